@@ -1,0 +1,191 @@
+"""The same inverse-kinematics problem, solved by peer libraries, each in its own virtual environment.
+
+Peers are never dependencies of kinefit. `benchmarks.peers.environments` makes their environments and runs them; the
+other modules here run *inside* a peer's environment (numpy, scipy and that peer, no kinefit).
+
+Exchange format: a folder with two files. Lengths in metres, angles in radians.
+
+``problem.json``
+    ``segments``: list, parents before children, of ``name``; ``parent`` (index, -1 for the root, which comes first);
+    ``origin`` [3], the segment's frame in its parent's frame in the rest pose, where all frames are parallel to the
+    root's; ``dofs``, list of ``name``, ``type`` ("revolute" or "prismatic"), ``axis`` [3], a unit vector in the
+    root-parallel rest frame; applied in order at that origin, so that R_parent_segment = R(axis0, q0) R(axis1, q1) ...
+    The root moves freely in the world by six degrees of freedom that are not listed; it has no ``dofs``.
+    ``markers``: list of ``name``, ``segment`` (index), ``point`` [3] in the segment's frame.
+
+``problem.npz``
+    ``positions`` (F, M, 3), marker targets in the world; ``initial_root`` (4, 4), T_world_root to start from;
+    ``initial_angles`` (N,), all dofs in the order of the segments; ``truth_root`` (F, 4, 4), ``truth_angles`` (F, N).
+    Optional second workload of P point-to-plane rows over G frames: ``plane_segment`` (P,), ``plane_point_local``
+    (P, 3), ``plane_normal_world`` (G, P, 3), ``plane_target_world`` (G, P, 3), a point of each plane.
+
+Every runner solves all frames in sequence, each from the solution of the one before. One measure holds for all: the
+sum of squared residuals, in double precision, by the kinematics in this file. A runner is timed at the loosest setting
+of its own stopping rule that brings that sum within 1e-6 (relative) of the least that it reaches at its tightest one.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+EXCESS = 1e-6  # relative excess over the least cost at which runners are timed
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One exchange folder, read. `planes` is None where the folder has no point-to-plane rows.
+
+    `planes` holds segment (P,), point_local (P, 3), normal_world (G, P, 3), target_world (G, P, 3).
+    """
+
+    segments: list[dict[str, Any]]
+    markers: list[dict[str, Any]]
+    positions: np.ndarray
+    initial_root: np.ndarray
+    initial_angles: np.ndarray
+    truth_root: np.ndarray
+    truth_angles: np.ndarray
+    planes: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def marker_segments(self) -> np.ndarray:
+        """Segment index of every marker, (M,)."""
+        return np.array([marker["segment"] for marker in self.markers])
+
+    @property
+    def marker_points(self) -> np.ndarray:
+        """Every marker in its segment's frame, (M, 3) [m]."""
+        return np.array([marker["point"] for marker in self.markers], dtype=float)
+
+
+def write_problem(folder: Path, segments: list[dict[str, Any]], markers: list[dict[str, Any]],
+                  **arrays: np.ndarray) -> None:
+    """Write an exchange folder; `arrays` as named in the module's text."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "problem.json").write_text(json.dumps({"segments": segments, "markers": markers}), encoding="utf-8")
+    np.savez(folder / "problem.npz", **arrays)
+
+
+def read_problem(folder: Path) -> Problem:
+    """Read an exchange folder."""
+    tree = json.loads((Path(folder) / "problem.json").read_text(encoding="utf-8"))
+    keys = ("positions", "initial_root", "initial_angles", "truth_root", "truth_angles")
+    plane_keys = ("plane_segment", "plane_point_local", "plane_normal_world", "plane_target_world")
+    with np.load(Path(folder) / "problem.npz") as arrays:
+        planes = tuple(arrays[key] for key in plane_keys) if plane_keys[0] in arrays else None
+        return Problem(tree["segments"], tree["markers"], *(arrays[key] for key in keys), planes=planes)
+
+
+def rotation_matrix(axis: Sequence[float], angle: Any) -> np.ndarray:
+    """Rotation by `angle` (..., ) [rad] about the unit vector `axis` (3,): (..., 3, 3)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.asarray(angle, dtype=float)[..., None, None]
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+def world_points(problem: Problem, root: np.ndarray, angles: np.ndarray, segments: np.ndarray, points: np.ndarray
+                 ) -> np.ndarray:
+    """Points of segments in the world: root (F, 4, 4), angles (F, N), segments (P,), points (P, 3) -> (F, P, 3)."""
+    rotations, origins, column = [], [], 0
+    for segment in problem.segments:
+        rotation, origin = root[:, :3, :3], root[:, :3, 3]
+        if segment["parent"] >= 0:
+            rotation = rotations[segment["parent"]]
+            origin = origins[segment["parent"]] + rotation @ np.array(segment["origin"], dtype=float)
+        for dof in segment["dofs"]:
+            if dof["type"] == "revolute":
+                rotation = rotation @ rotation_matrix(dof["axis"], angles[:, column])
+            else:
+                origin = origin + angles[:, column, None] * (rotation @ np.array(dof["axis"], dtype=float))
+            column += 1
+        rotations.append(rotation)
+        origins.append(origin)
+    rotations, origins = np.stack(rotations, axis=1), np.stack(origins, axis=1)
+    return origins[:, segments] + np.einsum("fpij,pj->fpi", rotations[:, segments], points)
+
+
+def marker_residuals(problem: Problem, root: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Marker minus target, (F, M, 3) [m]."""
+    fitted = world_points(problem, root, angles, problem.marker_segments, problem.marker_points)
+    return fitted - problem.positions[: len(root)]
+
+
+def plane_residuals(problem: Problem, root: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Distances of the points to their planes, (G, P) [m]."""
+    assert problem.planes is not None
+    segment, point_local, normal_world, target_world = problem.planes
+    fitted = world_points(problem, root, angles, segment, point_local)
+    return np.einsum("gpi,gpi->gp", normal_world, fitted - target_world)
+
+
+def axes_frame(axes: Sequence[Sequence[float]]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Right-handed frame whose columns are up to three orthogonal axes, for joints with fixed Euler sequences.
+
+    Returns the frame (3, 3) and the signs (len(axes),) by which `axes` differ from its first columns; None where the
+    axes are not orthogonal.
+    """
+    given = np.array(axes, dtype=float).reshape(-1, 3)
+    if not np.allclose(given @ given.T, np.eye(len(given)), atol=1e-9):
+        return None
+    full = np.linalg.qr(np.vstack([given, np.eye(3)]).T)[0].T  # Gram-Schmidt keeps the given axes up to sign
+    signs = np.sign(np.einsum("ij,ij->i", full[: len(given)], given))
+    full[: len(given)] = given
+    if np.linalg.det(full) > 0:
+        return full.T, np.ones(len(given))
+    full[-1] *= -1
+    return full.T, np.where(np.arange(len(given)) == 2, -1.0, 1.0) if len(given) == 3 else np.ones_like(signs)
+
+
+def measure(
+    peer: str,
+    version: str,
+    solve: Callable[[Any], tuple[Any, int]],
+    residuals: Callable[[Any], np.ndarray],
+    settings: Sequence[Any],
+    notes: str = "",
+    repeats: int = 5,
+) -> dict[str, Any]:
+    """Time `solve` at the first of `settings` that converges and print the result as one line of JSON.
+
+    Parameters
+    ----------
+    solve
+        `solve(setting) -> (solution, iterations)` runs the whole sequence; only this is timed.
+    residuals
+        `residuals(solution)`, (F, ...) [m], by the kinematics of this package.
+    settings
+        Stopping thresholds from loose to tight; the last gives the least cost to compare with.
+    """
+    solved = [(setting, residuals(solve(setting)[0])) for setting in reversed(settings)]
+    costs = {setting: float(np.sum(found**2)) for setting, found in solved}
+    least = min(costs.values())
+    chosen = next(setting for setting in settings if costs[setting] <= least * (1 + EXCESS))
+    cpu, wall, iterations, solution = [], [], 0, None
+    for _ in range(repeats):
+        before = time.process_time(), time.perf_counter()
+        solution, iterations = solve(chosen)
+        after = time.process_time(), time.perf_counter()
+        cpu.append(after[0] - before[0])
+        wall.append(after[1] - before[1])
+    found = residuals(solution)
+    frames, rows = len(found), found[..., 0].size if found.ndim == 3 else found.size
+    result = {
+        "peer": peer,
+        "version": version,
+        "ms_per_frame_cpu": 1e3 * min(cpu) / frames,
+        "ms_per_frame_wall": 1e3 * min(wall) / frames,
+        "rms_m": float(np.sqrt(np.sum(found**2) / rows)),
+        "cost": float(np.sum(found**2)),
+        "iterations_mean": iterations / frames,
+        "notes": f"stopping threshold {chosen:g}; {notes}".rstrip("; "),
+    }
+    print(json.dumps(result), flush=True)
+    return result

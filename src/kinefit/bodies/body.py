@@ -1,0 +1,179 @@
+"""Body: a kinematic tree with named points, scale groups and simple surfaces; frozen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.state import BodyState
+from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
+from kinefit.errors import BodyError, choices
+from kinefit.geometry import se3
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """Named points tied to segments: landmarks, a detector's keypoints, a marker set.
+
+    Parameters
+    ----------
+    names : (K,)
+    segments : (K,) int, index of each point's segment.
+    points : (K, 3) [m] in the segment's frame.
+    """
+
+    names: tuple[str, ...]
+    segments: NDArray
+    points: NDArray
+
+    def __post_init__(self) -> None:
+        segments, points = np.array(self.segments, np.int64), np.array(self.points, float).reshape(-1, 3)
+        segments.flags.writeable = points.flags.writeable = False
+        object.__setattr__(self, "segments", segments)
+        object.__setattr__(self, "points", points)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Position of a point by name."""
+        if name not in self.names:
+            raise BodyError(choices("point", name, self.names))
+        return self.names.index(name)
+
+    def select(self, names: tuple[str, ...]) -> PointSet:
+        """The named points, in that order."""
+        rows = [self.index(name) for name in names]
+        return PointSet(tuple(names), self.segments[rows], self.points[rows])
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Tapered round surface of a segment, from its joint to `end` [m, segment's frame], radii [m] at both ends."""
+
+    segment: int
+    end: tuple[float, float, float]
+    radii: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What is tracked.
+
+    Parameters
+    ----------
+    name : str
+    tree : KinematicTree
+    joints : (S,) name of the joint that ties each segment to its parent.
+    scale_groups : (G,) names of the lengths that can be scaled; left and right limbs share one.
+    segment_scale : (S,) int, scale group of each segment.
+    landmarks : PointSet
+    keypoint_sets, marker_sets : name -> PointSet
+    surfaces : one Cylinder for each segment that has one.
+    aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name there.
+    stature : float [m] of the body as it stands.
+    """
+
+    name: str
+    tree: KinematicTree
+    joints: tuple[str, ...]
+    scale_groups: tuple[str, ...]
+    segment_scale: NDArray
+    landmarks: PointSet
+    keypoint_sets: Mapping[str, PointSet] = field(default_factory=dict)
+    marker_sets: Mapping[str, PointSet] = field(default_factory=dict)
+    surfaces: tuple[Cylinder, ...] = ()
+    aliases: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    stature: float = 0.0
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """(6 + D,) names of all degrees of freedom."""
+        return ROOT_DOFS + self.tree.coordinates
+
+    def rest_state(self, T_world_root: NDArray | None = None) -> BodyState:
+        """All angles zero, or the nearest value within the limits."""
+        angles = np.clip(np.zeros(len(self.tree.coordinates)), self.tree.lower, self.tree.upper)
+        return BodyState(np.eye(4) if T_world_root is None else T_world_root, angles)
+
+    def keypoints(self, name: str) -> PointSet:
+        """The points of a detector's keypoint set."""
+        if name not in self.keypoint_sets:
+            raise BodyError(choices(f"keypoint set of body '{self.name}' named", name, self.keypoint_sets))
+        return self.keypoint_sets[name]
+
+    def markers(self, name: str) -> PointSet:
+        """The points of a marker set."""
+        if name not in self.marker_sets:
+            raise BodyError(choices(f"marker set of body '{self.name}' named", name, self.marker_sets))
+        return self.marker_sets[name]
+
+    def alias(self, convention: str, segment: str) -> str:
+        """Name of a segment in another convention; its own where that has none."""
+        return self.aliases.get(convention, {}).get(segment, segment)
+
+    def points_rest(self, points: PointSet) -> NDArray:
+        """(K, 3) [m] points in the root frame at rest, as kernels take them."""
+        return points.points + self.tree.rest[points.segments]
+
+    def positions(self, state: BodyState, points: PointSet) -> NDArray:
+        """(K, 3) [m] points in the world at a state."""
+        frames, _ = self.tree.forward(state.T_world_root, state.angles)
+        f = frames[points.segments]
+        return (f[:, :9].reshape(-1, 3, 3) @ self.points_rest(points)[:, :, None])[..., 0] + f[:, 9:]
+
+    def trajectories(self, Ts_world_root: NDArray, angles: NDArray, points: PointSet) -> NDArray:
+        """(F, K, 3) [m] points in the world over time: roots (F, 4, 4), angles (F, D)."""
+        Ts = self.tree.segment_poses(Ts_world_root, angles)
+        return se3.apply(Ts[:, points.segments], points.points)
+
+    def scaled(self, scales: NDArray) -> Body:
+        """The body with every scale group stretched: (G,) factors; joint centres and all points move along."""
+        factors = np.asarray(scales, float)
+        if factors.shape != (len(self.scale_groups),) or not np.all(np.isfinite(factors)) or np.any(factors <= 0):
+            raise BodyError(
+                f"scales must be {len(self.scale_groups)} positive numbers, got {factors}",
+                remedy=f"One for each of: {', '.join(self.scale_groups)}.",
+            )
+        per_segment = factors[self.segment_scale]
+        parents = np.maximum(self.tree.parents, 0)
+        stretched = replace(
+            self,
+            tree=self.tree.with_offsets(self.tree.offsets * per_segment[parents][:, None]),
+            landmarks=_stretch(self.landmarks, per_segment),
+            keypoint_sets={name: _stretch(s, per_segment) for name, s in self.keypoint_sets.items()},
+            marker_sets={name: _stretch(s, per_segment) for name, s in self.marker_sets.items()},
+            surfaces=tuple(_stretch_cylinder(c, float(per_segment[c.segment])) for c in self.surfaces),
+        )
+        return replace(stretched, stature=self.stature * stretched._extent() / max(self._extent(), 1e-9))
+
+    def _extent(self) -> float:
+        """[m] from the lowest to the highest landmark or joint at rest."""
+        heights = np.concatenate([self.points_rest(self.landmarks)[:, 1], self.tree.rest[:, 1]])
+        return float(np.ptp(heights)) if len(heights) else 0.0
+
+    def with_keypoints(self, name: str, points: NDArray) -> Body:
+        """The body with the points (K, 3) [m] of one keypoint set replaced (learnt offsets)."""
+        old = self.keypoints(name)
+        return replace(self, keypoint_sets={**self.keypoint_sets, name: PointSet(old.names, old.segments, points)})
+
+    def segment_lengths(self) -> dict[str, float]:
+        """[m] distance between the two joints of every scale group that has a child joint (bone lengths)."""
+        out: dict[str, float] = {}
+        for child, parent in enumerate(self.tree.parents):
+            if parent >= 0:
+                name = f"{self.tree.segments[parent]}-{self.tree.segments[child]}"
+                out[name] = float(np.linalg.norm(self.tree.offsets[child]))
+        return out
+
+
+def _stretch(points: PointSet, per_segment: NDArray) -> PointSet:
+    return PointSet(points.names, points.segments, points.points * per_segment[points.segments][:, None])
+
+
+def _stretch_cylinder(c: Cylinder, factor: float) -> Cylinder:
+    x, y, z = (factor * v for v in c.end)
+    return Cylinder(c.segment, (x, y, z), (factor * c.radii[0], factor * c.radii[1]))

@@ -1,0 +1,280 @@
+"""Bodies from TOML: the catalogue's, and a user's own file."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from kinefit.bodies.body import Body, Cylinder, PointSet
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError, choices
+
+JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
+_AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
+_AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
+Vector = tuple[float, float, float]
+
+
+class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class _Joint(_Record):
+    name: str
+    type: str
+    at: Vector = (0.0, 0.0, 0.0)
+    axes: list[str | Vector] = []
+    coordinates: list[str] = []
+    range: list[tuple[float, float]] = []
+
+
+class _Surface(_Record):
+    end: Vector
+    radii: tuple[float, float]
+
+
+class _Segment(_Record):
+    name: str
+    joint: _Joint
+    parent: str | None = None
+    scale: str | None = None
+    surface: _Surface | None = None
+    names: dict[str, str] = {}
+
+
+class _Point(_Record):
+    segment: str
+    at: Vector
+
+
+class _Head(_Record):
+    name: str
+    stature: float = 0.0
+    mirror: bool = False
+
+
+class _MarkerSet(_Record):
+    points: list[str] = []
+    placed: dict[str, _Point] = {}
+
+
+class _File(_Record):
+    body: _Head
+    segment: list[_Segment]
+    landmarks: dict[str, _Point] = {}
+    keypoints: dict[str, dict[str, str]] = {}
+    markers: dict[str, _MarkerSet] = {}
+
+
+def load_body(name_or_file: str | Path) -> Body:
+    """Body from the catalogue ("humanoid", "humanoid10", "arm") or from a TOML file.
+
+    Raises
+    ------
+    BodyError
+        Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a name twice: with file, place, remedy.
+    """
+    path = Path(name_or_file)
+    if path.suffix == ".toml":
+        try:
+            text, source = path.read_text(encoding="utf-8"), str(path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise BodyError(f"cannot read the body file ({error})", file=path) from error
+    else:
+        folder = resources.files("kinefit.bodies") / "catalogue"
+        entry, source = folder / f"{name_or_file}.toml", f"catalogue body {name_or_file}"
+        if not entry.is_file():
+            raise BodyError(
+                choices("body in the catalogue named", str(name_or_file), catalogue()),
+                remedy="A body file of your own is given by its path, ending in .toml.",
+            )
+        text = entry.read_text(encoding="utf-8")
+    return parse_body(text, source)
+
+
+def catalogue() -> tuple[str, ...]:
+    """Names of the bodies that come with kinefit."""
+    folder = resources.files("kinefit.bodies") / "catalogue"
+    return tuple(sorted(e.name[:-5] for e in folder.iterdir() if e.name.endswith(".toml")))
+
+
+def parse_body(text: str, source: str = "body") -> Body:
+    """Body from TOML text; `source` names it in messages."""
+    try:
+        record = msgspec.convert(tomllib.loads(text), _File)
+    except tomllib.TOMLDecodeError as error:
+        raise BodyError(f"not valid TOML ({error})", file=source) from error
+    except msgspec.ValidationError as error:
+        raise BodyError(f"not a body file ({error})", file=source, remedy="See docs/bodies.md for its keys.") from error
+    segments = _in_order(_mirrored(record.segment) if record.body.mirror else list(record.segment), source)
+    points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
+    if record.body.mirror:
+        points |= {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
+    groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
+    index = {s.name: i for i, s in enumerate(segments)}
+    landmarks = _points(points, index, source)
+    return Body(
+        name=record.body.name,
+        tree=_tree(segments, index, source),
+        joints=tuple(s.joint.name for s in segments),
+        scale_groups=groups,
+        segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
+        landmarks=landmarks,
+        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
+        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
+        surfaces=tuple(Cylinder(index[s.name], s.surface.end, s.surface.radii) for s in segments if s.surface),
+        aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
+        stature=record.body.stature,
+    )
+
+
+def _left(name: str) -> str:
+    if name.endswith("_r"):
+        return name[:-2] + "_l"
+    if name.startswith("r_"):
+        return "l_" + name[2:]
+    return name.replace("Right", "Left")
+
+
+def _mirrored(segments: list[_Segment]) -> list[_Segment]:
+    out = []
+    for s in segments:
+        out.append(s)
+        if not s.name.endswith("_r"):
+            continue
+        axes: list[str | Vector] = []
+        for axis in s.joint.axes:  # a turn about z looks the same in the mirror, about x and y it is reversed
+            x, y, z = _AXES[axis] if isinstance(axis, str) and axis in _AXES else axis
+            axes.append((-float(x), -float(y), float(z)) if s.joint.type != "prismatic" else (x, y, -float(z)))  # type: ignore[arg-type]
+        x, y, z = s.joint.at
+        joint = msgspec.structs.replace(
+            s.joint,
+            name=_left(s.joint.name),
+            at=(x, y, -z),
+            axes=axes,
+            coordinates=[_left(c) for c in s.joint.coordinates],
+        )
+        surface = s.surface and _Surface(end=(s.surface.end[0], s.surface.end[1], -s.surface.end[2]), radii=s.surface.radii)
+        names = {convention: _left(name) for convention, name in s.names.items()}
+        parent = _left(s.parent) if s.parent else None
+        out.append(
+            msgspec.structs.replace(s, name=_left(s.name), parent=parent, joint=joint, surface=surface, names=names)
+        )
+    return out
+
+
+def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
+    """Depth first from the root, so that parents come before children and limbs stay together."""
+    names = [s.name for s in segments]
+    for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
+        twice = {n for n in items if items.count(n) > 1}
+        if twice:
+            raise BodyError(f"{what} named twice: {', '.join(sorted(twice))}", file=source)
+    roots = [s for s in segments if s.parent is None]
+    if len(roots) != 1:
+        found = ", ".join(s.name for s in roots) or "none"
+        raise BodyError(
+            f"a body has exactly one segment without a parent, here: {found}", file=source, remedy="Give the others a parent."
+        )
+    for s in segments:
+        if s.parent is not None and s.parent not in names:
+            raise BodyError(choices("segment", s.parent, names), file=source, place=f"parent of segment {s.name}")
+    out: list[_Segment] = []
+    stack = [roots[0]]
+    while stack:
+        s = stack.pop()
+        out.append(s)
+        stack += reversed([c for c in segments if c.parent == s.name])
+    if len(out) != len(segments):
+        lost = ", ".join(n for n in names if n not in {s.name for s in out})
+        raise BodyError(f"the segments {lost} form a cycle", file=source, remedy="Every chain of parents must end at the root.")
+    return out
+
+
+def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> KinematicTree:
+    names: list[str] = []
+    rows: list[tuple[int, Any, bool, float, float]] = []
+    for i, s in enumerate(segments):
+        j, place = s.joint, f"joint {s.joint.name}"
+        if j.type not in JOINT_TYPES:
+            raise BodyError(choices("joint type", j.type, JOINT_TYPES), file=source, place=place)
+        if j.type == "free" and i == 0:
+            continue
+        axes: list[Any] = list(j.axes)
+        slides = [j.type == "prismatic"] * len(axes)
+        if j.type == "free":
+            axes, slides = ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
+        count = JOINT_TYPES[j.type]
+        coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
+        if len(axes) != count or len(coordinates) != count or len(j.range) not in (0, count):
+            raise BodyError(
+                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges; here are {len(axes)}, "
+                f"{len(coordinates)} and {len(j.range)}",
+                file=source,
+                place=place,
+            )
+        for k in range(count):
+            axis = np.array(_AXES.get(axes[k], [np.nan] * 3) if isinstance(axes[k], str) else axes[k], float)
+            norm = np.linalg.norm(axis)
+            if not norm > 1e-9:
+                raise BodyError(
+                    f"axis {axes[k]!r} of {coordinates[k]} is no direction",
+                    file=source,
+                    place=place,
+                    remedy='Use "x", "-y", ... or three numbers that are not all zero.',
+                )
+            low, high = j.range[k] if j.range else (-np.inf, np.inf)
+            if not low <= high:
+                raise BodyError(f"range [{low}, {high}] of {coordinates[k]} is empty", file=source, place=place)
+            unit = 1.0 if slides[k] else np.pi / 180.0
+            names.append(coordinates[k])
+            rows.append((i, axis / norm, slides[k], low * unit, high * unit))
+    twice = {n for n in names if names.count(n) > 1}
+    if twice:
+        raise BodyError(f"coordinate named twice: {', '.join(sorted(twice))}", file=source)
+    return KinematicTree(
+        segments=tuple(s.name for s in segments),
+        parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
+        offsets=np.array([s.joint.at if s.parent else (0.0, 0.0, 0.0) for s in segments]),
+        coordinates=tuple(names),
+        owners=np.array([r[0] for r in rows], np.int64),
+        axes=np.array([r[1] for r in rows]),
+        prismatic=np.array([r[2] for r in rows], bool),
+        lower=np.array([r[3] for r in rows]),
+        upper=np.array([r[4] for r in rows]),
+        root_free=segments[0].joint.type == "free",
+    )
+
+
+def _points(points: dict[str, tuple[str, Vector]], index: dict[str, int], source: str) -> PointSet:
+    for name, (segment, _) in points.items():
+        if segment not in index:
+            raise BodyError(choices("segment", segment, index), file=source, place=f"landmark {name}")
+    return PointSet(tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()]))
+
+
+def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
+    for name, landmark in entries.items():
+        if landmark not in landmarks.names:
+            raise BodyError(choices("landmark", landmark, landmarks.names), file=source, place=f"{place}.{name}")
+    chosen = landmarks.select(tuple(entries.values()))
+    return PointSet(tuple(entries), chosen.segments, chosen.points)
+
+
+def _markers(entry: _MarkerSet, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
+    on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
+    placed = _points({n: (p.segment, p.at) for n, p in entry.placed.items()}, index, source)
+    return PointSet(
+        on_landmarks.names + placed.names,
+        np.concatenate([on_landmarks.segments, placed.segments]),
+        np.concatenate([on_landmarks.points, placed.points]),
+    )
+
+
+def _conventions(segments: list[_Segment]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(c for s in segments for c in s.names))

@@ -1,0 +1,43 @@
+"""BodyState: where a body is at one time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry import se3
+
+
+@dataclass(frozen=True, eq=False)
+class BodyState:
+    """Pose of the root and all joint coordinates.
+
+    Parameters
+    ----------
+    T_world_root : (4, 4) [m]
+    angles : (D,) [rad], or [m] for prismatic joints.
+    """
+
+    T_world_root: NDArray
+    angles: NDArray
+
+    def __post_init__(self) -> None:
+        for name in ("T_world_root", "angles"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def retract(self, delta: NDArray) -> BodyState:
+        """State moved by δ (6 + D,): the root's twist (v, ω) in the world about its own origin, then the angles."""
+        T = np.array(self.T_world_root)
+        T[:3, :3] = se3.exp_so3(delta[3:6]) @ T[:3, :3]
+        T[:3, 3] += delta[:3]
+        return BodyState(T, self.angles + delta[6:])
+
+    def difference(self, other: BodyState) -> NDArray:
+        """δ (6 + D,) such that `self.retract(δ)` is `other`."""
+        R = other.T_world_root[:3, :3] @ self.T_world_root[:3, :3].T
+        shift = other.T_world_root[:3, 3] - self.T_world_root[:3, 3]
+        return np.concatenate([shift, se3.log_so3(R), other.angles - self.angles])

@@ -1,0 +1,151 @@
+"""KinematicTree: joints as screws in the rest pose, forward kinematics, Jacobians.
+
+At rest all segment frames are aligned with the root frame and lie at their joints. A segment's motion is the product of
+the exponentials of all screws between it and the root (P3 eq. 6), so a point is given once, in the root frame at rest.
+The degrees of freedom of a body are the root's twist (v, ω) in the world about the root's origin, then the angles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import _kernels
+from kinefit.errors import BodyError, choices
+
+ROOT_DOFS = ("root_tx", "root_ty", "root_tz", "root_rx", "root_ry", "root_rz")
+
+
+def _frozen(array: object, dtype: type = float) -> NDArray:
+    out = np.array(array, dtype=dtype)
+    out.flags.writeable = False
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicTree:
+    """A tree of segments; parents come before children, coordinates in the order of their segments.
+
+    Parameters
+    ----------
+    segments : (S,) names; the first is the root.
+    parents : (S,) index of each segment's parent, -1 for the root.
+    offsets : (S, 3) [m] joint centre in the parent's frame at rest (zero for the root).
+    coordinates : (D,) names of the joint angles (and prismatic lengths).
+    owners : (D,) index of the segment that each coordinate moves.
+    axes : (D, 3) unit axes in the root-aligned rest frame; a positive angle turns right-handed about it.
+    prismatic : (D,) bool, slides along its axis instead of turning.
+    lower, upper : (D,) [rad] or [m], limits; ±inf where there are none.
+    root_free : bool, False for a body whose root stays where it is put.
+    """
+
+    segments: tuple[str, ...]
+    parents: NDArray
+    offsets: NDArray
+    coordinates: tuple[str, ...]
+    owners: NDArray
+    axes: NDArray
+    prismatic: NDArray
+    lower: NDArray
+    upper: NDArray
+    root_free: bool = True
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("parents", np.int64), ("owners", np.int64), ("prismatic", bool)):
+            object.__setattr__(self, name, _frozen(getattr(self, name), dtype))
+        for name in ("offsets", "axes", "lower", "upper"):
+            object.__setattr__(self, name, _frozen(getattr(self, name)))
+        object.__setattr__(self, "axes", _frozen(self.axes.reshape(-1, 3)))
+        if np.any(np.diff(self.owners) < 0) or np.any(self.parents[1:] >= np.arange(1, len(self.parents))):
+            raise BodyError("segments of a tree are not in order", remedy="Put parents before their children.")
+
+    @property
+    def n_dofs(self) -> int:
+        """Degrees of freedom: six of the root and one for each coordinate."""
+        return 6 + len(self.coordinates)
+
+    @cached_property
+    def dof_start(self) -> NDArray:
+        """(S+1,) first coordinate of each segment."""
+        return _frozen(np.searchsorted(self.owners, np.arange(len(self.segments) + 1)), np.int64)
+
+    @cached_property
+    def rest(self) -> NDArray:
+        """(S, 3) [m] joint centres in the root frame at rest."""
+        out = np.array(self.offsets)
+        for s in range(1, len(out)):
+            out[s] += out[self.parents[s]]
+        return _frozen(out)
+
+    @cached_property
+    def dof_parent(self) -> NDArray:
+        """(6 + D,) the next degree of freedom towards the root, -1 for the first: the sparsity of the normal matrix."""
+        last = np.full(len(self.segments), 5)
+        out = list(range(-1, 5))
+        for s, parent in enumerate(self.parents):
+            last[s] = last[parent] if parent >= 0 else 5
+            for d in range(self.dof_start[s], self.dof_start[s + 1]):
+                out.append(int(last[s]))
+                last[s] = 6 + d
+        return _frozen(out, np.int64)
+
+    @cached_property
+    def last_dof(self) -> NDArray:
+        """(S,) the degree of freedom nearest to each segment that moves it."""
+        last = np.full(len(self.segments), 5)
+        for s, parent in enumerate(self.parents):
+            last[s] = last[parent] if parent >= 0 else 5
+            if self.dof_start[s + 1] > self.dof_start[s]:
+                last[s] = 5 + self.dof_start[s + 1]
+        return _frozen(last, np.int64)
+
+    def segment(self, name: str) -> int:
+        """Index of a segment by name."""
+        if name not in self.segments:
+            raise BodyError(choices("segment", name, self.segments))
+        return self.segments.index(name)
+
+    def coordinate(self, name: str) -> int:
+        """Index of a coordinate by name."""
+        if name not in self.coordinates:
+            raise BodyError(choices("coordinate", name, self.coordinates))
+        return self.coordinates.index(name)
+
+    def with_offsets(self, offsets: NDArray) -> KinematicTree:
+        """The same tree with other joint centres, (S, 3) [m]."""
+        return replace(self, offsets=offsets)
+
+    def forward(self, T_world_root: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
+        """Frames (S, 12) and screws (D, 6) of one pose; see `_kernels.forward`."""
+        frames, screws = np.empty((len(self.segments), 12)), np.empty((len(self.coordinates), 6))
+        _kernels.forward(
+            self.parents, self.dof_start, self.prismatic, self.axes, self.rest, T_world_root, angles, frames, screws
+        )
+        return frames, screws
+
+    def segment_poses(self, Ts_world_root: NDArray, angles: NDArray) -> NDArray:
+        """T_world_segment (F, S, 4, 4) of many poses: roots (F, 4, 4), angles (F, D)."""
+        roots = np.ascontiguousarray(Ts_world_root, dtype=float)
+        frames = np.empty((len(roots), len(self.segments), 12))
+        angles = np.ascontiguousarray(angles, dtype=float)
+        _kernels.forward_many(
+            self.parents, self.dof_start, self.prismatic, self.axes, self.rest, roots, angles, frames
+        )
+        Ts = np.zeros((*frames.shape[:2], 4, 4))
+        Ts[..., :3, :3] = frames[..., :9].reshape(*frames.shape[:2], 3, 3)
+        Ts[..., :3, 3] = frames[..., 9:] + (Ts[..., :3, :3] @ self.rest[:, :, None])[..., 0]
+        Ts[..., 3, 3] = 1.0
+        return Ts
+
+    def segment_jacobian(self, screws: NDArray, segment: int) -> NDArray:
+        """J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin for each degree of freedom."""
+        out = np.zeros((6, self.n_dofs))
+        out[:, :6] = np.eye(6)
+        d = self.last_dof[segment]
+        while d >= 6:
+            out[:, d] = screws[d - 6]
+            d = self.dof_parent[d]
+        return out

@@ -1,0 +1,98 @@
+"""Plücker lines and planes: distances of points and lines to them, and their derivatives (P1 2.3, P3 eqs. 4-5).
+
+A line is (n, m): unit direction n and moment m = x × n of any of its points x [m]. A plane is (n, d): unit normal and
+n·x = d [m]. All functions take any leading shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+
+def _unit(v: NDArray, what: str) -> NDArray:
+    norm = np.linalg.norm(v, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(norm)) or np.any(norm < 1e-12):
+        raise ObservationError(f"{what} of length zero or not finite", remedy="Give two different points.")
+    return v / norm
+
+
+def line_through(a: NDArray, b: NDArray) -> NDArray:
+    """Plücker line (..., 6) from point a to point b, both (..., 3) [m]."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    return line_along(a, b - a)
+
+
+def line_along(x: NDArray, direction: NDArray) -> NDArray:
+    """Plücker line (..., 6) through x (..., 3) [m] along a direction (..., 3) of any length."""
+    n = _unit(np.asarray(direction, float), "a line's direction")
+    return np.concatenate([np.broadcast_to(n, np.broadcast_shapes(n.shape, np.shape(x))), np.cross(x, n)], -1)
+
+
+def plane_through(line: NDArray, x: NDArray) -> NDArray:
+    """Plane (..., 4) = (n, d) that holds a Plücker line (..., 6) and a point (..., 3) [m] off it."""
+    foot = np.cross(line[..., :3], line[..., 3:])
+    n = _unit(np.cross(line[..., :3], np.asarray(x, float) - foot), "a plane's normal")
+    return np.concatenate([n, np.sum(n * x, -1, keepdims=True)], -1)
+
+
+def move_line(T: NDArray, line: NDArray) -> NDArray:
+    """Line (..., 6) moved by T (..., 4, 4)."""
+    n = (T[..., :3, :3] @ line[..., :3, None])[..., 0]
+    m = (T[..., :3, :3] @ line[..., 3:, None])[..., 0] + np.cross(T[..., :3, 3], n)
+    return np.concatenate([n, m], -1)
+
+
+def point_line(x: NDArray, line: NDArray) -> NDArray:
+    """Residual vector x × n − m (..., 3) [m] of a point and a line; its norm is the distance (P3 eq. 4)."""
+    return np.cross(x, line[..., :3]) - line[..., 3:]
+
+
+def point_line_jacobian(line: NDArray) -> NDArray:
+    """∂(x × n − m)/∂x, (..., 3, 3)."""
+    n = line[..., :3]
+    out = np.zeros((*n.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = n[..., 2], -n[..., 1], n[..., 0]
+    return out - np.swapaxes(out, -1, -2)
+
+
+def point_plane(x: NDArray, plane: NDArray) -> NDArray:
+    """Signed distance n·x − d (...) [m] of a point to a plane; its derivative with respect to x is n."""
+    return np.sum(plane[..., :3] * x, -1) - plane[..., 3]
+
+
+def line_plane(line: NDArray, plane: NDArray) -> NDArray:
+    """Residual (..., 4) of a line that should lie in a plane: its tilt, and its offset along the normal.
+
+    The first entry is the sine of the angle between them [rad]; the other three are the vector from the plane to the
+    line's foot point along the plane's normal [m]. All four vanish exactly when the line lies in the plane (P1 2.3).
+    """
+    n_line, n_plane = line[..., :3], plane[..., :3]
+    foot = np.cross(n_line, line[..., 3:])
+    tilt = np.sum(n_line * n_plane, -1, keepdims=True)
+    return np.concatenate([tilt, point_plane(foot, plane)[..., None] * n_plane], -1)
+
+
+def line_plane_jacobian(line: NDArray, plane: NDArray) -> NDArray:
+    """∂ line_plane / ∂(n, m) of the line, (..., 4, 6), for unconstrained changes of n and m."""
+    n_line, m_line, n_plane = line[..., :3], line[..., 3:], plane[..., :3]
+    out = np.zeros((*np.broadcast_shapes(n_line.shape, n_plane.shape)[:-1], 4, 6))
+    out[..., 0, :3] = n_plane
+    along = np.concatenate([np.cross(m_line, n_plane), np.cross(n_plane, n_line)], -1)
+    out[..., 1:, :] = n_plane[..., :, None] * along[..., None, :]
+    return out
+
+
+def closest_points(line_a: NDArray, line_b: NDArray) -> tuple[NDArray, NDArray]:
+    """Points (..., 3) [m] of two lines that are nearest to each other (for parallel ones: the feet from the origin)."""
+    a, b = line_a[..., :3], line_b[..., :3]
+    foot_a, foot_b = np.cross(a, line_a[..., 3:]), np.cross(b, line_b[..., 3:])
+    c = np.sum(a * b, -1)
+    gap, det = foot_b - foot_a, 1.0 - c**2
+    safe = np.where(det < 1e-14, 1.0, det)
+    along_a, along_b = np.sum(gap * a, -1), np.sum(gap * b, -1)
+    s = np.where(det < 1e-14, 0.0, (along_a - c * along_b) / safe)
+    t = np.where(det < 1e-14, -along_b, (c * along_a - along_b) / safe)
+    return foot_a + s[..., None] * a, foot_b + t[..., None] * b

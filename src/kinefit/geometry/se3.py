@@ -1,0 +1,183 @@
+"""Rigid motions and twists: exp, log, adjoint, left Jacobian; batched, exact near identity and near π.
+
+A twist is ξ = (v, ω), spatial, in metres and radians: a point x moves by v + ω × x (P3, eqs. 1-4). All functions take any
+leading shape. The coefficients are series where closed forms cancel, so that nothing is lost for small angles.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SMALL = 0.5  # [rad] below it the seven-term series are exact to machine precision
+_FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, 25.0)]))
+
+
+def _series(theta2: NDArray, first: int) -> NDArray:
+    """Σ_k (−θ²)^k / (first + 2k)! — the tail of sine or cosine divided by its leading power."""
+    total = np.zeros_like(theta2)
+    for k in range(7, -1, -1):
+        total = total * -theta2 + 1.0 / _FACTORIALS[first + 2 * k]
+    return total
+
+
+def _coefficients(theta: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """sin θ / θ, (1 − cos θ) / θ², (θ − sin θ) / θ³."""
+    theta2 = theta * theta
+    small = theta < _SMALL
+    t = np.where(small, 1.0, theta)
+    a = np.where(small, _series(theta2, 1), np.sin(t) / t)
+    b = np.where(small, _series(theta2, 2), 2.0 * (np.sin(0.5 * t) / t) ** 2)
+    c = np.where(small, _series(theta2, 3), (t - np.sin(t)) / t**3)
+    return a, b, c
+
+
+def hat(omega: NDArray) -> NDArray:
+    """Cross-product matrix: (..., 3) -> (..., 3, 3) with hat(ω) x = ω × x."""
+    omega = np.asarray(omega, float)
+    out = np.zeros((*omega.shape[:-1], 3, 3))
+    x, y, z = omega[..., 0], omega[..., 1], omega[..., 2]
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    return out
+
+
+def exp_so3(omega: NDArray) -> NDArray:
+    """Rodrigues' formula: rotation vector (..., 3) [rad] -> rotation matrix (..., 3, 3)."""
+    omega = np.asarray(omega, float)
+    a, b, _ = _coefficients(np.linalg.norm(omega, axis=-1))
+    w = hat(omega)
+    return np.eye(3) + a[..., None, None] * w + b[..., None, None] * (w @ w)
+
+
+def quaternion(rotation: NDArray) -> NDArray:
+    """Unit quaternion (..., 4) as (w, x, y, z), w ≥ 0, of a rotation matrix (..., 3, 3); stable everywhere (Shepperd)."""
+    r = np.asarray(rotation, float)
+    m00, m11, m22 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
+    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    table = np.stack(
+        [
+            np.stack([squares[..., 0], wx, wy, wz], -1),
+            np.stack([wx, squares[..., 1], xy, xz], -1),
+            np.stack([wy, xy, squares[..., 2], yz], -1),
+            np.stack([wz, xz, yz, squares[..., 3]], -1),
+        ],
+        -2,
+    )
+    best = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(table, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def rotation_from_quaternion(q: NDArray) -> NDArray:
+    """Rotation matrix (..., 3, 3) of a quaternion (..., 4) as (w, x, y, z), normalised first."""
+    q = np.asarray(q, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, v = hat(q[..., 1:]), q[..., 0]
+    return np.eye(3) + 2.0 * v[..., None, None] * w + 2.0 * (w @ w)
+
+
+def log_so3(rotation: NDArray) -> NDArray:
+    """Rotation vector (..., 3) [rad], norm ≤ π, of a rotation matrix (..., 3, 3)."""
+    q = quaternion(rotation)
+    sine = np.linalg.norm(q[..., 1:], axis=-1)
+    half = np.arctan2(sine, q[..., 0])
+    factor = np.where(sine > 1e-8, 2.0 * half / np.where(sine > 1e-8, sine, 1.0), 2.0)
+    return factor[..., None] * q[..., 1:]
+
+
+def transform(rotation: NDArray, translation: NDArray) -> NDArray:
+    """Homogeneous matrix (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3) [m]."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    out = np.zeros((*shape, 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = rotation, translation, 1.0
+    return out
+
+
+def inverse(T: NDArray) -> NDArray:
+    """Inverse of rigid motions (..., 4, 4)."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T: NDArray, x: NDArray) -> NDArray:
+    """Move points: T (..., 4, 4), x (..., 3) [m] -> (..., 3) [m]."""
+    return (T[..., :3, :3] @ np.asarray(x, float)[..., None])[..., 0] + T[..., :3, 3]
+
+
+def exp(xi: NDArray) -> NDArray:
+    """Screw motion of a twist: ξ = (v, ω) (..., 6) [m, rad] -> T (..., 4, 4) (P3, eq. 3)."""
+    xi = np.asarray(xi, float)
+    v, omega = xi[..., :3], xi[..., 3:]
+    _, b, c = _coefficients(np.linalg.norm(omega, axis=-1))
+    w = hat(omega)
+    left = np.eye(3) + b[..., None, None] * w + c[..., None, None] * (w @ w)
+    return transform(exp_so3(omega), (left @ v[..., None])[..., 0])
+
+
+def log(T: NDArray) -> NDArray:
+    """Twist ξ = (v, ω) (..., 6) [m, rad], |ω| ≤ π, of a rigid motion (..., 4, 4)."""
+    T = np.asarray(T, float)
+    omega = log_so3(T[..., :3, :3])
+    v = (_left_so3_inverse(omega) @ T[..., :3, 3:])[..., 0]
+    return np.concatenate([v, omega], -1)
+
+
+def left_jacobian_so3(omega: NDArray) -> NDArray:
+    """Left Jacobian of SO(3): (..., 3) -> (..., 3, 3); exp(ω + δ) ≈ exp(J δ) exp(ω)."""
+    omega = np.asarray(omega, float)
+    _, b, c = _coefficients(np.linalg.norm(omega, axis=-1))
+    w = hat(omega)
+    return np.eye(3) + b[..., None, None] * w + c[..., None, None] * (w @ w)
+
+
+def _left_so3_inverse(omega: NDArray) -> NDArray:
+    theta = np.linalg.norm(omega, axis=-1)
+    a, b, c = _coefficients(theta)
+    # 1/θ² − A/(2Bθ²) = (2B − A) / (2Bθ²), and 2B − A = θ² (c − e) with e = (½ − B) / θ²
+    e = np.where(theta < _SMALL, _series(theta**2, 4), (0.5 - b) / np.where(theta < _SMALL, 1.0, theta) ** 2)
+    d = (c - 2.0 * e) / (2.0 * b)
+    w = hat(omega)
+    return np.eye(3) - 0.5 * w + d[..., None, None] * (w @ w)
+
+
+def left_jacobian(xi: NDArray) -> NDArray:
+    """Left Jacobian of SE(3), (..., 6) -> (..., 6, 6): exp(ξ + δ) ≈ exp(J δ) exp(ξ) to first order in δ.
+
+    Source: the closed form of T. Barfoot, State Estimation for Robotics, eq. 7.86, for twists ordered (v, ω).
+    """
+    xi = np.asarray(xi, float)
+    v, omega = xi[..., :3], xi[..., 3:]
+    theta = np.linalg.norm(omega, axis=-1)
+    theta2, small = theta**2, theta < _SMALL
+    t = np.where(small, 1.0, theta)
+    _, b, c = _coefficients(theta)
+    e = np.where(small, _series(theta2, 4), (0.5 - b) / t**2)
+    f = np.where(small, _series(theta2, 5), (1.0 / 6.0 - c) / t**2)
+    w, u = hat(omega), hat(v)
+    wu, uw = w @ u, u @ w
+    wuw = wu @ w
+    q = (
+        0.5 * u
+        + c[..., None, None] * (wu + uw + wuw)
+        + e[..., None, None] * (w @ wu + uw @ w - 3.0 * wuw)
+        + (0.5 * (e - 3.0 * f))[..., None, None] * (wuw @ w + w @ wuw)
+    )
+    out = np.zeros((*theta.shape, 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = left_jacobian_so3(omega)
+    out[..., :3, 3:] = q
+    return out
+
+
+def adjoint(T: NDArray) -> NDArray:
+    """Adjoint (..., 6, 6) of T (..., 4, 4): exp(Ad ξ) = T exp(ξ) T⁻¹, twists ordered (v, ω)."""
+    T = np.asarray(T, float)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return out

@@ -1,0 +1,90 @@
+"""What the readers of skeleton motions share: text in, Euler angles to rotations, local poses to world poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError
+
+
+def read_text(path: str | PathLike[str], kind: str) -> str:
+    """Text of a file of the given kind ("BVH"), line ends as \\n; FileError if it cannot be had or is no text."""
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as file:
+            text = file.read()
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror}"
+        raise FileError(problem, file=path, remedy=f"Give the path of a {kind} file.") from error
+    if "\0" in text:
+        raise FileError(f"is a binary file, not {kind} text", file=path, remedy=f"Give a {kind} file.")
+    return text
+
+
+def parse_numbers(tokens: Sequence[str], *, file: str | PathLike[str], line: int) -> list[float]:
+    """Finite numbers of one line; FileError naming file and line otherwise."""
+    try:
+        values = [float(token) for token in tokens]
+    except ValueError:
+        bad = next(token for token in tokens if not _is_number(token))
+        raise FileError(
+            f"'{bad}' is not a number",
+            file=file,
+            place=f"line {line}",
+            remedy="Export the motion again, with a point as the decimal mark.",
+        ) from None
+    if not all(map(math.isfinite, values)):
+        raise FileError(
+            "holds a value that is not finite",
+            file=file,
+            place=f"line {line}",
+            remedy="Fill the gaps of the motion before exporting, or cut these frames out.",
+        )
+    return values
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    return True
+
+
+def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
+    """Product of the elementary rotations about `axes`, from left to right.
+
+    Parameters
+    ----------
+    angles : (..., A) [rad]
+    axes : A of "x", "y", "z"
+        "zyx" gives Rz(a0) Ry(a1) Rx(a2).
+
+    Returns
+    -------
+    (..., 3, 3)
+    """
+    rotations = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
+    for k, axis in enumerate(axes):
+        i = "xyz".index(axis)
+        j, l = (i + 1) % 3, (i + 2) % 3
+        c, s = np.cos(angles[..., k]), np.sin(angles[..., k])
+        elementary = np.zeros((*angles.shape[:-1], 3, 3))
+        elementary[..., i, i] = 1.0
+        elementary[..., j, j] = elementary[..., l, l] = c
+        elementary[..., l, j], elementary[..., j, l] = s, -s
+        rotations = rotations @ elementary
+    return rotations
+
+
+def joint_poses(parents: Sequence[int], Ts_parent_joint: NDArray) -> NDArray:
+    """Poses in the world, (F, J, 4, 4), from poses in the parent's frame; parents come before children."""
+    Ts_world_joint = np.array(Ts_parent_joint)
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            Ts_world_joint[:, joint] = Ts_world_joint[:, parent] @ Ts_parent_joint[:, joint]
+    return Ts_world_joint

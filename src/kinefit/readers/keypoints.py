@@ -1,0 +1,301 @@
+"""2D keypoints of detectors: OpenPose json folders, MediaPipe arrays, caliscope tables."""
+
+from __future__ import annotations
+
+import csv
+import re
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError, choices
+from kinefit.observations import Keypoints
+
+if TYPE_CHECKING:
+    from kinefit.geometry.camera import ImageFrame
+
+_FACE_ARMS_LEGS = (
+    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
+)
+_FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
+_PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
+
+KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
+    "BODY_25B": (
+        *_FACE_ARMS_LEGS.split(), "UpperNeck", "HeadTop", "LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel"
+    ),
+    "BODY_25": tuple(
+        "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
+        "REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
+    ),
+    "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
+    "HALPE_26": (
+        *_FACE_ARMS_LEGS.split(), "Head", "Neck", "Hip", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel"
+    ),
+    "MEDIAPIPE_33": (
+        *_FACE.split(), "mouth_left", "mouth_right", *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right"))
+    ),
+}  # names in each detector's own order
+_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+
+
+def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
+    """Names of a keypoint set in the detector's order; ObservationError lists the sets that exist."""
+    if keypoint_set not in KEYPOINT_SETS:
+        raise ObservationError(choices("keypoint set", keypoint_set, KEYPOINT_SETS))
+    return KEYPOINT_SETS[keypoint_set]
+
+
+class _Person(msgspec.Struct):
+    pose_keypoints_2d: list[float]
+
+
+class _OpenPoseFrame(msgspec.Struct):
+    people: list[_Person]
+
+
+_decode = msgspec.json.Decoder(_OpenPoseFrame).decode
+
+
+def read_openpose(
+    folder: str | PathLike[str],
+    *,
+    camera: str,
+    rate: float,
+    keypoint_set: str = "BODY_25B",
+    frames: tuple[int, int] | None = None,
+    time_offset: float = 0.0,
+    image_frame: ImageFrame | None = None,
+) -> Keypoints:
+    """Read a folder with one json file per frame, as OpenPose and its followers write them.
+
+    Parameters
+    ----------
+    folder : path
+        Files are taken in the order of the frame number that ends their name; the first one is frame 0.
+    camera : str
+    rate : float [Hz]
+    keypoint_set : str
+        One of `KEYPOINT_SETS`; the files do not tell it.
+    frames : (start, stop), optional
+        Only these; their times stay what they were.
+    time_offset : float [s]
+    image_frame : ImageFrame, optional
+        The image frame the coordinates are in, if it is not the calibration's.
+
+    Returns
+    -------
+    Keypoints
+        All people of every frame, in the files' order; (0, 0) with confidence 0 becomes NaN.
+
+    Raises
+    ------
+    ObservationError
+        A frame number that is missing or there twice, broken json, NaN, another number of keypoints, nobody at all.
+    FileError
+        No such folder, or no json in it.
+    """
+    folder = Path(folder)
+    names = keypoint_names(keypoint_set)
+    paths, start = _cut(_numbered_files(folder), frames, folder)
+    people = [_read_people(path, len(names), keypoint_set) for path in paths]
+    if not any(map(len, people)):
+        raise ObservationError(
+            f"nobody is seen in any of the {len(paths)} frames of camera {camera}", file=folder,
+            remedy="Check that the detector ran on this camera's video; or leave this camera out.",
+        )
+    data = np.zeros((len(people), max(map(len, people)), len(names), 3))
+    for row, persons in zip(data, people, strict=True):
+        row[: len(persons)] = persons
+    return _keypoints(data, names, camera, keypoint_set, rate, time_offset + start / rate, folder, image_frame)
+
+
+def read_mediapipe(
+    path: str | PathLike[str],
+    *,
+    camera: str,
+    rate: float,
+    frames: tuple[int, int] | None = None,
+    time_offset: float = 0.0,
+    image_frame: ImageFrame | None = None,
+) -> Keypoints:
+    """Read MediaPipe pose landmarks from an array file (.npy).
+
+    Parameters
+    ----------
+    path : path
+        (F, 33, 3): x, y [px] in the video's image frame, visibility; frames with nobody are all NaN or all zero.
+    camera, rate, frames, time_offset
+        As in `read_openpose`.
+    image_frame : ImageFrame, optional
+        The video's image frame, from which the points are converted to the calibration's.
+
+    Raises
+    ------
+    ObservationError
+        Another shape, single NaNs, nobody at all.
+    FileError
+        Missing or not an array file.
+    """
+    path = Path(path)
+    names = KEYPOINT_SETS["MEDIAPIPE_33"]
+    try:
+        data = np.load(path, allow_pickle=False)
+    except FileNotFoundError as error:
+        raise FileError("no such file", file=path) from error
+    except (OSError, ValueError, EOFError) as error:
+        raise FileError(f"not a numpy array file ({error})", file=path, remedy="Write it by numpy.save.") from error
+    if not isinstance(data, np.ndarray) or data.dtype.kind not in "fiu" or data.shape[1:] != (len(names), 3):
+        raise ObservationError(
+            f"landmarks have shape {getattr(data, 'shape', None)}", file=path,
+            remedy=f"Give (frames, {len(names)}, 3) numbers: x, y [px], visibility.",
+        )
+    data, start = _cut(data, frames, path)
+    data = np.array(data, dtype=float)
+    data[np.isnan(data).all(axis=(1, 2))] = 0
+    if not np.isfinite(data).all():
+        frame, point, _ = np.argwhere(~np.isfinite(data))[0]
+        raise ObservationError(
+            f"NaN or infinity at {names[point]}", file=path, place=f"frame {start + frame}",
+            remedy="A frame with nobody must be NaN (or zero) as a whole.",
+        )
+    if not data[..., 2].any():
+        raise ObservationError(f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path)
+    return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset + start / rate, path, image_frame)
+
+
+def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
+    """Read the body landmarks (MediaPipe's 33) of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
+
+    Parameters
+    ----------
+    path : path
+        Columns sync_index, port, frame_time, point_id, img_loc_x, img_loc_y [px].
+    rate : float [Hz], optional
+        Default: the median of the table's own times.
+
+    Returns
+    -------
+    {"cam_0": Keypoints, ...}
+        One entry per port; frames are sync indices from the smallest on; confidence is 1 where seen.
+
+    Raises
+    ------
+    FileError, ObservationError
+        Missing file; missing columns, cells that are no numbers, no body landmark.
+    """
+    path, names = Path(path), KEYPOINT_SETS["MEDIAPIPE_33"]
+    columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
+                raise ObservationError(f"no column {', '.join(missing)}", file=path, remedy=f"Needed: {', '.join(columns)}.")
+            table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
+    except FileNotFoundError as error:
+        raise FileError("no such file", file=path) from error
+    except (ValueError, TypeError, UnicodeDecodeError) as error:
+        raise ObservationError(f"a cell is not a number ({error})", file=path) from error
+    table = table[(table[:, 3] < len(names)) & np.isfinite(table).all(axis=1)]
+    if not len(table):
+        raise ObservationError("no landmark of the body in this table", file=path, remedy="Track the whole pose.")
+    frame, port, point = (table[:, k].astype(int) for k in (0, 1, 3))
+    frame = frame - frame.min()
+    if rate is None:
+        first = port == port[0]
+        _, at = np.unique(frame[first], return_index=True)
+        rate = float(1 / np.median(np.diff(table[first, 2][at]))) if len(at) > 1 else 1.0
+    keypoints = {}
+    for p in np.unique(port):
+        data = np.zeros((frame.max() + 1, 1, len(names), 3))
+        rows = port == p
+        data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
+        keypoints[f"cam_{p}"] = _keypoints(data, names, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, path, None)
+    return keypoints
+
+
+READERS = {"openpose": read_openpose, "mediapipe": read_mediapipe}  # for one camera's file or folder
+
+
+def _numbered_files(folder: Path) -> list[Path]:
+    """Json files of a folder by frame number, without gaps."""
+    if not folder.is_dir():
+        raise FileError("no such folder of json files", file=folder)
+    numbered: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() != ".json":
+            continue
+        match = _NUMBER.search(path.name)
+        if not match:
+            raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_000012_keypoints.json.")
+        number = int(match[1])
+        if number in numbered:
+            raise ObservationError(
+                f"frame {number} is there twice, also as {numbered[number].name}", file=path,
+                remedy="Keep one camera in each folder.",
+            )
+        numbered[number] = path
+    if not numbered:
+        raise FileError("there are no json files in this folder", file=folder)
+    first, last = min(numbered), max(numbered)
+    if missing := [i for i in range(first, last + 1) if i not in numbered] if last - first >= len(numbered) else []:
+        before = numbered[max(i for i in numbered if i < missing[0])]
+        raise ObservationError(
+            f"{len(missing)} of the frames {first} to {last} are missing, the first is {missing[0]}", file=folder,
+            place=f"after {before.name}", remedy="Run the detector again with a file for every frame, also for empty ones.",
+        )
+    return [numbered[i] for i in range(first, last + 1)]
+
+
+def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
+    """(P, K, 3): x, y, confidence of all people of one frame."""
+    raw = path.read_bytes()
+    try:
+        people = _decode(raw).people
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        problem = "NaN or infinity among the keypoints" if re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw) else f"broken json ({error})"
+        raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
+    for i, person in enumerate(people):
+        if len(person.pose_keypoints_2d) != 3 * count:
+            fitting = [name for name, names in KEYPOINT_SETS.items() if 3 * len(names) == len(person.pose_keypoints_2d)]
+            raise ObservationError(
+                f"{len(person.pose_keypoints_2d)} numbers where {keypoint_set} has {count} x 3", file=path,
+                place=f"person {i}", remedy=f"This number fits: {', '.join(fitting) or 'no known keypoint set'}.",
+            )
+    data = np.array([person.pose_keypoints_2d for person in people], dtype=float).reshape(len(people), count, 3)
+    if not np.isfinite(data).all():
+        raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")
+    return data
+
+
+def _cut(items, frames: tuple[int, int] | None, file: Path):  # type: ignore[no-untyped-def]
+    """Slice of the frames [start, stop) and its start."""
+    if frames is None:
+        return items, 0
+    if not 0 <= frames[0] < frames[1] <= len(items):
+        raise ObservationError(
+            f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file, remedy=f"There are frames = [0, {len(items)}]."
+        )
+    return items[frames[0] : frames[1]], frames[0]
+
+
+def _keypoints(
+    data: NDArray, names: tuple[str, ...], camera: str, keypoint_set: str, rate: float, time_offset: float,
+    source: Path, image_frame: ImageFrame | None,
+) -> Keypoints:
+    """Record from (F, P, K, 3) x, y, confidence with zeros where unseen."""
+    if not rate > 0 or not np.isfinite(rate):
+        raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
+    confidence = np.clip(data[..., 2], 0, 1)
+    points = data[..., :2]
+    seen = (confidence > 0) | points.any(axis=-1)
+    if image_frame is not None:
+        points = image_frame.to_calibration(points)
+    return Keypoints(
+        camera, keypoint_set, names, rate, np.where(seen[..., None], points, np.nan), np.where(seen, confidence, 0.0),
+        time_offset=time_offset, source=str(source),
+    )

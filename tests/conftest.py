@@ -1,0 +1,28 @@
+"""What all tests share: real recordings, and settings of hypothesis."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# The first example of a test may compile a kernel, so no deadline; a failure is repeated by anyone who runs the test.
+settings.register_profile("kinefit", deadline=None, max_examples=50, derandomize=True)
+settings.load_profile("kinefit")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Callable[[str], Path]:
+    """Find a folder of real recordings by name; skip the test where it is absent."""
+
+    def find(name: str) -> Path:
+        root = Path(os.environ.get("KINEFIT_DATA") or ROOT.parent / "shared" / "data")
+        folder = root / name
+        if not folder.is_dir():
+            pytest.skip(f"no recording '{name}' in {root}: set KINEFIT_DATA to the folder of recordings")
+        return folder
+
+    return find

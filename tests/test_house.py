@@ -1,0 +1,191 @@
+"""The rules of the house that a machine can hold: who may import whom, short files, docstrings, kernels kept apart."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "kinefit"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+# Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
+LEVELS = [
+    {"errors", "_jit"},
+    {"geometry"},
+    {"bodies", "observations", "motion"},
+    {"readers", "images", "rendering", "rows"},
+    {"correspondences"},
+    {"solvers"},
+    {"calibration", "identification", "tracking"},
+    {"simulation", "evaluation", "recipes"},
+    {"batch"},
+    {"cli", "__main__"},
+]
+BESIDE = {("motion", "bodies"), ("__main__", "cli")}
+LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
+OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
+SEEN_ONLY_BY = {
+    "exporters": {"recipes", "batch", "cli"},
+    "viewers": {"recipes", "batch", "cli"},
+    "assets": {"cli"},
+}
+LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds
+
+
+def part_of(path: Path) -> str:
+    """Top-level part of the package that a file belongs to: "geometry", "errors", "" for kinefit/__init__.py."""
+    first = path.relative_to(PACKAGE).parts[0]
+    return "" if first == "__init__.py" else first.removesuffix(".py")
+
+
+def imported_parts(tree: ast.AST, path: Path) -> set[tuple[str, int]]:
+    """Parts of kinefit that a module imports anywhere in it, with the line; "" is kinefit/__init__.py itself."""
+    package = ["kinefit", *path.relative_to(PACKAGE).parts[:-1]]
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names = [f"{module}.{alias.name}" for alias in node.names] if module == "kinefit" else [module]
+        else:
+            continue
+        for name in names:
+            first, *rest = name.split(".")
+            if first == "kinefit":
+                known = rest and (rest[0] in LEVEL or rest[0] in OUTPUTS or rest[0] in SEEN_ONLY_BY)
+                is_module = rest and ((PACKAGE / rest[0]).is_dir() or (PACKAGE / f"{rest[0]}.py").is_file())
+                found.add((rest[0] if known or is_module else "", node.lineno))
+    return found
+
+
+def may_import(importer: str, imported: str) -> bool:
+    """Whether one part of the house may see another."""
+    if importer in (imported, ""):
+        return True
+    if importer in SEEN_ONLY_BY.get(imported, {importer}) and imported in SEEN_ONLY_BY:
+        return True
+    if imported in SEEN_ONLY_BY or imported == "":
+        return imported == "" and importer in ("cli", "__main__", "batch")
+    if importer == "assets":
+        return LEVEL[imported] == 0
+    height = LEVEL["correspondences"] if importer in OUTPUTS else LEVEL[importer]
+    return LEVEL[imported] < height or (importer, imported) in BESIDE
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported", "allowed"),
+    [
+        ("geometry", "errors", True), ("geometry", "bodies", False), ("motion", "bodies", True),
+        ("bodies", "motion", False), ("bodies", "observations", False), ("readers", "rows", False),
+        ("correspondences", "rows", True), ("rows", "correspondences", False), ("solvers", "readers", True),
+        ("tracking", "calibration", False), ("exporters", "rows", True), ("exporters", "correspondences", False),
+        ("tracking", "exporters", False), ("recipes", "exporters", True), ("cli", "viewers", True),
+        ("cli", "assets", True), ("tracking", "assets", False), ("assets", "_jit", True), ("assets", "readers", False),
+        ("tracking", "", False), ("cli", "", True), ("", "tracking", True), ("simulation", "recipes", False),
+    ],
+)
+def test_the_order_says_what_the_architecture_says(importer, imported, allowed):
+    assert may_import(importer, imported) is allowed
+
+
+def test_every_part_has_its_place():
+    parts = {part_of(path) for path in SOURCES} - {""}
+    unknown = parts - set(LEVEL) - OUTPUTS - set(SEEN_ONLY_BY)
+    assert not unknown, f"{unknown} have no place in LEVELS of this test: give them one"
+
+
+def test_imports_are_found_in_every_form():
+    forms = ("import kinefit.rows", "from kinefit import bodies, Body", "from ..geometry import se3")
+    text = "\n".join([*forms, "def f():", " from .. import errors"])
+    found = {part for part, _ in imported_parts(ast.parse(text), PACKAGE / "solvers" / "x.py")}
+    assert found == {"rows", "bodies", "", "geometry", "errors"}
+
+
+def test_imports_run_downwards():
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports kinefit.{imported}"
+        for path in SOURCES
+        for imported, line in sorted(imported_parts(ast.parse(path.read_text("utf-8")), path))
+        if not may_import(part_of(path), imported)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_files_are_short():
+    wrong = []
+    for folder in ("src", "examples"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            name = path.relative_to(ROOT).as_posix()
+            longest = next(lines for start, lines in LONGEST.items() if name.startswith(start + "/"))
+            if (lines := len(path.read_text("utf-8").splitlines())) > longest:
+                wrong.append(f"{name}: {lines} lines, {longest} are allowed")
+    assert not wrong, "\n".join(wrong)
+
+
+def public_without_docstring(body: list[ast.stmt], prefix: str = "") -> list[str]:
+    """Names of public classes, functions and methods that say nothing."""
+    found = []
+    for node in body:
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
+            continue
+        marks = [ast.unparse(mark) for mark in node.decorator_list]
+        if not ast.get_docstring(node) and not any(mark.endswith((".setter", "overload")) for mark in marks):
+            found.append(f"{node.lineno} {prefix}{node.name}")
+        if isinstance(node, ast.ClassDef):
+            found += public_without_docstring(node.body, f"{node.name}.")
+    return found
+
+
+def test_everything_public_says_what_it_is():
+    wrong = []
+    for path in SOURCES:
+        tree = ast.parse(path.read_text("utf-8"))
+        missing = public_without_docstring(tree.body)
+        if tree.body and not ast.get_docstring(tree):
+            missing.insert(0, "1 the module itself")
+        wrong += [f"{path.relative_to(ROOT)}:{name}" for name in missing]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_only_kernels_know_the_compiler():
+    wrong = []
+    for path in SOURCES:
+        if path.name == "_jit.py" or path.name.startswith("_kernels"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            if any(name.split(".")[0] == "numba" for name in names):
+                wrong.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_file_names_a_folder_of_one_machine():
+    own = re.compile(r"(?<![\w.~}/$-])/(?:work|home|root|opt|mnt|Users)/\w")
+    assert own.search('open("/' 'home/me/x")') and not own.search("a/work/b ~/work")
+    kept = {".py", ".toml", ".md", ".txt", ".cfg", ".yml", ".yaml", ".sh", ""}
+    folders = [ROOT / name for name in ("src", "tests", "docs", "examples", "benchmarks", ".ci")]
+    files = [path for path in ROOT.iterdir() if path.is_file()]
+    files += [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    wrong = []
+    for path in files:
+        skip = {"__pycache__", "_build", "generated"} & set(path.relative_to(ROOT).parts)
+        if skip or path.suffix not in kept or path.name.startswith(".coverage"):
+            continue
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
+            if own.search(line):
+                wrong.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_readme_has_the_two_commands_that_the_checks_run():
+    readme = (ROOT / "README.md").read_text("utf-8")
+    for name in ("demo command", "test command"):
+        after = readme.partition(f"<!-- {name} -->")[2]
+        command = re.match(r"\s*```bash\n([^\n]+)\n```", after)
+        assert command, f"README.md: no single shell line after <!-- {name} -->"
+        assert command[1].startswith("python3 -m venv")
