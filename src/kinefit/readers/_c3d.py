@@ -1,7 +1,7 @@
 """C3D files as they lie on disk: header, parameters and 3D points, every offset checked against the file.
 
-Written here rather than taken from ezc3d, which crashes on some damaged files, reads truncated ones as if they were whole
-and refuses big-endian ones and parameters of an unexpected type. Format: the C3D User Guide of Motion Lab Systems, 2008.
+Written here rather than taken from ezc3d, which crashes on some damaged files, reads truncated ones as if they were
+whole, and refuses big-endian ones and unexpected types. Format: C3D User Guide, Motion Lab Systems, 2008.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def read_c3d(path: Path) -> C3d:
     except OSError as error:
         raise FileError(f"cannot be read ({error})", file=path) from error
     if len(raw) < 2 * _BLOCK or raw[1] != 0x50 or raw[0] == 0:
-        raise FileError(f"not a C3D file ({len(raw)} bytes)", file=path, remedy="Name a C3D file exported from the system.")
+        raise FileError(f"not a C3D file ({len(raw)} bytes)", file=path, remedy="Name a C3D file of your system.")
     section = (raw[0] - 1) * _BLOCK
     processor = _PROCESSORS.get(raw[section + 3]) if section + 4 <= len(raw) else None
     if processor is None:
@@ -82,9 +82,9 @@ def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> di
         if group == 0:
             break
         if pointer + 2 > end:
-            raise FileError("a parameter record runs out of its section", file=path, place=f"after {last}", remedy=_REMEDY)
+            raise FileError("a parameter runs out of its section", file=path, place=f"after {last}", remedy=_REMEDY)
         name = raw[at + 2 : pointer].decode("latin-1").strip().upper()
-        offset = int(_numbers(raw[pointer : pointer + 2], 2, processor).view(f"{'>' if processor == 'mips' else '<'}u2")[0])
+        offset = int.from_bytes(raw[pointer : pointer + 2], "big" if processor == "mips" else "little")
         following = pointer + offset
         if not name.isprintable() or (offset and (offset < 3 or following > end)):
             raise FileError(
@@ -112,7 +112,7 @@ def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
     size = _SIZES.get(kind, 0) * int(np.prod(shape, dtype=object)) if rank else _SIZES.get(kind, 0)
     data = record[2 + rank : 2 + rank + size]
     if kind not in _SIZES or len(shape) < rank or len(data) < size:
-        raise FileError("a parameter is longer than its record, or of no known type", file=path, place=key, remedy=_REMEDY)
+        raise FileError("longer than its record, or of no known type", file=path, place=key, remedy=_REMEDY)
     if kind != -1:
         return _numbers(data, kind, processor)
     width = shape[0] if shape else 1
@@ -139,9 +139,9 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
     scale, rate = _number(parameters, "POINT:SCALE") or scale, _number(parameters, "POINT:RATE") or rate
     used = _number(parameters, "POINT:USED")
     if used is not None and int(used) % 65536 != count:
-        raise FileError(f"{count} points in the header, POINT:USED says {used:.0f}", file=path, place="header", remedy=_REMEDY)
+        raise FileError(f"{count} points, POINT:USED says {used:.0f}", file=path, place="header", remedy=_REMEDY)
     if not (np.isfinite(scale) and scale != 0 and np.isfinite(rate) and rate > 0):
-        raise FileError(f"scale {scale:g} and rate {rate:g} Hz make no sense", file=path, place="header", remedy=_REMEDY)
+        raise FileError(f"scale {scale:g}, rate {rate:g} Hz", file=path, place="header", remedy=_REMEDY)
     width = 4 if scale < 0 else 2
     step = (4 * count + analog) * width
     begin = (start - 1) * _BLOCK
@@ -164,7 +164,7 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
 
 
 def _frames(parameters: dict[str, Values], first: int, last: int, room: int) -> tuple[int, int]:
-    """Number of the first frame and count of frames: header, POINT:FRAMES or TRIAL fields, whichever the file can hold."""
+    """First frame and count of frames: of the header, POINT:FRAMES or TRIAL, whichever the file can hold."""
     counts = [last - first + 1]
     stated = _number(parameters, "POINT:FRAMES")
     if stated is not None and np.isfinite(stated):

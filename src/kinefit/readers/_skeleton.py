@@ -13,7 +13,7 @@ from kinefit.errors import FileError
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:
-    """Text of a file of the given kind ("BVH"), line ends as \\n; FileError if it cannot be had or is no text."""
+    """Text of a file of the given kind ("BVH"); FileError if it cannot be had or is no text."""
     try:
         with open(path, encoding="utf-8-sig", errors="replace") as file:
             text = file.read()

@@ -33,9 +33,10 @@ class _Joint:
 def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str = "auto") -> SkeletonMotion:
     """Read a BVH file.
 
-    A position channel replaces the joint's offset along its axis, for the root as for other joints; rotation
-    channels multiply from left to right in the order in which the file lists them. The rest pose is that of all
-    angles zero, which need not be one that a person can take.
+    Rotation channels multiply from left to right in the order in which the file lists them. Position channels
+    hold the joint's place instead of its OFFSET in some programs' files and the way from its OFFSET in others';
+    taken is whichever the values are nearer to (for the root: in height). The rest pose is that of all angles
+    zero, which need not be one that a person can take.
 
     Parameters
     ----------
@@ -60,33 +61,33 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
         if no unit makes it human and none was given.
     """
     text = read_text(path, "BVH")
-    head, mark, body = re.split(r"^[ \t]*(MOTION)\b", text, maxsplit=1, flags=re.M | re.I) if _has_motion(text) else (
-        text, "", "")
-    joints = _read_hierarchy(head, path)
-    if not mark:
+    if up not in ("x", "y", "z", "auto"):
+        raise FileError(f"up {up!r} is not an axis", file=path, remedy='Give "x", "y", "z" or "auto".')
+    hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
+    joints = _read_hierarchy(hierarchy, path)
+    if not motion:
         raise FileError("holds no MOTION section", file=path, remedy="Export the skeleton with its motion.")
     channels = sum(len(joint.channels) for joint in joints)
-    rate, values = _read_motion(body, channels, head.count("\n") + 1, path)
+    rate, values = _read_motion(motion[0], channels, hierarchy.count("\n") + 1, path)
 
     names = tuple(joint.name for joint in joints)
     parents = [joint.parent for joint in joints]
     offsets = np.array([joint.offset for joint in joints])
-    unit = _human_unit(names, parents, offsets, path) if unit == "auto" else _given_unit(unit, path)
+    scale = _human_unit(names, parents, offsets, path) if unit == "auto" else _given_unit(unit, path)
     Ts_world_joint = joint_poses(parents, _local_poses(joints, values))
-    Ts_world_joint[..., :3, 3] *= unit
+    if up == "auto":
+        up = _up_axis(names, Ts_world_joint[..., :3, 3])
+    Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
+    Ts_world_joint[..., :3, 3] *= scale
     return SkeletonMotion(
         names=names,
         parents=np.array(parents),
-        offsets=offsets * unit,
+        offsets=offsets * scale,
         rate=rate,
         Ts_world_joint=Ts_world_joint,
-        up=_up_axis(names, Ts_world_joint[..., :3, 3]) if up == "auto" else up,
-        source=f"{fspath(path)} (unit {unit:.6g} m)",
+        up=up,
+        source=f"{fspath(path)} (unit {scale:.6g} m)",
     )
-
-
-def _has_motion(text: str) -> bool:
-    return re.search(r"^[ \t]*MOTION\b", text, flags=re.M | re.I) is not None
 
 
 def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
@@ -133,8 +134,10 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
             case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
                 count = take(1)[0]
                 channels = tuple(word.lower() for word in take(int(count) if count.isdecimal() else 0))
-                if not count.isdecimal() or len(set(channels)) < len(channels) or not all(
-                    re.fullmatch("[xyz](position|rotation)", channel) for channel in channels
+                if (
+                    not count.isdecimal()
+                    or len(set(channels)) < len(channels)
+                    or not all(re.fullmatch("[xyz](position|rotation)", channel) for channel in channels)
                 ):
                     raise fault(f"CHANNELS {count} {' '.join(channels)} is not a list of that many channels", line)
                 joint = joints[open_joints[-1]["index"]]
@@ -179,7 +182,7 @@ def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str])
             place=f"line {lines[1 if frames else 0][0]}",
             remedy="Export the motion again.",
         )
-    values = []
+    values: list[list[float]] = []
     for n, row in rows:
         numbers = parse_numbers(row.split(), file=path, line=n)
         if len(numbers) != channels:
@@ -219,14 +222,33 @@ def _local_poses(joints: Sequence[_Joint], values: NDArray) -> NDArray:
     for i, joint in enumerate(joints):
         columns = values[:, at : at + len(joint.channels)]
         at += len(joint.channels)
-        rotations = [k for k, channel in enumerate(joint.channels) if channel.endswith("rotation")]
-        axes = [joint.channels[k][0] for k in rotations]
-        Ts_parent_joint[:, i, :3, :3] = euler_rotations(np.radians(columns[:, rotations]), axes)
+        turns = [k for k, channel in enumerate(joint.channels) if channel.endswith("rotation")]
+        Ts_parent_joint[:, i, :3, :3] = euler_rotations(
+            np.radians(columns[:, turns]), [joint.channels[k][0] for k in turns]
+        )
         Ts_parent_joint[:, i, :3, 3] = joint.offset
-        for k, channel in enumerate(joint.channels):
-            if channel.endswith("position"):
-                Ts_parent_joint[:, i, "xyz".index(channel[0]), 3] = columns[:, k]
+        shifts = [k for k, channel in enumerate(joint.channels) if channel.endswith("position")]
+        axes = ["xyz".index(joint.channels[k][0]) for k in shifts]
+        offset = np.array(joint.offset)[axes]
+        added = i > 0 and _is_added(columns[:, shifts], offset)
+        Ts_parent_joint[:, i, axes, 3] = columns[:, shifts] + (offset if added else 0.0)
     return Ts_parent_joint
+
+
+def _is_added(positions: NDArray, offset: NDArray) -> bool:
+    """Whether position channels (F, P) are the way from the OFFSET (P,) rather than a place near it."""
+    from_origin = np.median(np.linalg.norm(positions, axis=1))
+    return bool(from_origin <= np.median(np.linalg.norm(positions - offset, axis=1)))
+
+
+def _root_shift(root: _Joint, values: NDArray, up: str) -> NDArray:
+    """(3,) the root's OFFSET where its position channels are to be added to it, else zero."""
+    shift = np.zeros(3)
+    height = [k for k, channel in enumerate(root.channels) if channel == f"{up}position"]
+    if _is_added(values[:, height], np.array(root.offset)[["xyz".index(up)] * len(height)]):
+        axes = ["xyz".index(channel[0]) for channel in root.channels if channel.endswith("position")]
+        shift[axes] = np.array(root.offset)[axes]
+    return shift
 
 
 def _given_unit(unit: float | str, path: str | PathLike[str]) -> float:
@@ -239,9 +261,7 @@ def _given_unit(unit: float | str, path: str | PathLike[str]) -> float:
     return value
 
 
-def _human_unit(
-    names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]
-) -> float:
+def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]) -> float:
     """The unit of `UNITS` in which the skeleton is most human.
 
     Measured along the bones from head to ankle, which no pose changes; by the extent of the rest pose where the
@@ -250,12 +270,13 @@ def _human_unit(
     head, feet = _landmarks(names)
     if head is not None and feet:
         chains = [set(_chain(head, parents)) ^ set(_chain(foot, parents)) for foot in feet]
-        height = np.mean([sum(np.linalg.norm(offsets[j]) for j in chain) for chain in chains]) / _HEAD_TO_ANKLE
+        lengths = np.linalg.norm(offsets, axis=1)
+        height = float(np.mean([lengths[list(chain)].sum() for chain in chains])) / _HEAD_TO_ANKLE
     else:
         rest = np.array(offsets)
         for joint, parent in enumerate(parents):
             rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
-        height = np.ptp(rest, axis=0).max()
+        height = float(np.ptp(rest, axis=0).max())
     unit = min(UNITS, key=lambda u: abs(height * u - _STATURE))
     if not _LEAST <= height * unit <= _LARGEST:
         raise FileError(

@@ -6,7 +6,7 @@ import csv
 import re
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -26,7 +26,8 @@ _PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
 
 KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     "BODY_25B": (
-        *_FACE_ARMS_LEGS.split(), "UpperNeck", "HeadTop", "LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel"
+        *_FACE_ARMS_LEGS.split(),
+        *"UpperNeck HeadTop LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split(),
     ),
     "BODY_25": tuple(
         "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
@@ -34,10 +35,12 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     ),
     "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
     "HALPE_26": (
-        *_FACE_ARMS_LEGS.split(), "Head", "Neck", "Hip", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel"
+        *_FACE_ARMS_LEGS.split(),
+        *"Head Neck Hip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split(),
     ),
     "MEDIAPIPE_33": (
-        *_FACE.split(), "mouth_left", "mouth_right", *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right"))
+        *_FACE.split(), "mouth_left", "mouth_right",
+        *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
     ),
 }  # names in each detector's own order
 _NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
@@ -194,7 +197,8 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
-                raise ObservationError(f"no column {', '.join(missing)}", file=path, remedy=f"Needed: {', '.join(columns)}.")
+                needed = f"Needed: {', '.join(columns)}."
+                raise ObservationError(f"no column {', '.join(missing)}", file=path, remedy=needed)
             table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
     except FileNotFoundError as error:
         raise FileError("no such file", file=path) from error
@@ -218,7 +222,29 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     return keypoints
 
 
-READERS = {"openpose": read_openpose, "mediapipe": read_mediapipe}  # for one camera's file or folder
+def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **options: Any) -> Keypoints:
+    """Read one camera's keypoints of any format.
+
+    Parameters
+    ----------
+    path : path
+    format : "openpose" or "mediapipe", optional
+        Default: a folder is OpenPose's, a .npy file MediaPipe's.
+    **options
+        Of `read_openpose` or `read_mediapipe`.
+
+    Raises
+    ------
+    ObservationError, FileError
+        An unknown format; and what those raise.
+    """
+    formats = {"openpose": read_openpose, "mediapipe": read_mediapipe}
+    if format is None:
+        format = "openpose" if Path(path).is_dir() else "mediapipe"
+    if format not in formats:
+        raise ObservationError(choices("keypoint format", format, formats), file=path)
+    reader: Any = formats[format]
+    return reader(path, **options)
 
 
 def _numbered_files(folder: Path) -> list[Path]:
@@ -231,7 +257,7 @@ def _numbered_files(folder: Path) -> list[Path]:
             continue
         match = _NUMBER.search(path.name)
         if not match:
-            raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_000012_keypoints.json.")
+            raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
         if number in numbered:
             raise ObservationError(
@@ -242,10 +268,12 @@ def _numbered_files(folder: Path) -> list[Path]:
     if not numbered:
         raise FileError("there are no json files in this folder", file=folder)
     first, last = min(numbered), max(numbered)
-    if missing := [i for i in range(first, last + 1) if i not in numbered] if last - first >= len(numbered) else []:
-        before = numbered[max(i for i in numbered if i < missing[0])]
+    count = last - first + 1 - len(numbered)
+    if count:
+        missing = next(i for i in range(first, last) if i not in numbered)
+        before = numbered[missing - 1]
         raise ObservationError(
-            f"{len(missing)} of the frames {first} to {last} are missing, the first is {missing[0]}", file=folder,
+            f"{count} of the frames {first} to {last} are missing, the first is {missing}", file=folder,
             place=f"after {before.name}", remedy="Run the detector again with a file for every frame, also for empty ones.",
         )
     return [numbered[i] for i in range(first, last + 1)]
@@ -257,11 +285,12 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     try:
         people = _decode(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        problem = "NaN or infinity among the keypoints" if re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw) else f"broken json ({error})"
+        infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
+        problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
     for i, person in enumerate(people):
         if len(person.pose_keypoints_2d) != 3 * count:
-            fitting = [name for name, names in KEYPOINT_SETS.items() if 3 * len(names) == len(person.pose_keypoints_2d)]
+            fitting = [name for name in KEYPOINT_SETS if 3 * len(KEYPOINT_SETS[name]) == len(person.pose_keypoints_2d)]
             raise ObservationError(
                 f"{len(person.pose_keypoints_2d)} numbers where {keypoint_set} has {count} x 3", file=path,
                 place=f"person {i}", remedy=f"This number fits: {', '.join(fitting) or 'no known keypoint set'}.",
@@ -272,13 +301,14 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     return data
 
 
-def _cut(items, frames: tuple[int, int] | None, file: Path):  # type: ignore[no-untyped-def]
+def _cut(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, int]:
     """Slice of the frames [start, stop) and its start."""
     if frames is None:
         return items, 0
     if not 0 <= frames[0] < frames[1] <= len(items):
         raise ObservationError(
-            f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file, remedy=f"There are frames = [0, {len(items)}]."
+            f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file,
+            remedy=f"There are frames = [0, {len(items)}].",
         )
     return items[frames[0] : frames[1]], frames[0]
 

@@ -125,7 +125,7 @@ class Video:
         stated, span = float(self._stream.average_rate or 0), self.times[-1]
         measured = (len(self) - 1) / span if span > 0 else 0.0
         if not (stated or measured):
-            raise FileError("the video tells no frame rate", file=self.path, remedy="Give it one: ffmpeg -r RATE -i ...")
+            raise FileError("the video tells no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
         return stated if stated and (not measured or abs(measured / stated - 1) < 0.02) else measured
 
 
@@ -202,7 +202,8 @@ def check_rates(rates: Mapping[str, float], *, file: str | PathLike[str] | None 
     if max(rates.values()) > 1.001 * min(rates.values()):
         listed = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in rates.items())
         raise ObservationError(
-            f"streams of different rate: {listed}", file=file, remedy="Resample them to one rate: ffmpeg -i in -r RATE out."
+            f"streams of different rate: {listed}", file=file,
+            remedy="Resample them to one rate: ffmpeg -i IN -r RATE OUT.",
         )
 
 
@@ -220,7 +221,8 @@ def common_frames(
     """
     begins = {name: round(time_offsets.get(name, 0.0) * rate) for name in lengths}
     start, stop = max(begins.values()), min(begins[name] + n for name, n in lengths.items())
-    listed = ", ".join(f"{name} {n} frames" + f" from step {begins[name]}" * (begins[name] != 0) for name, n in lengths.items())
+    shifts = {name: f" from step {begin}" if begin else "" for name, begin in begins.items()}
+    listed = ", ".join(f"{name} {n} frames{shifts[name]}" for name, n in lengths.items())
     if start >= stop:
         raise ObservationError(f"no time that all streams saw: {listed}", file=file, remedy="Check the time offsets.")
     if frames is None:
@@ -257,7 +259,7 @@ def _presentation_times(path: Path) -> list[int]:
         stream = container.streams.video[0]
         stated, rate, base = stream.frames, float(stream.average_rate or 0), float(stream.time_base or 0)
         if not stated and len(container.streams) == 1 and container.duration and container.size > 0:
-            stated = int(container.duration / av.time_base * rate * 0.98) - 2  # no count: the duration, which is rounded
+            stated = int(container.duration / av.time_base * rate * 0.98) - 2  # of the duration, which is rounded
         try:
             for packet in container.demux(stream):
                 if packet.size and packet.is_corrupt:
@@ -279,7 +281,7 @@ def _presentation_times(path: Path) -> list[int]:
         pts = _decoded_times(path)
     if not pts:
         raise FileError("no frame of this video can be decoded", file=path, remedy=_REMEDY)
-    return sorted(pts)  # type: ignore[type-var]
+    return sorted(pts)  # type: ignore[type-var,arg-type]
 
 
 def _decoded_times(path: Path) -> list[int | None]:
@@ -289,7 +291,7 @@ def _decoded_times(path: Path) -> list[int | None]:
         except (av.FFmpegError, ValueError) as error:
             raise FileError(f"the video cannot be decoded ({error})", file=path, remedy=_REMEDY) from error
     if None in pts or len(set(pts)) < len(pts):
-        raise FileError("frames without times", file=path, remedy="Put it in a container: ffmpeg -i IN -c copy OUT.mp4.")
+        raise FileError("frames without times", file=path, remedy="Repack it: ffmpeg -i IN -c copy OUT.mp4.")
     return pts
 
 

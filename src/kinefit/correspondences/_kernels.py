@@ -1,0 +1,149 @@
+"""Row makers as kernels: they fill lines `start..` of the row buffers and return the next free line.
+
+Common parameters: frames (S, 12) from forward kinematics; owner (K,) segments and rest (K, 3) points in the root frame at
+rest; buffers data (8, N) = x, n, r, w; segment (N,); group (N,).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+from kinefit.geometry._kernels_camera import project_jacobian
+
+
+@jit
+def place(frames, owner, rest, k):
+    """World position of point k."""
+    f = frames[owner[k]]
+    x, y, z = rest[k, 0], rest[k, 1], rest[k, 2]
+    return (
+        f[0] * x + f[1] * y + f[2] * z + f[9],
+        f[3] * x + f[4] * y + f[5] * z + f[10],
+        f[6] * x + f[7] * y + f[8] * z + f[11],
+    )
+
+
+@jit
+def _put(data, segment, group, i, s, g, x, y, z, nx, ny, nz, r, w):
+    data[0, i], data[1, i], data[2, i] = x, y, z
+    data[3, i], data[4, i], data[5, i] = nx, ny, nz
+    data[6, i], data[7, i] = r, w
+    segment[i], group[i] = s, g
+
+
+@jit
+def point_rows(frames, owner, rest, target, weight, data, segment, group, start):
+    """Three rows a point along the world's axes: target (K, 3) [m], weight (K,) [1/m²], 0 for none."""
+    i = start
+    for k in range(owner.size):
+        w = weight[k]
+        if w <= 0.0:
+            continue
+        x, y, z = place(frames, owner, rest, k)
+        s = owner[k]
+        _put(data, segment, group, i, s, k, x, y, z, 1.0, 0.0, 0.0, target[k, 0] - x, w)
+        _put(data, segment, group, i + 1, s, k, x, y, z, 0.0, 1.0, 0.0, target[k, 1] - y, w)
+        _put(data, segment, group, i + 2, s, k, x, y, z, 0.0, 0.0, 1.0, target[k, 2] - z, w)
+        i += 3
+    return i
+
+
+@jit
+def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, segment, group, start):
+    """One row a point along normal (K, 3) of the plane through target (K, 3) [m], weight (K,) [1/m²]."""
+    i = start
+    for k in range(owner.size):
+        w = weight[k]
+        if w <= 0.0:
+            continue
+        x, y, z = place(frames, owner, rest, k)
+        nx, ny, nz = normal[k, 0], normal[k, 1], normal[k, 2]
+        r = nx * (target[k, 0] - x) + ny * (target[k, 1] - y) + nz * (target[k, 2] - z)
+        _put(data, segment, group, i, owner[k], first_group + k, x, y, z, nx, ny, nz, r, w)
+        i += 1
+    return i
+
+
+@jit
+def pixel_rows(frames, owner, rest, cameras, camera, target, weight, data, segment, group, start):
+    """Two rows a pixel: the exact linearisation of reprojection with distortion.
+
+    cameras (C, P) packed, camera (K,) index, target (K, 2) [px], weight (K,) [1/px²]. With g = ∂u/∂x: n = g/|g|,
+    r = Δu/|g|, w = weight |g|². A point that its camera cannot see makes no row.
+    """
+    i = start
+    for k in range(owner.size):
+        w = weight[k]
+        if w <= 0.0:
+            continue
+        x, y, z = place(frames, owner, rest, k)
+        ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(cameras[camera[k]], x, y, z)
+        if not ok:
+            continue
+        s = owner[k]
+        g2 = ux * ux + uy * uy + uz * uz
+        g = 1.0 / math.sqrt(g2)
+        _put(data, segment, group, i, s, k, x, y, z, ux * g, uy * g, uz * g, (target[k, 0] - u) * g, w * g2)
+        g2 = vx * vx + vy * vy + vz * vz
+        g = 1.0 / math.sqrt(g2)
+        _put(data, segment, group, i + 1, s, k, x, y, z, vx * g, vy * g, vz * g, (target[k, 1] - v) * g, w * g2)
+        i += 2
+    return i
+
+
+@jit
+def image_line_rows(frames, owner, rest, cameras, camera, line, weight, data, segment, group, start):
+    """One row a point: its pixel should lie on the image line a u + b v + c = 0 (K, 3), weight (K,) [1/px²]."""
+    i = start
+    for k in range(owner.size):
+        w = weight[k]
+        if w <= 0.0:
+            continue
+        x, y, z = place(frames, owner, rest, k)
+        ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(cameras[camera[k]], x, y, z)
+        if not ok:
+            continue
+        a, b, c = line[k, 0], line[k, 1], line[k, 2]
+        scale = 1.0 / math.sqrt(a * a + b * b)
+        a, b, c = a * scale, b * scale, c * scale
+        gx, gy, gz = a * ux + b * vx, a * uy + b * vy, a * uz + b * vz
+        g2 = gx * gx + gy * gy + gz * gz
+        g = 1.0 / math.sqrt(g2)
+        r = -(a * u + b * v + c) * g
+        _put(data, segment, group, i, owner[k], k, x, y, z, gx * g, gy * g, gz * g, r, w * g2)
+        i += 1
+    return i
+
+
+@jit
+def ray_rows(frames, owner, rest, line, weight, data, segment, group, start):
+    """Two rows a point: its distance to the Plücker line (K, 6) along two directions at right angles to it."""
+    i = start
+    for k in range(owner.size):
+        w = weight[k]
+        if w <= 0.0:
+            continue
+        x, y, z = place(frames, owner, rest, k)
+        n0, n1, n2 = line[k, 0], line[k, 1], line[k, 2]
+        fx, fy, fz = n1 * line[k, 5] - n2 * line[k, 4], n2 * line[k, 3] - n0 * line[k, 5], n0 * line[k, 4] - n1 * line[k, 3]
+        # a branch-free frame about n (Duff et al. 2017)
+        sign = math.copysign(1.0, n2)
+        p = -1.0 / (sign + n2)
+        q = n0 * n1 * p
+        ax, ay, az = 1.0 + sign * n0 * n0 * p, sign * q, -sign * n0
+        bx, by, bz = q, sign + n1 * n1 * p, -n1
+        ra = ax * (fx - x) + ay * (fy - y) + az * (fz - z)
+        rb = bx * (fx - x) + by * (fy - y) + bz * (fz - z)
+        _put(data, segment, group, i, owner[k], k, x, y, z, ax, ay, az, ra, w)
+        _put(data, segment, group, i + 1, owner[k], k, x, y, z, bx, by, bz, rb, w)
+        i += 2
+    return i
+
+
+@jit
+def buffers(count):
+    """Row buffers of `count` lines: data, segment, group."""
+    return np.empty((8, count)), np.empty(count, np.int64), np.empty(count, np.int64)

@@ -1,0 +1,55 @@
+"""Rows on the degrees of freedom: soft limits, a prior posture, a predicted pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
+from kinefit.rows import ParameterRows
+
+
+def limit_rows(body: Body, state: BodyState, *, sigma: float = 0.02) -> ParameterRows:
+    """One row for each coordinate outside its range, back to the nearer end. For limits that hold see the solver.
+
+    Parameters
+    ----------
+    sigma : float [rad or m]
+        Softness of a limit.
+    """
+    inside = np.clip(state.angles, body.tree.lower, body.tree.upper)
+    beyond = np.flatnonzero(inside != state.angles)
+    return ParameterRows(6 + beyond, (inside - state.angles)[beyond], np.full(len(beyond), 1.0 / sigma**2))
+
+
+def prior_rows(body: Body, state: BodyState, *, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0) -> ParameterRows:
+    """One row for each coordinate, towards a mean posture.
+
+    Parameters
+    ----------
+    mean : scalar or (D,) [rad or m]
+    sigma : scalar or (D,) [rad or m]
+        Spread of the posture; inf for a coordinate without prior.
+    """
+    count = len(body.tree.coordinates)
+    sigma = np.broadcast_to(np.asarray(sigma, float), count)
+    held = np.flatnonzero(np.isfinite(sigma))
+    gap = np.broadcast_to(np.asarray(mean, float), count) - state.angles
+    return ParameterRows(6 + held, gap[held], 1.0 / sigma[held] ** 2)
+
+
+def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma: NDArray) -> ParameterRows:
+    """One row for each degree of freedom, towards a predicted state.
+
+    Parameters
+    ----------
+    predicted : BodyState
+    sigma : (6 + D,) [m, rad]
+        Standard deviation of the prediction; inf for a degree of freedom that is not predicted.
+    """
+    sigma = np.asarray(sigma, float)
+    if sigma.shape != (body.tree.n_dofs,):
+        raise ObservationError(f"sigma of a prediction has shape {sigma.shape}", remedy=f"Give ({body.tree.n_dofs},).")
+    held = np.flatnonzero(np.isfinite(sigma))
+    return ParameterRows(held, state.difference(predicted)[held], 1.0 / sigma[held] ** 2)

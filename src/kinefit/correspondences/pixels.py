@@ -1,0 +1,38 @@
+"""Point to pixel: a keypoint seen by a camera, as the exact linearisation of reprojection (P1-2, 3D point - 2D point)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import _kernels, targets
+from kinefit.geometry.camera import Rig
+from kinefit.rows import Rows
+
+
+def pixel_rows(
+    body: Body,
+    state: BodyState,
+    points: PointSet,
+    rig: Rig,
+    camera: ArrayLike,
+    uv: ArrayLike,
+    *,
+    sigma: ArrayLike = 8.0,
+) -> Rows:
+    """Two rows a pixel: g = ∂(u or v)/∂x with distortion, n = g/|g|, r = Δpx/|g|, w = |g|²/σ².
+
+    Parameters
+    ----------
+    points : PointSet of K points on the body, one for each pixel (a point seen twice stands twice).
+    rig : Rig
+    camera : (K,) int, index in the rig of the camera that saw each.
+    uv : (K, 2) [px]
+        In the calibration's image frame; NaN for none.
+    sigma : scalar or (K,) [px]
+    """
+    target, present = targets.array(uv, 2, len(points), "pixels")
+    index = np.ascontiguousarray(camera, np.int64)
+    w = targets.weights(sigma, present, "pixels")
+    return targets.fill(_kernels.pixel_rows, 2, body, state, points, rig.packed, index, np.nan_to_num(target), w)

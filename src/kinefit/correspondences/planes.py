@@ -1,0 +1,30 @@
+"""Point to plane: a point of the body should lie in a plane (a depth point's tangent plane, the floor)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import _kernels, targets
+from kinefit.rows import Rows
+
+
+def plane_rows(
+    body: Body, state: BodyState, points: PointSet, x_world: ArrayLike, normal: ArrayLike, *, sigma: ArrayLike = 0.01
+) -> Rows:
+    """One row a point along the plane's normal: r = n·(target − x) (P1 2.3, point-plane).
+
+    Parameters
+    ----------
+    points : PointSet of K points on the body.
+    x_world : (K, 3) [m]
+        A point of each plane; NaN for none.
+    normal : (K, 3)
+        Unit normals.
+    sigma : scalar or (K,) [m]
+    """
+    x, present = targets.array(x_world, 3, len(points), "points of planes")
+    n, directed = targets.array(normal, 3, len(points), "normals")
+    w = targets.weights(sigma, present & directed, "planes")
+    return targets.fill(_kernels.plane_rows, 1, body, state, points, np.nan_to_num(x), np.nan_to_num(n), w, 0)

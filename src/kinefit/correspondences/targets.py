@@ -1,0 +1,38 @@
+"""What a point of the body is compared with: the common part of all row makers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import _kernels
+from kinefit.errors import ObservationError
+from kinefit.rows import Rows
+
+
+def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
+    """(K,) weight 1/σ² of each measurement, 0 where it is absent; σ a scalar or (K,)."""
+    sigma = np.broadcast_to(np.asarray(sigma, float), present.shape)
+    if not np.all(sigma[present] > 0):
+        raise ObservationError(f"the standard deviation of {what} must be positive")
+    safe = np.where(present, sigma, 1.0)
+    return np.where(present, 1.0 / safe**2, 0.0)
+
+
+def fill(kernel: Any, lines: int, body: Body, state: BodyState, points: PointSet, *arguments: Any) -> Rows:
+    """Run a row-making kernel for the points of a body at a state; `lines` rows for each point at most."""
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    data, segment, group = _kernels.buffers(lines * len(points))
+    end = kernel(frames, points.segments, body.points_rest(points), *arguments, data, segment, group, 0)
+    return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
+
+
+def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArray, NDArray]:
+    """(K, columns) contiguous floats and which rows are finite; NaN means not measured."""
+    out = np.ascontiguousarray(values, dtype=float)
+    if out.shape != (count, columns):
+        raise ObservationError(f"{what} have shape {out.shape}", remedy=f"Give ({count}, {columns}).")
+    return out, np.isfinite(out).all(axis=1)

@@ -1,0 +1,154 @@
+"""Motion: the result of a fit over time, as arrays, with quality and uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.state import BodyState
+from kinefit.errors import ObservationError, choices
+from kinefit.geometry import se3
+
+UP_AXES = {
+    "x": (1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+
+def rotation_between_up(source: str, target: str) -> NDArray:
+    """(3, 3) rotation that takes a world with vertical axis `source` to one with vertical axis `target`.
+
+    It turns by the smallest angle, so a z-up world (x right, y away) becomes y-up (x right, z towards) and so on.
+    """
+    for axis in (source, target):
+        if axis not in UP_AXES:
+            raise ObservationError(choices("vertical axis", axis, UP_AXES))
+    a, b = np.array(UP_AXES[source]), np.array(UP_AXES[target])
+    if a @ b < -0.5:  # opposite: half a turn about an axis at right angles to both
+        return se3.exp_so3(np.pi * np.roll(np.abs(a), 1)).round(12) + 0.0
+    return se3.exp_so3(np.cross(a, b) * (np.pi / 2)).round(12) + 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """What one sensor's points left over after the fit.
+
+    Parameters
+    ----------
+    names : (K,) of the points.
+    segments : (K,) int, segment that each point belongs to.
+    values : (F, K, N)
+        Measured minus fitted: N = 2 [px] for a camera's keypoints, N = 3 [m] for markers; NaN where unseen.
+    weights : (F, K)
+        Robust weight in 0..1 with which the point took part; 0 for an outlier or an unseen point.
+    unit : "px" or "m"
+    measured : (F, K, N)
+        The measurements as used (people chosen, left and right put right), same frame and unit as the values.
+    swapped : (F,) bool
+        Frames in which the detector took left for right.
+    """
+
+    names: tuple[str, ...]
+    segments: NDArray
+    values: NDArray
+    weights: NDArray
+    unit: str
+    measured: NDArray
+    swapped: NDArray
+
+    @property
+    def norms(self) -> NDArray:
+        """(F, K) length of each residual, NaN where unseen."""
+        return np.linalg.norm(self.values, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A body's motion.
+
+    Parameters
+    ----------
+    body : Body
+        Fitted: its lengths and points are those found for this subject.
+    rate : float [Hz]
+    times : (F,) [s]
+    Ts_world_root : (F, 4, 4) [m]
+    angles : (F, D) [rad] (prismatic coordinates [m])
+    dof_std : (F, 6 + D) [m, rad]
+        One standard deviation of the root's twist and of every coordinate; inf where nothing observes it.
+    joint_std : (F, S, 3) [m]
+        One standard deviation of every joint centre along the world's axes.
+    quality : (F,) in 0..1
+        Share of the body that its measurements support; 0 in a frame without tracking.
+    segment_quality : (F, S) in 0..1
+        0 for a segment that no measurement supports (lost, or hidden).
+    residuals : sensor name -> Residuals
+    up : str
+        Vertical axis of the world: "x", "y", "z", "-x", "-y" or "-z".
+    name : str
+        Name of the take.
+    """
+
+    body: Body
+    rate: float
+    times: NDArray
+    Ts_world_root: NDArray
+    angles: NDArray
+    dof_std: NDArray
+    joint_std: NDArray
+    quality: NDArray
+    segment_quality: NDArray
+    residuals: Mapping[str, Residuals] = field(default_factory=dict)
+    up: str = "y"
+    name: str = "motion"
+
+    def __post_init__(self) -> None:
+        for name in ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"):
+            array = np.array(getattr(self, name), dtype=float)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if not np.all(np.isfinite(self.Ts_world_root)) or not np.all(np.isfinite(self.angles)):
+            raise ObservationError("a motion holds poses that are not finite", remedy="Leave out frames without a pose.")
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def state(self, frame: int) -> BodyState:
+        """State of the body in one frame."""
+        return BodyState(self.Ts_world_root[frame], self.angles[frame])
+
+    def segment_poses(self) -> NDArray:
+        """T_world_segment (F, S, 4, 4); the translation is the joint centre [m]."""
+        return self.body.tree.segment_poses(self.Ts_world_root, self.angles)
+
+    def positions(self, points: PointSet | None = None) -> NDArray:
+        """(F, K, 3) [m] points in the world; by default the body's landmarks."""
+        points = self.body.landmarks if points is None else points
+        return self.body.trajectories(self.Ts_world_root, self.angles, points)
+
+    def turned(self, up: str) -> Motion:
+        """The same motion in a world whose vertical axis is `up`."""
+        R = rotation_between_up(self.up, up)
+        T = se3.transform(R, np.zeros(3))
+        variance = np.square(self.dof_std[:, :6])
+        spread = np.concatenate([variance[:, :3] @ np.square(R).T, variance[:, 3:] @ np.square(R).T], axis=1)
+        residuals = {
+            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T) if r.unit == "m" else r
+            for name, r in self.residuals.items()
+        }
+        return replace(
+            self,
+            Ts_world_root=T @ self.Ts_world_root,
+            dof_std=np.concatenate([np.sqrt(spread), self.dof_std[:, 6:]], axis=1),
+            joint_std=np.sqrt(np.square(self.joint_std) @ np.square(R).T),
+            residuals=residuals,
+            up=up,
+        )

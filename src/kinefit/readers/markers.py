@@ -1,0 +1,185 @@
+"""Marker recordings: C3D and TRC, plainly read into metres."""
+
+from __future__ import annotations
+
+from collections import Counter
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError, choices
+from kinefit.observations import Markers
+from kinefit.readers._c3d import C3d, read_c3d
+
+UNITS = {
+    "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01,
+    "mm": 0.001, "millimeters": 0.001, "millimetres": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048,
+}  # [m] each
+_COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # points of a C3D that are no positions
+_TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
+
+
+def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Markers:
+    """Read a C3D or TRC file, told apart by its content.
+
+    Parameters
+    ----------
+    path : path
+    unit : str, optional
+        "m", "cm", "mm", "in" ...: only for files that do not tell it, or tell it wrongly.
+
+    Returns
+    -------
+    Markers
+        Positions [m] in the file's own world. Not seen (NaN) is what has a negative residual, an empty cell, or lies
+        exactly at the origin. Angles, forces and the like that a C3D keeps among its points are left out. Points
+        without a label are called "*1", "*2" ...; a label that is there twice gets the suffix "_2".
+
+    Raises
+    ------
+    FileError
+        Missing, damaged or truncated (the message tells how many frames can be read), or neither C3D nor TRC.
+    ObservationError
+        No or unknown unit; no marker, or none seen in any frame; a rate that the times contradict.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except FileNotFoundError as error:
+        raise FileError("no such file", file=path) from error
+    except OSError as error:
+        raise FileError(f"cannot be read ({error})", file=path) from error
+    if head[1:2] == b"\x50" or path.suffix.lower() == ".c3d":
+        return _markers_of_c3d(read_c3d(path), path, unit)
+    if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(b"pathfiletype") or path.suffix.lower() == ".trc":
+        return _read_trc(path, unit)
+    raise FileError("neither C3D nor TRC", file=path, remedy="Markers are read from .c3d and .trc files.")
+
+
+def _metres(unit: str | None, path: Path) -> float:
+    if not unit:
+        raise ObservationError("the file tells no unit", file=path, place="units", remedy='State it: unit = "mm".')
+    if unit.strip().lower() not in UNITS:
+        raise ObservationError(choices("unit", unit, UNITS), file=path, place="units", remedy='State it: unit = "mm".')
+    return UNITS[unit.strip().lower()]
+
+
+def _unique(names: list[str]) -> tuple[str, ...]:
+    """The same names, with "*1" for empty ones and a suffix for repeated ones."""
+    taken: Counter[str] = Counter()
+    unique: list[str] = []
+    for i, name in enumerate(names):
+        base = name = name or f"*{i + 1}"
+        while name in taken:
+            taken[base] += 1
+            name = f"{base}_{taken[base]}"
+        taken[name] += 1
+        unique.append(name)
+    return tuple(unique)
+
+
+def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
+    return ObservationError(f"none of the {markers} markers is seen in any of the {frames} frames", file=path)
+
+
+def _texts(c3d: C3d, key: str) -> list[str]:
+    """A text parameter with its continuations: LABELS, LABELS2 ..."""
+    found: list[str] = []
+    for suffix in ("", *map(str, range(2, 100))):
+        values = c3d.parameters.get(key + suffix)
+        if not isinstance(values, list):
+            break
+        found += values
+    return found
+
+
+def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
+    count = c3d.points.shape[1]
+    labels = (_texts(c3d, "POINT:LABELS") + [""] * count)[:count]
+    computed = {name for kind in _COMPUTED for name in _texts(c3d, f"POINT:{kind}")} - {""}
+    keep = [i for i, label in enumerate(labels) if label not in computed]
+    if not keep:
+        raise ObservationError("all points of this file are computed quantities, none is a marker", file=path)
+    screen = "".join(_texts(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
+    metres = _metres(unit or next(iter(_texts(c3d, "POINT:UNITS")), None), path)
+    if c3d.missing[:, keep].all():
+        raise _unseen(len(keep), len(c3d.points), path)
+    positions = np.where(c3d.missing[..., None], np.nan, c3d.points) * metres
+    return Markers(
+        tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
+        up=screen if screen in ("x", "y", "z") else None, first_frame=c3d.first_frame, source=str(path),
+    )
+
+
+def _read_trc(path: Path, unit: str | None) -> Markers:
+    text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    lines = text.splitlines()
+    if len(lines) < 5 or not lines[0].lstrip().lower().startswith("pathfiletype"):
+        raise FileError("not a TRC file", file=path, place="line 1", remedy=_TRC_REMEDY)
+    header = dict(zip(map(str.lower, lines[1].split()), lines[2].split(), strict=False))
+    try:
+        rate, stated = float(header["datarate"]), int(float(header["numframes"]))
+        count = int(float(header["nummarkers"]))
+    except (KeyError, ValueError) as error:
+        problem = f"DataRate, NumFrames or NumMarkers is missing or no number ({error})"
+        raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
+    if not 0 < rate < np.inf:
+        raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
+    cells = lines[3].split("\t") if "\t" in lines[3] else lines[3].split()
+    names = [cell.strip() for cell in cells if cell.strip()][2:]
+    names += [""] * (count - len(names))
+    metres = _metres(unit or header.get("units"), path)
+    frames, times, positions = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
+    if len(frames) < stated - 1:  # some writers count one too many
+        raise FileError(
+            f"the file is truncated: {len(frames)} of {stated} frames can be read", file=path,
+            remedy="Copy or export it again; or, if it is whole, correct NumFrames in line 3.",
+        )
+    if not names or not len(frames):
+        raise ObservationError(f"{len(frames)} frames of {len(names)} markers: nothing in this file", file=path)
+    span = (times[-1] - times[0]) * rate
+    if len(times) > 2 and abs(span - len(times) + 1) > max(1.0, 0.02 * len(times)):
+        raise ObservationError(
+            f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s", file=path,
+            place="line 3", remedy="Correct DataRate or the times.",
+        )
+    missing = ~positions.any(axis=-1) | ~np.isfinite(positions).all(axis=-1)
+    if missing.all():
+        raise _unseen(len(names), len(frames), path)
+    return Markers(
+        _unique(names), rate, np.where(missing[..., None], np.nan, positions * metres), first_frame=int(frames[0]),
+        source=str(path),
+    )
+
+
+def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[NDArray, NDArray, NDArray]:
+    """Frame numbers (F,), times (F,) [s] and positions (F, M, 3) in the file's unit; NaN where a cell is empty."""
+    width = 2 + 3 * count
+    rows: list[list[str]] = []
+    for number, line in enumerate(lines[4:], start=5):
+        if not line.strip() or line.split()[0].upper() == "X1":
+            continue
+        cells = [cell.strip() for cell in line.rstrip("\r\n").split("\t")] if "\t" in line else line.split()
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        short = width - len(cells)
+        cut = number == len(lines) and not ended
+        if "\t" in line and short > 0 and short % 3 == 0 and not cut:
+            cells += [""] * short  # trailing markers not seen
+        elif short > 0 and cut:
+            problem = f"the file is truncated: {len(rows)} frames can be read"
+            raise FileError(problem, file=path, place=f"line {number}", remedy="Copy or export it again.")
+        elif short:
+            problem = f"{len(cells)} cells where {count} markers need {width}"
+            raise FileError(problem, file=path, place=f"line {number}", remedy=_TRC_REMEDY)
+        rows.append(["nan" if not cell else cell for cell in cells])
+    try:
+        table = np.array(rows, dtype=float).reshape(len(rows), width)
+    except ValueError as error:
+        raise FileError(f"a cell is not a number ({error})", file=path, remedy=_TRC_REMEDY) from error
+    if not np.isfinite(table[:, :2]).all():
+        raise FileError("a row without frame number or time", file=path, remedy=_TRC_REMEDY)
+    return table[:, 0], table[:, 1], table[:, 2:].reshape(len(rows), count, 3)

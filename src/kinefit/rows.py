@@ -1,0 +1,162 @@
+"""Rows: the narrow waist between sensors and solvers.
+
+A segment moves by a twist δξ = (δv, δω). That a point x of it should lie further along the unit direction n by r reads
+
+    r ≈ n·δv + (x × n)·δω        with weight w
+
+Every measurement of every sensor is one or more such rows. Twists are taken about the root's origin, so that the far
+world origin costs no digits; row makers need not care, they give points in the world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+
+def _check(what: str, *arrays: NDArray) -> None:
+    if not all(np.all(np.isfinite(a)) for a in arrays):
+        raise ObservationError(f"{what} hold values that are not finite", remedy="Leave out what was not measured.")
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Linearised measurements, N rows; make them with `Rows.of`.
+
+    Parameters
+    ----------
+    data : (8, N)
+        x (3) [m] and n (3) in the world, r [m], w [1/m²]: one contiguous line each, as kernels like it.
+    segment : (N,) int, the segment that each point belongs to.
+    group : (N,) int
+        Measurement id: adjacent rows with one id share one robust weight; -1 for a row that is never an outlier.
+    """
+
+    data: NDArray
+    segment: NDArray
+    group: NDArray
+
+    @classmethod
+    def of(
+        cls,
+        segment: NDArray,
+        point: NDArray,
+        direction: NDArray,
+        residual: NDArray,
+        weight: NDArray,
+        group: NDArray | None = None,
+    ) -> Rows:
+        """Rows from segment (N,), point (N, 3) [m], direction (N, 3), residual (N,) [m], weight (N,) [1/m²]."""
+        n = len(segment)
+        data = np.empty((8, n))
+        data[0:3], data[3:6] = np.asarray(point).T, np.asarray(direction).T
+        data[6], data[7] = residual, weight
+        _check("rows", data)
+        ids = np.arange(n) if group is None else np.asarray(group)
+        return cls(data, np.ascontiguousarray(segment, np.int64), np.ascontiguousarray(ids, np.int64))
+
+    @classmethod
+    def concat(cls, *parts: Rows) -> Rows:
+        """All rows of several makers; measurement ids are renumbered so that none clash."""
+        groups, first = [], 0
+        for part in parts:
+            groups.append(np.where(part.group < 0, -1, part.group + first))
+            first += int(part.group.max(initial=-1)) + 1
+        return cls(
+            np.ascontiguousarray(np.concatenate([p.data for p in parts], axis=1)) if parts else np.empty((8, 0)),
+            np.concatenate([p.segment for p in parts]) if parts else np.empty(0, np.int64),
+            np.concatenate(groups) if parts else np.empty(0, np.int64),
+        )
+
+    def __len__(self) -> int:
+        return self.data.shape[1]
+
+    @property
+    def point(self) -> NDArray:
+        """(N, 3) [m] in the world."""
+        return self.data[0:3].T
+
+    @property
+    def direction(self) -> NDArray:
+        """(N, 3) unit directions in the world."""
+        return self.data[3:6].T
+
+    @property
+    def residual(self) -> NDArray:
+        """(N,) [m] how much further along its direction each point should lie."""
+        return self.data[6]
+
+    @property
+    def weight(self) -> NDArray:
+        """(N,) [1/m²] inverse variance."""
+        return self.data[7]
+
+
+@dataclass(frozen=True, eq=False)
+class PairRows:
+    """Rows between two segments: point x_b of segment b should lie at x_a of segment a, along n.
+
+    r ≈ (n, x_a × n)·δξ_a − (n, x_b × n)·δξ_b with r = n·(x_b − x_a): closed chains, contacts, elastic bands.
+
+    Parameters
+    ----------
+    segments : (N, 2) int, a and b.
+    point_a, point_b : (N, 3) [m] in the world, each on its own segment.
+    direction : (N, 3) unit
+    residual : (N,) [m]
+    weight : (N,) [1/m²]
+    """
+
+    segments: NDArray
+    point_a: NDArray
+    point_b: NDArray
+    direction: NDArray
+    residual: NDArray
+    weight: NDArray
+
+    def __post_init__(self) -> None:
+        _check("pair rows", self.point_a, self.point_b, self.direction, self.residual, self.weight)
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterRows:
+    """Rows on degrees of freedom themselves: limits, priors, prediction. r ≈ δ[index].
+
+    Parameters
+    ----------
+    index : (N,) int, degree of freedom: 0-2 the root's shift, 3-5 its turn, 6.. the angles.
+    residual : (N,) [rad or m] how much further it should be.
+    weight : (N,) [1/rad² or 1/m²]
+    """
+
+    index: NDArray
+    residual: NDArray
+    weight: NDArray
+
+    def __post_init__(self) -> None:
+        _check("parameter rows", self.residual, self.weight)
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+
+AnyRows = Rows | PairRows | ParameterRows
+
+
+def sort_out(parts: AnyRows | Iterable[AnyRows]) -> tuple[Rows, list[PairRows], list[ParameterRows]]:
+    """What row makers gave, by kind."""
+    given: Sequence[AnyRows] = [parts] if isinstance(parts, Rows | PairRows | ParameterRows) else list(parts)
+    rows = [p for p in given if isinstance(p, Rows)]
+    return (
+        rows[0] if len(rows) == 1 else Rows.concat(*rows),
+        [p for p in given if isinstance(p, PairRows)],
+        [p for p in given if isinstance(p, ParameterRows)],
+    )

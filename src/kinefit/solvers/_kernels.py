@@ -1,0 +1,357 @@
+"""Normal equations of a tree and their solution: rows -> 6×6 a segment -> H -> step.
+
+The tree makes H sparse: two angles meet only when one is above the other. `dof_parent` tells that pattern; the
+factorisation H = Lᵀ L keeps it (Featherstone 2005). A chain 0, 1, 2, ... as `dof_parent` makes the same code dense.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+
+NO_LOSS, HUBER, TUKEY, GEMAN_MCCLURE = 0, 1, 2, 3
+
+
+@jit
+def robust(kind, scale, s2):
+    """ρ(s²) and its derivative, the weight, of a squared residual in standard deviations."""
+    if kind == HUBER:
+        if s2 <= scale * scale:
+            return s2, 1.0
+        s = math.sqrt(s2)
+        return 2.0 * scale * s - scale * scale, scale / s
+    if kind == TUKEY:
+        c2 = scale * scale
+        if s2 >= c2:
+            return c2 / 3.0, 0.0
+        u = 1.0 - s2 / c2
+        return c2 / 3.0 * (1.0 - u * u * u), u * u
+    if kind == GEMAN_MCCLURE:
+        u = 1.0 / (1.0 + s2 / (scale * scale))
+        return s2 * u, u * u
+    return s2, 1.0
+
+
+@jit
+def weigh(data, group, count, kind, scale, factor):
+    """Robust factor of every row, shared by the rows of one measurement; returns the cost Σ ρ(w r²)."""
+    cost = 0.0
+    if kind == NO_LOSS:
+        for i in range(count):
+            factor[i] = 1.0
+            cost += data[7, i] * data[6, i] * data[6, i]
+        return cost
+    i = 0
+    while i < count:
+        j, s2 = i, 0.0
+        while j < count and (j == i or (group[j] == group[i] and group[i] >= 0)):
+            s2 += data[7, j] * data[6, j] * data[6, j]
+            j += 1
+        rho, weight = robust(kind, scale, s2) if group[i] >= 0 else (s2, 1.0)
+        cost += rho
+        for k in range(i, j):
+            factor[k] = weight
+        i = j
+    return cost
+
+
+@jit
+def accumulate(data, segment, factor, count, cx, cy, cz, blocks):
+    """Add all rows into blocks (S, 27): the upper triangle of Σ w a aᵀ row by row, then Σ w a r; a = (n, (x − c) × n)."""
+    i = 0
+    while i < count:
+        s = segment[i]
+        j = i + 1
+        while j < count and segment[j] == s:
+            j += 1
+        h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
+        h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
+        g0 = g1 = g2 = g3 = g4 = g5 = 0.0
+        for k in range(i, j):
+            x, y, z = data[0, k] - cx, data[1, k] - cy, data[2, k] - cz
+            a0, a1, a2 = data[3, k], data[4, k], data[5, k]
+            a3, a4, a5 = y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0
+            w = data[7, k] * factor[k]
+            r = w * data[6, k]
+            g0 += a0 * r
+            g1 += a1 * r
+            g2 += a2 * r
+            g3 += a3 * r
+            g4 += a4 * r
+            g5 += a5 * r
+            w0, w1, w2, w3, w4 = w * a0, w * a1, w * a2, w * a3, w * a4
+            h00 += w0 * a0
+            h01 += w0 * a1
+            h02 += w0 * a2
+            h03 += w0 * a3
+            h04 += w0 * a4
+            h05 += w0 * a5
+            h11 += w1 * a1
+            h12 += w1 * a2
+            h13 += w1 * a3
+            h14 += w1 * a4
+            h15 += w1 * a5
+            h22 += w2 * a2
+            h23 += w2 * a3
+            h24 += w2 * a4
+            h25 += w2 * a5
+            h33 += w3 * a3
+            h34 += w3 * a4
+            h35 += w3 * a5
+            h44 += w4 * a4
+            h45 += w4 * a5
+            h55 += w * a5 * a5
+        b = blocks[s]
+        b[0] += h00
+        b[1] += h01
+        b[2] += h02
+        b[3] += h03
+        b[4] += h04
+        b[5] += h05
+        b[6] += h11
+        b[7] += h12
+        b[8] += h13
+        b[9] += h14
+        b[10] += h15
+        b[11] += h22
+        b[12] += h23
+        b[13] += h24
+        b[14] += h25
+        b[15] += h33
+        b[16] += h34
+        b[17] += h35
+        b[18] += h44
+        b[19] += h45
+        b[20] += h55
+        b[21] += g0
+        b[22] += g1
+        b[23] += g2
+        b[24] += g3
+        b[25] += g4
+        b[26] += g5
+        i = j
+
+
+@jit
+def project(parents, dof_start, dof_parent, screws, blocks, H, g):
+    """H = Σ Jₛᵀ Hₛ Jₛ (lower triangle, the pattern of `dof_parent`) and g = Σ Jₛᵀ gₛ; `blocks` are summed up the tree."""
+    for s in range(parents.size - 1, -1, -1):
+        b = blocks[s]
+        for d in range(dof_start[s + 1] - 1, dof_start[s] - 1, -1):
+            j0, j1, j2, j3, j4, j5 = screws[d, 0], screws[d, 1], screws[d, 2], screws[d, 3], screws[d, 4], screws[d, 5]
+            f0 = b[0] * j0 + b[1] * j1 + b[2] * j2 + b[3] * j3 + b[4] * j4 + b[5] * j5
+            f1 = b[1] * j0 + b[6] * j1 + b[7] * j2 + b[8] * j3 + b[9] * j4 + b[10] * j5
+            f2 = b[2] * j0 + b[7] * j1 + b[11] * j2 + b[12] * j3 + b[13] * j4 + b[14] * j5
+            f3 = b[3] * j0 + b[8] * j1 + b[12] * j2 + b[15] * j3 + b[16] * j4 + b[17] * j5
+            f4 = b[4] * j0 + b[9] * j1 + b[13] * j2 + b[16] * j3 + b[18] * j4 + b[19] * j5
+            f5 = b[5] * j0 + b[10] * j1 + b[14] * j2 + b[17] * j3 + b[19] * j4 + b[20] * j5
+            k = 6 + d
+            g[k] = b[21] * j0 + b[22] * j1 + b[23] * j2 + b[24] * j3 + b[25] * j4 + b[26] * j5
+            row = H[k]
+            e = k
+            while e >= 6:
+                t = screws[e - 6]
+                row[e] = t[0] * f0 + t[1] * f1 + t[2] * f2 + t[3] * f3 + t[4] * f4 + t[5] * f5
+                e = dof_parent[e]
+            row[0], row[1], row[2], row[3], row[4], row[5] = f0, f1, f2, f3, f4, f5
+        p = parents[s]
+        if p >= 0:
+            up = blocks[p]
+            for i in range(27):
+                up[i] += b[i]
+    b = blocks[0]
+    i = 0
+    for r in range(6):
+        g[r] = b[21 + r]
+        for c in range(r, 6):
+            H[c, r] = b[i]
+            i += 1
+
+
+@jit
+def factor_tree(H, dof_parent):
+    """H = Lᵀ L in place (lower triangle, the tree's pattern); the diagonal is left inverted. False if not positive."""
+    for k in range(H.shape[0] - 1, -1, -1):
+        row = H[k]
+        if not row[k] > 0.0:
+            return False
+        inverse = 1.0 / math.sqrt(row[k])
+        row[k] = inverse
+        i = dof_parent[k]
+        while i >= 0:
+            row[i] *= inverse
+            i = dof_parent[i]
+        i = dof_parent[k]
+        while i >= 6:
+            h, above = row[i], H[i]
+            j = i
+            while j >= 6:
+                above[j] -= h * row[j]
+                j = dof_parent[j]
+            for j in range(6):
+                above[j] -= h * row[j]
+            i = dof_parent[i]
+        for i in range(min(k, 6)):
+            for j in range(i + 1):
+                H[i, j] -= row[i] * row[j]
+    return True
+
+
+@jit
+def solve_tree(L, dof_parent, x):
+    """Solve Lᵀ L x = b in place, with L from `factor_tree`."""
+    n = L.shape[0]
+    for k in range(n - 1, -1, -1):
+        row = L[k]
+        v = x[k] * row[k]
+        x[k] = v
+        i = dof_parent[k]
+        while i >= 0:
+            x[i] -= row[i] * v
+            i = dof_parent[i]
+    for k in range(n):
+        row = L[k]
+        v = x[k]
+        i = dof_parent[k]
+        while i >= 0:
+            v -= row[i] * x[i]
+            i = dof_parent[i]
+        x[k] = v * row[k]
+
+
+@jit
+def hold(angles, lower, upper, locked, H, g):
+    """Take degrees of freedom out of a step: locked ones, and those at a limit that the gradient pushes out of."""
+    n = g.size
+    for k in range(n):
+        stop = locked[k]
+        if k >= 6 and not stop:
+            d = k - 6
+            stop = (angles[d] <= lower[d] and g[k] < 0.0) or (angles[d] >= upper[d] and g[k] > 0.0)
+        if stop:
+            g[k] = 0.0
+            for i in range(k):
+                H[k, i] = 0.0
+            for i in range(k + 1, n):
+                H[i, k] = 0.0
+            H[k, k] = 1.0
+
+
+@jit
+def retract(root, angles, delta, lower, upper, new_root, new_angles):
+    """State moved by δ: root's twist in the world about its origin, then angles, kept within their limits."""
+    wx, wy, wz = delta[3], delta[4], delta[5]
+    t2 = wx * wx + wy * wy + wz * wz
+    if t2 < 1e-8:
+        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
+    else:
+        t = math.sqrt(t2)
+        half = math.sin(0.5 * t)
+        a, b = math.sin(t) / t, 2.0 * half * half / t2
+    for j in range(3):
+        x, y, z = root[0, j], root[1, j], root[2, j]
+        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        new_root[0, j] = x + a * cx + b * (wy * cz - wz * cy)
+        new_root[1, j] = y + a * cy + b * (wz * cx - wx * cz)
+        new_root[2, j] = z + a * cz + b * (wx * cy - wy * cx)
+    for i in range(3):
+        new_root[i, 3] = root[i, 3] + delta[i]
+        new_root[3, i] = 0.0
+    new_root[3, 3] = 1.0
+    for d in range(angles.size):
+        q = angles[d] + delta[6 + d]
+        q = lower[d] if q < lower[d] else q
+        new_angles[d] = upper[d] if q > upper[d] else q
+
+
+@jit
+def damped_step(H, g, damping, dof_parent, angles, lower, upper, locked, L, delta):
+    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if H + λ is not positive."""
+    n = g.size
+    for i in range(n):
+        for j in range(i + 1):
+            L[i, j] = H[i, j]
+        delta[i] = g[i]
+    hold(angles, lower, upper, locked, L, delta)
+    for i in range(n):
+        L[i, i] += damping
+    if not factor_tree(L, dof_parent):
+        return -1.0
+    fall = 0.0
+    solve_tree(L, dof_parent, delta)
+    for i in range(n):
+        fall += delta[i] * (g[i] + damping * delta[i])
+    return fall
+
+
+@jit
+def adapt(damping, growth, fall, predicted):
+    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule)."""
+    if not fall > 0.0:
+        return damping * growth, 2.0 * growth
+    gain = 2.0 * fall / predicted - 1.0
+    shrink = 1.0 - gain * gain * gain
+    return damping * (shrink if shrink > 0.1 else 0.1), 2.0
+
+
+@jit
+def add_parameters(index, residual, weight, H, g):
+    """Add rows on degrees of freedom to H and g; returns their cost."""
+    cost = 0.0
+    for i in range(index.size):
+        k = index[i]
+        H[k, k] += weight[i]
+        g[k] += weight[i] * residual[i]
+        cost += weight[i] * residual[i] * residual[i]
+    return cost
+
+
+@jit
+def add_pairs(segments, point_a, point_b, normal, residual, weight, centre, screws, dof_parent, last_dof, H, g):
+    """Add pair rows to a dense H (lower triangle) and g; returns their cost."""
+    n = g.size
+    row = np.empty(n)
+    cost = 0.0
+    for i in range(residual.size):
+        row[:] = 0.0
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        for side in range(2):
+            p = point_a[i] if side == 0 else point_b[i]
+            sign = 1.0 if side == 0 else -1.0
+            x, y, z = p[0] - centre[0], p[1] - centre[1], p[2] - centre[2]
+            ax, ay, az = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+            row[0] += sign * nx
+            row[1] += sign * ny
+            row[2] += sign * nz
+            row[3] += sign * ax
+            row[4] += sign * ay
+            row[5] += sign * az
+            d = last_dof[segments[i, side]]
+            while d >= 6:
+                t = screws[d - 6]
+                row[d] += sign * (t[0] * nx + t[1] * ny + t[2] * nz + t[3] * ax + t[4] * ay + t[5] * az)
+                d = dof_parent[d]
+        w = weight[i]
+        cost += w * residual[i] * residual[i]
+        for k in range(n):
+            wk = w * row[k]
+            g[k] += wk * residual[i]
+            if wk != 0.0:
+                for j in range(k + 1):
+                    H[k, j] += wk * row[j]
+    return cost
+
+
+@jit
+def assemble(
+    data, segment, group, count, kind, scale, centre, parents, dof_start, dof_parent, screws, factor, blocks, H, g
+):
+    """Rows -> robust factors, H (lower triangle) and g; returns the cost Σ ρ."""
+    cost = weigh(data, group, count, kind, scale, factor)
+    blocks[:] = 0.0
+    accumulate(data, segment, factor, count, centre[0], centre[1], centre[2], blocks)
+    project(parents, dof_start, dof_parent, screws, blocks, H, g)
+    return cost

@@ -1,0 +1,154 @@
+"""Levenberg-Marquardt with absolute adaptive damping, and the single Gauss-Newton step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.rows import AnyRows
+from kinefit.solvers import _kernels
+from kinefit.solvers.equations import Equations, normal_equations
+from kinefit.solvers.losses import SQUARED, Loss
+
+MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where a fit ended.
+
+    Parameters
+    ----------
+    state : BodyState
+    equations : Equations, undamped, at that state.
+    iterations : int, steps tried.
+    converged : bool, False when the iterations were used up.
+    damping : float, last λ: a good start for the next frame.
+    """
+
+    state: BodyState
+    equations: Equations
+    iterations: int
+    converged: bool
+    damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One Gauss-Newton step: the new state, δ (n,), its norm, and the cost before it."""
+
+    state: BodyState
+    delta: NDArray
+    norm: float
+    cost: float
+
+
+def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
+    n = len(eq.gradient)
+    L, delta = np.empty((n, n)), np.empty(n)
+    fall = _kernels.damped_step(
+        eq.lower, eq.gradient, damping, eq.pattern, eq.state.angles, bounds[0], bounds[1], locked, L, delta
+    )
+    return delta, fall
+
+
+def _moved(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -> BodyState:
+    root, angles = np.empty((4, 4)), np.empty(len(state.angles))
+    _kernels.retract(state.T_world_root, state.angles, delta, bounds[0], bounds[1], root, angles)
+    return BodyState(root, angles)
+
+
+def bounds_of(body: Body, limits: bool) -> tuple[NDArray, NDArray]:
+    """(D,) lower and upper ends of every coordinate; infinite without limits."""
+    if limits:
+        return body.tree.lower, body.tree.upper
+    free = np.full(len(body.tree.coordinates), np.inf)
+    return -free, free
+
+
+def lock(body: Body, locked: NDArray | None) -> NDArray:
+    """(6 + D,) bool, degrees of freedom that may not move: those given, and the root of a body that is fixed."""
+    out = np.zeros(body.tree.n_dofs, bool) if locked is None else np.array(locked, bool)
+    out[:6] |= not body.tree.root_free
+    return out
+
+
+def gauss_newton(
+    body: Body,
+    state: BodyState,
+    rows: AnyRows | Iterable[AnyRows],
+    *,
+    loss: Loss = SQUARED,
+    limits: bool = True,
+    damping: float = 0.0,
+    locked: NDArray | None = None,
+) -> Step:
+    """One step of (H + λ) δ = g for rows linearised at `state`; for loops that renew their rows (ICP).
+
+    Parameters
+    ----------
+    damping : float
+        λ, added to the diagonal as it is; a trillionth of H's mean diagonal is the least.
+    """
+    eq = normal_equations(body, state, rows, loss=loss)
+    bounds, held = bounds_of(body, limits), lock(body, locked)
+    floor = 1e-12 * float(np.trace(eq.lower)) / len(eq.gradient) + 1e-300
+    damping = max(damping, floor)
+    delta, fall = _step(eq, damping, bounds, held)
+    while fall < 0:
+        damping *= 100.0
+        delta, fall = _step(eq, damping, bounds, held)
+    return Step(_moved(state, delta, bounds), delta, float(np.linalg.norm(delta)), eq.cost)
+
+
+def levenberg_marquardt(
+    body: Body,
+    state: BodyState,
+    make_rows: MakeRows,
+    *,
+    loss: Loss = SQUARED,
+    limits: bool = True,
+    locked: NDArray | None = None,
+    damping: float | None = None,
+    max_iterations: int = 50,
+    tolerance: float = 1e-9,
+) -> Fit:
+    """Minimise Σ ρ(w r²) over the body's state.
+
+    Parameters
+    ----------
+    make_rows : state -> rows
+        Called anew at every state tried, so that rows are exact there.
+    limits : bool
+        Joint limits hold: no coordinate leaves its range.
+    locked : (6 + D,) bool
+        Degrees of freedom that stay.
+    damping : float
+        First λ, absolute (in the units of H); default: a thousandth of H's mean diagonal.
+    tolerance : float
+        Stop when the predicted fall of the cost is below this share of it.
+    """
+    bounds, held = bounds_of(body, limits), lock(body, locked)
+    state = _moved(state, np.zeros(body.tree.n_dofs), bounds)
+    eq = normal_equations(body, state, make_rows(state), loss=loss)
+    mean = float(np.trace(eq.lower)) / len(eq.gradient) + 1e-300
+    damping, growth = (1e-3 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    for iteration in range(1, max_iterations + 1):
+        delta, predicted = _step(eq, damping, bounds, held)
+        if predicted < 0.0:
+            damping, growth = _kernels.adapt(damping, growth, -1.0, 1.0)
+            continue
+        if predicted <= tolerance * eq.cost + 1e-30:
+            return Fit(state, eq, iteration, True, damping)
+        candidate = _moved(state, delta, bounds)
+        new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
+        damping, growth = _kernels.adapt(damping, growth, eq.cost - new.cost, predicted)
+        if new.cost < eq.cost:
+            state, eq = candidate, new
+        elif damping > 1e16 * mean:
+            return Fit(state, eq, iteration, True, damping)
+    return Fit(state, eq, max_iterations, False, damping)

@@ -1,0 +1,155 @@
+"""Videos are read frame-exactly, upright and in step; damaged ones are refused with what can be read."""
+
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.readers.video import Video, VideoSet, common_frames
+
+COUNT, WIDTH, HEIGHT = 40, 160, 96
+MATRICES = {  # clockwise turn: a, b, c, d of the display matrix, tx, ty
+    90: (0, 1, -1, 0, HEIGHT, 0), 180: (-1, 0, 0, -1, WIDTH, HEIGHT), 270: (0, -1, 1, 0, 0, WIDTH)
+}
+
+
+def picture(i):
+    """Bars that spell the number `i` in binary from the left, the upper half dark."""
+    image = np.full((HEIGHT, WIDTH, 3), 40, np.uint8)
+    for bit in range(8):
+        image[HEIGHT // 2 :, bit * 20 : bit * 20 + 20] = 230 if i >> bit & 1 else 90
+    return image
+
+
+def number(image):
+    return sum(1 << bit for bit in range(8) if image[-20, bit * 20 + 10].mean() > 160)
+
+
+def write(path, count=COUNT, rate=30, codec="mpeg4", **options):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.codec_context.gop_size = 12
+        stream.codec_context.max_b_frames = options.get("b_frames", 2)
+        stream.codec_context.time_base = Fraction(1, rate)
+        for i in range(count):
+            frame = av.VideoFrame.from_ndarray(picture(options.get("first", 0) + i), format="rgb24")
+            frame.pts = i
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
+def test_frames_by_number_in_any_order(tmp_path, suffix):
+    with Video(write(tmp_path / f"v{suffix}", b_frames=0 if suffix == ".avi" else 2)) as video:
+        assert (len(video), video.size) == (COUNT, (WIDTH, HEIGHT))
+        assert video.rate == pytest.approx(30, rel=1e-3)
+        assert [number(image) for image in video.frames()] == list(range(COUNT))
+        order = [39, 0, 17, 16, 18, 30, 2, 39]
+        assert [number(video.read(i)) for i in order] == order
+        assert [number(image) for image in video.frames(11, 14)] == [11, 12, 13]
+        np.testing.assert_allclose(np.diff(video.times), 1 / 30, atol=2e-3)
+        with pytest.raises(ObservationError, match="0 to 39"):
+            video.read(COUNT)
+
+
+def test_webm_hidden_frames_are_not_counted(tmp_path):
+    if "libvpx" not in av.codecs_available:
+        pytest.skip("this FFmpeg cannot write VP8")
+    with Video(write(tmp_path / "v.webm", codec="libvpx", b_frames=0)) as video:
+        assert len(video) == COUNT
+        assert number(video.read(COUNT - 1)) == COUNT - 1
+
+
+@pytest.mark.parametrize("turn", MATRICES)
+def test_display_rotation_is_applied(tmp_path, turn):
+    raw = write(tmp_path / "v.mp4").read_bytes()
+    unity = np.array([65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30], ">i4").tobytes()
+    a, b, c, d, x, y = (65536 * v for v in MATRICES[turn])
+    at = raw.index(unity, raw.index(b"tkhd"))
+    turned = tmp_path / "turned.mp4"
+    turned.write_bytes(raw[:at] + np.array([a, b, 0, c, d, 0, x, y, 1 << 30], ">i4").tobytes() + raw[at + 36 :])
+    with Video(tmp_path / "v.mp4") as plain, Video(turned) as video:
+        assert video.size == ((HEIGHT, WIDTH) if turn != 180 else (WIDTH, HEIGHT))
+        np.testing.assert_array_equal(video.read(5), np.rot90(plain.read(5), -turn // 90))
+
+
+def test_missing_and_foreign_files(tmp_path):
+    with pytest.raises(FileError, match="no such video"):
+        Video(tmp_path / "none.mp4")
+    text = tmp_path / "text.mp4"
+    text.write_text("not a video, though it says so")
+    with pytest.raises(FileError, match="not a readable video, 0 frames"):
+        Video(text)
+    (tmp_path / "empty.mp4").touch()
+    with pytest.raises(FileError, match="0 frames"):
+        Video(tmp_path / "empty.mp4")
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
+def test_truncated_video_tells_what_can_be_read(tmp_path, suffix):
+    path = write(tmp_path / f"v{suffix}", b_frames=0)
+    raw = path.read_bytes()
+    path.write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(FileError, match=r"\b\d+( of \d+)? frames") as caught:
+        Video(path)
+    assert caught.value.file == path
+    assert caught.value.remedy
+
+
+def test_real_mp4_with_its_index_in_front_but_cut(data_dir, tmp_path):
+    raw = (data_dir("video_balancing_4cam") / "videos" / "cam02.mp4").read_bytes()
+    if raw.index(b"moov") > raw.index(b"mdat"):
+        pytest.skip("its index is at the end")
+    path = tmp_path / "cut.mp4"
+    path.write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(FileError, match=r"truncated: \d+ of 100 frames"):
+        Video(path)
+
+
+def test_real_videos(data_dir):
+    folder = data_dir("video_balancing_4cam") / "videos"
+    paths = {f"cam0{i}": folder / f"cam0{i}.mp4" for i in (1, 2, 3, 4)}
+    with VideoSet(paths) as videos:
+        assert len(videos) == 100
+        assert videos.rate == 60
+        assert [v.size for v in videos.videos.values()] == [(1080, 1920)] * 2 + [(1088, 1920)] * 2
+        late = videos.read(57)
+        assert late["cam03"].shape == (1920, 1088, 3)
+    with Video(paths["cam02"]) as video:
+        in_order = list(video.frames(0, 58))[57]
+    np.testing.assert_array_equal(late["cam02"], in_order)
+
+
+def test_cameras_in_step_with_time_offsets(tmp_path):
+    paths = {"a": write(tmp_path / "a.mp4"), "b": write(tmp_path / "b.mp4", first=0)}
+    with VideoSet(paths, {"b": 0.1}) as videos:  # b started three frames after a
+        assert len(videos) == COUNT - 3
+        np.testing.assert_allclose(videos.times[[0, -1]], [3 / 30, 39 / 30])
+        steps = [(number(images["a"]), number(images["b"])) for images in videos]
+    assert steps == [(k + 3, k) for k in range(COUNT - 3)]
+
+
+def test_streams_of_different_length_or_rate(tmp_path):
+    long, short = write(tmp_path / "long.mp4"), write(tmp_path / "short.mp4", count=25)
+    with pytest.raises(ObservationError, match="a 40 frames, b 25 frames") as caught:
+        VideoSet({"a": long, "b": short})
+    assert "frames = [0, 25]" in caught.value.remedy
+    with VideoSet({"a": long, "b": short}, frames=(5, 25)) as videos:
+        assert [number(images["b"]) for images in videos] == list(range(5, 25))
+    with pytest.raises(ObservationError, match=r"\[0, 30\]"):
+        VideoSet({"a": long, "b": short}, frames=(0, 30))
+    with pytest.raises(ObservationError, match="different rate: a 30 Hz, c 25 Hz"):
+        VideoSet({"a": long, "c": write(tmp_path / "c.mp4", rate=25)})
+    with pytest.raises(ObservationError, match="no camera 'z'"):
+        VideoSet({"a": long}, {"z": 1.0})
+    with pytest.raises(ObservationError, match="no videos"):
+        VideoSet({})
+
+
+def test_common_frames_without_overlap():
+    with pytest.raises(ObservationError, match="no time that all streams saw"):
+        common_frames({"a": 10, "b": 10}, {"b": 5.0}, 30.0)
