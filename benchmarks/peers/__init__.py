@@ -158,6 +158,7 @@ def measure(
     solve: Callable[[float], tuple[Any, int | None]],
     residuals: Callable[[Any], np.ndarray],
     settings: Sequence[float],
+    truth: np.ndarray,
     notes: str = "",
     repeats: int = 5,
     default: float | None = None,
@@ -172,6 +173,8 @@ def measure(
         `residuals(solution)`, (F, M, 3) or (G, P) [m], by the kinematics of this package.
     settings
         Stopping thresholds from loose to tight; the last gives the least cost to compare with.
+    truth
+        Residuals at the truth; a solver that ends above their sum of squares has not converged.
     default
         The peer's own default threshold where that does not converge; timed too, once, and told apart.
 
@@ -183,6 +186,8 @@ def measure(
     ``default_cost``.
     """
     least = np.sum(residuals(solve(settings[-1])[0]) ** 2)
+    if not least <= np.sum(truth**2):
+        raise SystemExit(f"did not converge: cost {least:g} m^2, at the truth {np.sum(truth**2):g}")
     chosen = settings[-1]
     for setting in settings[:-1]:
         if np.sum(residuals(solve(setting)[0]) ** 2) <= least * (1 + EXCESS):

@@ -43,7 +43,8 @@ class Figure:
                 joint = self.add_joint("root", -1, np.zeros(3), root_frame(problem.truth_root, 2, 0))
                 self.entries += [(7 * joint + i, i, 1.0) for i in range(6)]
             else:
-                joint, origin, dofs = self.segment_joints[segment["parent"]], np.array(segment["origin"]), segment["dofs"]
+                joint, dofs = self.segment_joints[segment["parent"]], segment["dofs"]
+                origin = np.array(segment["origin"], dtype=float)
                 while dofs:
                     count = next(n for n in (3, 2, 1) if n <= len(dofs) and self.joinable(dofs[:n]))
                     joint = self.add_turning_joint(joint, origin, dofs[:count], column)
@@ -148,6 +149,7 @@ def fit_markers(problem: Problem, figure: Figure) -> None:
         lambda threshold: solve_sequence(figure, error, renew, start, threshold),
         lambda solution: marker_residuals(problem, *figure.poses(solution)),
         THRESHOLDS,
+        marker_residuals(problem, problem.truth_root, problem.truth_angles),
         f"GaussNewtonSolver in C++, regularization {REGULARIZATION:g}, single precision",
     )
 
@@ -176,6 +178,7 @@ def fit_planes(problem: Problem, figure: Figure) -> None:
         lambda threshold: solve_sequence(figure, error, renew, start, threshold),
         lambda solution: plane_residuals(problem, *figure.poses(solution)),
         THRESHOLDS,
+        plane_residuals(problem, problem.truth_root[: len(normal_world)], problem.truth_angles[: len(normal_world)]),
         f"GaussNewtonSolver in C++, regularization {REGULARIZATION:g}, {len(segment)} rows, single precision",
         repeats=3,
     )

@@ -8,6 +8,7 @@ Run as `python -m benchmarks.peers.mujoco_mink FOLDER mujoco|mink` with the peer
 from __future__ import annotations
 
 import sys
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -147,7 +148,9 @@ def main(folder: Path, peer: str) -> None:
         "mujoco": (solve_with_mujoco, "MuJoCo", "mj_jacSite stacked in numpy, double precision"),
         "mink": (solve_with_mink, "mink", "solve_ik with one stacked task, daqp, no limits, double precision"),
     }[peer]
-    measure(name, version(peer), lambda threshold: solve(model, problem, start, threshold), residuals, THRESHOLDS, notes)
+    truth = marker_residuals(problem, problem.truth_root, problem.truth_angles)
+    run = partial(solve, model, problem, start)
+    measure(name, version(peer), run, residuals, THRESHOLDS, truth, notes)
 
 
 if __name__ == "__main__":

@@ -15,9 +15,12 @@ from benchmarks.peers import Problem, marker_residuals, measure, read_problem
 from benchmarks.peers._gauss_newton import THRESHOLDS, solve_sequence
 
 
-def build(problem: Problem) -> tuple[pin.Model, list[int]]:
-    """Return the model, a free-flyer and one joint per dof, and the joint that carries each segment."""
-    model, carriers = pin.Model(), []
+def build(problem: Problem) -> tuple[pin.Model, np.ndarray]:
+    """Return the model, a free-flyer and one joint per dof, and the sign of every dof in it.
+
+    Axes along a coordinate axis, either way, get the aligned joint types, which are faster.
+    """
+    model, carriers, signs = pin.Model(), [], []
     for segment in problem.segments:
         if segment["parent"] < 0:
             carriers.append(model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root"))
@@ -26,7 +29,8 @@ def build(problem: Problem) -> tuple[pin.Model, list[int]]:
         assert segment["dofs"], "a segment without dofs belongs to its parent"
         for dof in segment["dofs"]:
             axis = np.array(dof["axis"], dtype=float)
-            along = [i for i in range(3) if axis[i] == 1]  # the aligned joint types are faster
+            along = [i for i in range(3) if abs(axis[i]) == 1]
+            signs.append(axis[along[0]] if along else 1.0)
             if dof["type"] == "revolute":
                 aligned = (pin.JointModelRX, pin.JointModelRY, pin.JointModelRZ)
                 kind = aligned[along[0]]() if along else pin.JointModelRevoluteUnaligned(axis)
@@ -38,13 +42,13 @@ def build(problem: Problem) -> tuple[pin.Model, list[int]]:
     for marker in problem.markers:
         at = pin.SE3(np.eye(3), np.array(marker["point"], dtype=float))
         model.addFrame(pin.Frame(marker["name"], carriers[marker["segment"]], 0, at, pin.FrameType.OP_FRAME))
-    return model, carriers
+    return model, np.array(signs)
 
 
 def main(folder: Path) -> None:
     """Solve the problem in `folder` and print the result."""
     problem = read_problem(folder)
-    model, _ = build(problem)
+    model, signs = build(problem)
     data = model.createData()
     frames = [model.getFrameId(marker["name"]) for marker in problem.markers]
     supports = np.zeros((len(frames), 1, model.nv))
@@ -69,12 +73,12 @@ def main(folder: Path) -> None:
         np.multiply(stacked, supports, out=stacked)
         return points, stacked.reshape(-1, model.nv)
 
-    start = np.concatenate([pin.SE3ToXYZQUAT(pin.SE3(problem.initial_root)), problem.initial_angles])
+    start = np.concatenate([pin.SE3ToXYZQUAT(pin.SE3(problem.initial_root)), signs * problem.initial_angles])
     targets = problem.positions.reshape(len(problem.positions), -1)
 
     def residuals(solution: list[np.ndarray]) -> np.ndarray:
         root = np.array([pin.XYZQUATToSE3(q[:7]).homogeneous for q in solution])
-        return marker_residuals(problem, root, np.array(solution)[:, 7:])
+        return marker_residuals(problem, root, signs * np.array(solution)[:, 7:])
 
     measure(
         "Pinocchio",
@@ -82,6 +86,7 @@ def main(folder: Path) -> None:
         lambda threshold: solve_sequence(linearise, lambda q, v: pin.integrate(model, q, v), start, targets, threshold),
         residuals,
         THRESHOLDS,
+        marker_residuals(problem, problem.truth_root, problem.truth_angles),
         "joint Jacobians stacked in numpy, double precision",
     )
 

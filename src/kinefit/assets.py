@@ -6,6 +6,7 @@ of the small files that come with kinefit, a take that can be tracked.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.util
 import os
@@ -253,11 +254,10 @@ def _environment(temporary: Path) -> dict[str, str]:
 
 def _bytes_in(folder: Path) -> int:
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size if path.is_file() else 0
-        except OSError:  # pip has moved it meanwhile
-            continue
+    for parent, _, names in os.walk(folder):  # which, unlike rglob, bears that pip deletes folders meanwhile
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += os.path.getsize(os.path.join(parent, name))
     return total
 
 

@@ -204,9 +204,7 @@ def triangulate_points(cameras, points, weights, limit, positions, inliers, resi
             inliers[n, c], residuals[n, c] = False, _NAN
         ok, x, y, z = False, _NAN, _NAN, _NAN
         if seen >= 2:
-            ok, x, y, z = _consensus(
-                cameras, centres, directions, points[n], usable, limit, chosen, residuals[n]
-            )
+            ok, x, y, z = _consensus(cameras, centres, directions, points[n], usable, limit, chosen, residuals[n])
         if ok:
             positions[n, 0], positions[n, 1], positions[n, 2] = x, y, z
             for c in range(count):

@@ -106,7 +106,13 @@ class Camera:
         out = np.zeros(kernels.PACKED)
         K, T = self.matrix, self.T_camera_world
         out[kernels.MODEL] = MODELS.index(self.model)
-        out[[kernels.FX, kernels.FY, kernels.CX, kernels.CY, kernels.SKEW]] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1]
+        out[[kernels.FX, kernels.FY, kernels.CX, kernels.CY, kernels.SKEW]] = (
+            K[0, 0],
+            K[1, 1],
+            K[0, 2],
+            K[1, 2],
+            K[0, 1],
+        )
         out[kernels.DIST : kernels.DIST + self.distortion.size] = self.distortion
         out[kernels.ROT : kernels.ROT + 9] = T[:3, :3].ravel()
         out[kernels.TRANS : kernels.TRANS + 3] = T[:3, 3]

@@ -155,7 +155,8 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
             remedy="Copy or export it again.",
         )
     data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)[:, : 4 * count * width]
-    values = _numbers(data.tobytes(), width, processor).reshape(frames, count, 4).astype(float)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        values = _numbers(data.tobytes(), width, processor).reshape(frames, count, 4).astype(float)
     points = values[..., :3] * (scale if scale > 0 else 1.0)
     fourth = np.nan_to_num(values[..., 3], nan=-1.0, posinf=-1.0, neginf=-1.0)
     missing = (fourth < 0) | ~np.isfinite(points).all(axis=-1) | ~points.any(axis=-1)

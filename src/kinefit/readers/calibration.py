@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-import tempfile
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,8 +18,12 @@ from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration_colmap import colmap_cameras
 from kinefit.readers.calibration_qualisys import qualisys_cameras
 from kinefit.readers.calibration_tables import (
-    camera_from_table, camera_tables, numbers, read_table, rigid, stated_unit,
-)  # fmt: skip
+    camera_from_table,
+    camera_tables,
+    read_table,
+    stated_unit,
+    stereo_tables,
+)
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}  # [m]
 FORMATS = (
@@ -37,8 +41,8 @@ def read_calibration(
     Parameters
     ----------
     path : file or folder
-        OpenCV YAML/XML/JSON (one file with all cameras, or a folder with one file a camera, or with
-        intrinsics.yml and extrinsics.yml of a stereo pair), Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML,
+        OpenCV YAML/XML/JSON (one file with all cameras; a folder with one file or one folder a camera; a folder with
+        intrinsics.yml and extrinsics.yml), Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML,
         COLMAP text (the folder). Poses are world to camera. A single camera without a pose becomes the world.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
         Unit of length of the file. "auto": what the file states (`unit = "mm"`, alone or under [metadata]), or what
@@ -70,7 +74,9 @@ def read_calibration(
     if kind == "qualisys":
         cameras = qualisys_cameras(ElementTree.fromstring(text), path)
         return _rig(cameras, path, "mm" if unit == "auto" else unit)
-    return _read_tables(path, kind, text, unit, image_size)
+    tree = read_table(text, kind, path)
+    tables = [(name, table, path) for name, table in _tables(tree, path.stem, path)]
+    return _rig_of(tables, path, _chosen_unit(tree, unit), image_size)
 
 
 def read_opencv_stereo(
@@ -83,24 +89,12 @@ def read_opencv_stereo(
 ) -> Rig:
     """Read the pair of files that OpenCV's stereo calibration writes (M1, D1, M2, D2 and R, T).
 
-    The first camera is the world. Its unit is that of the board's squares: give its length in metres as `unit`.
+    The first camera is the world. Its unit is that of the board's squares: give their length in metres as `unit`.
     """
-    first, second = Path(intrinsics), Path(extrinsics)
-    inner, outer = (_tree(path) for path in (first, second))
-    for table, keys, path in ((inner, ("M1", "D1", "M2", "D2"), first), (outer, ("R", "T"), second)):
-        for key in keys:
-            if key not in table:
-                raise CalibrationError(
-                    f"key {key} missing", file=path, remedy="Give the files of OpenCV's stereo_calib sample."
-                )
-    R = numbers(outer["R"], (3, 3), second, "R")
-    t = numbers(outer["T"], (3,), second, "T")
-    cameras = []
-    for i, (name, T) in enumerate(zip(names, (np.eye(4), rigid(R, t, second, "R"))), 1):
-        table = {"matrix": inner[f"M{i}"], "distortion": inner[f"D{i}"]}
-        camera = camera_from_table(name, table, first, image_size=image_size, pose_needed=False)
-        cameras.append(camera.with_pose(T))
-    return _rig(cameras, second, _chosen_unit(outer, unit))
+    path = Path(intrinsics)
+    tree = _tree(path) | _tree(Path(extrinsics))
+    tables = stereo_tables(tree, path, names)
+    return _rig_of([(name, table, path) for name, table in tables], path, _chosen_unit(tree, unit), image_size)
 
 
 def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
@@ -114,19 +108,19 @@ def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
         Where a camera has what the format lacks.
     """
     path = Path(path)
-    text = "\n".join([*(_toml(camera, path) for camera in rig), '[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n'])
-    temporary = None
+    metadata = '[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n'
+    text = "\n".join([*(_toml(camera, path) for camera in rig), metadata])
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False, encoding="utf-8", newline="\n") as out:
-            temporary = out.name
-            out.write(text)
+        temporary.write_text(text, encoding="utf-8", newline="\n")
         os.replace(temporary, path)
     except OSError as error:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
         raise ExportError(
             f"cannot be written: {error.strerror}", file=path, remedy="Choose a folder that exists and has room."
         ) from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
 
 
 def _toml(camera: Camera, path: Path) -> str:
@@ -150,36 +144,50 @@ def _toml(camera: Camera, path: Path) -> str:
 def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | None) -> Rig:
     if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
         return _rig(colmap_cameras(folder), folder, unit)
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in (".yml", ".yaml", ".xml", ".json", ".toml"))
-    stems = {f.stem: f for f in files}
-    if {"intrinsics", "extrinsics"} <= stems.keys():
-        if image_size is None:
-            raise CalibrationError(
-                "these files do not state the size of the images",
-                file=stems["intrinsics"],
-                remedy="Pass image_size=(width, height).",
-            )
-        return read_opencv_stereo(stems["intrinsics"], stems["extrinsics"], image_size=image_size, unit=unit)
-    if not files:
-        raise FileError("no calibration in this folder", file=folder, remedy=f"kinefit reads {FORMATS}.")
-    cameras = []
-    for file in files:
-        tree = _tree(file)
-        factor = _factor(_chosen_unit(tree, unit), file)
-        for name, table in camera_tables(tree, file.stem):
-            camera = camera_from_table(name, table, file, image_size=image_size, pose_needed=len(files) > 1)
-            cameras.append(_in_metres(camera, factor, file))
-    return _rig(cameras, folder, 1.0)
+    files = _calibration_files(folder)
+    if len(files) == 1:
+        return read_calibration(files[0], unit=unit, image_size=image_size)
+    if {"intrinsics", "extrinsics"} <= {file.stem for file in files}:
+        sources = [(folder.name, [file for file in files if file.stem in ("intrinsics", "extrinsics")])]
+    elif files:
+        sources = [(file.stem, [file]) for file in files]
+    else:
+        inner = [(sub.name, _calibration_files(sub)) for sub in sorted(folder.iterdir()) if sub.is_dir()]
+        sources = [(name, group) for name, group in inner if group]
+    tables, units = [], set()
+    for name, group in sources:
+        tree: dict = {}
+        for file in group:
+            tree |= _tree(file)
+        found = _tables(tree, name, group[0])
+        tables += [(camera, table, group[0]) for camera, table in found]
+        units |= {_chosen_unit(tree, unit)} if found else set()
+    if len(units) > 1:
+        raise CalibrationError(
+            f"its files state different units: {', '.join(sorted(map(str, units)))}",
+            file=folder,
+            remedy="Pass the unit that all of them have.",
+        )
+    return _rig_of(tables, folder, units.pop() if units else unit, image_size)
 
 
-def _read_tables(path: Path, kind: str, text: str, unit: str | float, image_size: tuple[int, int] | None) -> Rig:
-    tree = read_table(text, kind, path)
-    tables = camera_tables(tree, path.stem)
+def _calibration_files(folder: Path) -> list[Path]:
+    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
+    return sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+
+
+def _tables(tree: dict, name: str, path: Path) -> list[tuple[str, dict]]:
+    return stereo_tables(tree, path) if "M1" in tree else camera_tables(tree, name)
+
+
+def _rig_of(
+    tables: list[tuple[str, dict, Path]], path: Path, unit: str | float, image_size: tuple[int, int] | None
+) -> Rig:
     cameras = [
-        camera_from_table(name, table, path, image_size=image_size, pose_needed=len(tables) > 1)
-        for name, table in tables
+        camera_from_table(name, table, file, image_size=image_size, pose_needed=len(tables) > 1)
+        for name, table, file in tables
     ]
-    return _rig(cameras, path, _chosen_unit(tree, unit))
+    return _rig(cameras, path, unit)
 
 
 def _tree(path: Path) -> dict:
@@ -187,8 +195,7 @@ def _tree(path: Path) -> dict:
     kind = _recognise(text, path)
     if kind == "qualisys":
         raise CalibrationError("a Qualisys file", file=path, remedy="Give the path of this file itself.")
-    tree = read_table(text, kind, path)
-    return tree if isinstance(tree, dict) else {"cameras": tree}
+    return read_table(text, kind, path)
 
 
 def _read_text(path: Path) -> str:
@@ -205,7 +212,9 @@ def _recognise(text: str, path: Path) -> str:
         try:
             tag = ElementTree.fromstring(text).tag
         except ElementTree.ParseError as error:
-            raise CalibrationError(f"broken XML: {error}", file=path, remedy="Export it again; it may be cut.") from None
+            raise CalibrationError(
+                f"broken XML: {error}", file=path, remedy="Export it again; it may be cut."
+            ) from None
         if tag in ("calibration", "opencv_storage"):
             return "qualisys" if tag == "calibration" else "xml"
     elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):

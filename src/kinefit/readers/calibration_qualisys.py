@@ -14,6 +14,14 @@ from kinefit.readers.calibration_tables import build_camera, rigid
 _SUBPIXELS = 64.0  # focal lengths and centres are in 1/64 px; distortion coefficients are not scaled
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Qualisys' cameras look along -z with y up
 
+_DISTORTION = (
+    "radialDistortion1",
+    "radialDistortion2",
+    "tangentalDistortion1",
+    "tangentalDistortion2",
+    "radialDistortion3",
+)
+
 
 def qualisys_cameras(root: Element, path: Path) -> list[Camera]:
     """Active cameras of a parsed file; translation in the file's unit (millimetres).
@@ -52,7 +60,7 @@ def _camera(element: Element, path: Path) -> Camera:
             f"its view is rotated by {element.get('viewrotation')} degrees",
             file=path,
             place=f"camera {name}",
-            remedy='Set the view rotation to 0, export again, and set the rotation of the video in the take file.',
+            remedy="Set the view rotation to 0, export again, and set the rotation of the video in the take file.",
         )
     left, top = value("fov_video", "left"), value("fov_video", "top")
     size = (int(value("fov_video", "right") - left) + 1, int(value("fov_video", "bottom") - top) + 1)
@@ -60,15 +68,7 @@ def _camera(element: Element, path: Path) -> Camera:
     centre = [value("intrinsic", f"centerPoint{axis}") / _SUBPIXELS for axis in "UV"]
     skew = value("intrinsic", "skew", 0.0) / _SUBPIXELS
     K = np.array([[focal[0], skew, centre[0] - left], [0, focal[1], centre[1] - top], [0, 0, 1]])
-    k = np.array(
-        [
-            value("intrinsic", key, 0.0)
-            for key in (
-                "radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2",
-                "radialDistortion3",
-            )  # fmt: skip
-        ]
-    )
+    k = np.array([value("intrinsic", key, 0.0) for key in _DISTORTION])
     r = np.array([[value("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)])
     position = np.array([value("transform", axis) for axis in "xyz"])
     R = _FLIP @ r

@@ -40,9 +40,11 @@ def read_table(text: str, kind: str, path: Path) -> Table:
         if kind == "toml":
             return tomllib.loads(text)
         if kind == "json":
-            return _matrices(json.loads(text))
-        return _file_storage(text, kind)
-    except (ValueError, RecursionError, cv2.error, SystemError) as error:
+            tree = _matrices(json.loads(text))
+        else:
+            tree = _file_storage(text, kind)
+        return tree if isinstance(tree, dict) else {"cameras": tree}
+    except (ValueError, TypeError, RecursionError, cv2.error, SystemError) as error:
         reason = str(error).strip().splitlines()[-1] if str(error).strip() else "broken syntax"
         raise CalibrationError(
             f"not a readable {kind.upper()} file: {reason}", file=path, remedy="Write the file again; it may be cut."
@@ -66,7 +68,7 @@ def _file_storage(text: str, kind: str) -> Table:
 def _node(node: Any) -> Any:
     """Plain values of an OpenCV file node."""
     if node.isMap():
-        return _matrix({key: _node(node.getNode(key)) for key in node.keys()})  # noqa: SIM118
+        return _matrix({key: _node(node.getNode(key)) for key in node.keys()})
     if node.isSeq():
         return [_node(node.at(i)) for i in range(node.size())]
     if node.isString():
@@ -81,10 +83,11 @@ def _matrices(value: Any) -> Any:
 
 
 def _matrix(table: Table) -> Any:
-    """Array of a stored OpenCV matrix; any other table as it is."""
-    if not {"rows", "cols", "dt", "data"} <= table.keys():
+    """Array of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); any other table as it is."""
+    if not {"dt", "data"} <= table.keys():
         return table
-    return np.array(table["data"], dtype=float).reshape(int(table["rows"]), int(table["cols"])).tolist()
+    shape = table.get("sizes") or (table.get("rows", -1), table.get("cols", 1))  # XML gives one length as a number
+    return np.array(table["data"], dtype=float).reshape(np.atleast_1d(shape).astype(int)).tolist()
 
 
 def find(table: Table, kind: str) -> Any:
@@ -102,10 +105,30 @@ def camera_tables(tree: Any, name: str) -> list[tuple[str, Table]]:
         return [found for group in inner for found in group]
     if not isinstance(tree, dict):
         return []
+    for part in ("intrinsics", "extrinsics"):  # {"intrinsics": {"K": ...}, "extrinsics": {"R": ..., "t": ...}}
+        if isinstance(tree.get(part), dict):
+            tree = {key: value for key, value in tree.items() if key != part} | tree[part]
     if find(tree, "matrix") is not None and not isinstance(find(tree, "matrix"), dict):
         return [] if tree.get("ignore") else [(str(tree.get("name") or name), tree)]
     inner = [camera_tables(value, name if key == "cameras" else str(key)) for key, value in tree.items()]
     return [found for group in inner for found in group]
+
+
+def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
+    """The two cameras of OpenCV's stereo calibration; the first is the world."""
+    missing = [key for key in ("M1", "D1", "M2", "D2", "R", "T") if key not in tree]
+    if missing:
+        raise CalibrationError(
+            f"{', '.join(missing)} missing in a stereo calibration",
+            file=path,
+            remedy="Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo.",
+        )
+    poses = (([0, 0, 0], [0, 0, 0]), (tree["R"], tree["T"]))
+    common = {key: value for key, value in tree.items() if key in ("image_width", "image_height", "fisheye_model")}
+    return [
+        (name, common | {"matrix": tree[f"M{i}"], "distortion": tree[f"D{i}"], "rotation": R, "translation": t})
+        for i, (name, (R, t)) in enumerate(zip(names, poses), 1)
+    ]
 
 
 def stated_unit(tree: Table) -> str | None:
@@ -161,7 +184,9 @@ def camera_from_table(
     return build_camera(name, size, K, k, model, T, path)
 
 
-def build_camera(name: str, size: tuple[int, int], K: NDArray, k: NDArray, model: str, T: NDArray, path: Path) -> Camera:
+def build_camera(
+    name: str, size: tuple[int, int], K: NDArray, k: NDArray, model: str, T: NDArray, path: Path
+) -> Camera:
     """Camera whose errors name the file."""
     try:
         return Camera(name, size, K, k, model, T)
@@ -198,7 +223,7 @@ def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
 def _size(table: Table, path: Path, place: str) -> tuple[int, int] | None:
     size, width, height = find(table, "size"), find(table, "width"), find(table, "height")
     if isinstance(size, dict):
-        size, width, height = None, find(size, "width"), find(size, "height")
+        width, height, size = find(size, "width"), find(size, "height"), None
     if size is None and (width is None or height is None):
         return None
     array = numbers(size if size is not None else (width, height), (2,), path, f"{place}, image size")

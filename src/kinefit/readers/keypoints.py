@@ -114,7 +114,7 @@ def read_openpose(
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
     for row, persons in zip(data, people, strict=True):
         row[: len(persons)] = persons
-    return _keypoints(data, names, camera, keypoint_set, rate, time_offset + start / rate, folder, image_frame)
+    return _keypoints(data, names, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
 
 
 def read_mediapipe(
@@ -168,7 +168,7 @@ def read_mediapipe(
         )
     if not data[..., 2].any():
         raise ObservationError(f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path)
-    return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset + start / rate, path, image_frame)
+    return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
 
 
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
@@ -218,7 +218,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         data = np.zeros((frame.max() + 1, 1, len(names), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = _keypoints(data, names, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, path, None)
+        keypoints[f"cam_{p}"] = _keypoints(data, names, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, 0, path, None)
     return keypoints
 
 
@@ -274,7 +274,7 @@ def _numbered_files(folder: Path) -> list[Path]:
         before = numbered[missing - 1]
         raise ObservationError(
             f"{count} of the frames {first} to {last} are missing, the first is {missing}", file=folder,
-            place=f"after {before.name}", remedy="Run the detector again with a file for every frame, also for empty ones.",
+            place=f"after {before.name}", remedy="Run the detector again with one file per frame, also for empty ones.",
         )
     return [numbered[i] for i in range(first, last + 1)]
 
@@ -315,7 +315,7 @@ def _cut(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, i
 
 def _keypoints(
     data: NDArray, names: tuple[str, ...], camera: str, keypoint_set: str, rate: float, time_offset: float,
-    source: Path, image_frame: ImageFrame | None,
+    start: int, source: Path, image_frame: ImageFrame | None,
 ) -> Keypoints:
     """Record from (F, P, K, 3) x, y, confidence with zeros where unseen."""
     if not rate > 0 or not np.isfinite(rate):
@@ -327,5 +327,5 @@ def _keypoints(
         points = image_frame.to_calibration(points)
     return Keypoints(
         camera, keypoint_set, names, rate, np.where(seen[..., None], points, np.nan), np.where(seen, confidence, 0.0),
-        time_offset=time_offset, source=str(source),
+        time_offset=time_offset + start / rate, source=str(source),
     )

@@ -1,0 +1,142 @@
+"""Body as plain arrays, exactly: for files that hold a fitted body beside its motion.
+
+S segments, D coordinates, G scale groups; names are arrays of text, indices int64, the rest float64, metres and radians:
+
+    name ()  stature ()  root_free ()                  the body; stature [m]
+    segments (S,)  joints (S,)  parents (S,)           parents: index, -1 for the root
+    offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
+    coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
+    prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
+    scale_groups (G,)  segment_scale (S,)
+    landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
+    keypoints/SET/names, segments, points              as the landmarks, one of these for every set
+    markers/SET/names, segments, points
+    surfaces/segments (C,)  surfaces/ends (C, 3)  surfaces/radii (C, 2)       [m]
+    aliases/CONVENTION (N, 2)                          pairs: segment, name there
+
+Names that are part of a key are percent-encoded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from urllib.parse import quote, unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.body import Body, Cylinder, PointSet
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError
+
+_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper")
+
+
+def body_to_arrays(body: Body) -> dict[str, NDArray]:
+    """Arrays of a body, keyed as the module tells."""
+    tree = body.tree
+    out: dict[str, NDArray] = {
+        "name": np.array(body.name),
+        "stature": np.array(float(body.stature)),
+        "root_free": np.array(tree.root_free),
+        "segments": text_array(tree.segments),
+        "joints": text_array(body.joints),
+        "coordinates": text_array(tree.coordinates),
+        "scale_groups": text_array(body.scale_groups),
+        "segment_scale": np.array(body.segment_scale, np.int64),
+        "surfaces/segments": np.array([c.segment for c in body.surfaces], np.int64),
+        "surfaces/ends": np.array([c.end for c in body.surfaces], float).reshape(-1, 3),
+        "surfaces/radii": np.array([c.radii for c in body.surfaces], float).reshape(-1, 2),
+    }
+    out |= {name: np.array(getattr(tree, name)) for name in _TREE}
+    out |= _points_to_arrays("landmarks", body.landmarks)
+    for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
+        for name, points in sets.items():
+            out |= _points_to_arrays(f"{kind}/{quote(name, safe='')}", points)
+    for convention, names in body.aliases.items():
+        pairs = [text_array(names), text_array(names.values())]
+        out[f"aliases/{quote(convention, safe='')}"] = np.stack(pairs, axis=1)
+    return out
+
+
+def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
+    """Body of such arrays.
+
+    Raises
+    ------
+    BodyError
+        An array is missing, has the wrong shape, or names a segment that is not there.
+    """
+    n_segments, n_coordinates = len(_array(arrays, "segments", (None,))), len(_array(arrays, "coordinates", (None,)))
+    shapes = {"offsets": (n_segments, 3), "axes": (n_coordinates, 3), "parents": (n_segments,)}
+    tree = KinematicTree(
+        segments=_texts(arrays, "segments"),
+        coordinates=_texts(arrays, "coordinates"),
+        root_free=bool(_array(arrays, "root_free", ())),
+        **{name: _array(arrays, name, shapes.get(name, (n_coordinates,))) for name in _TREE},  # type: ignore[arg-type]
+    )
+    _check_indices(tree.owners, n_segments, "owners")
+    _check_indices(tree.parents[1:], n_segments, "parents")
+    groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
+    _check_indices(segment_scale, len(groups), "segment_scale")
+    owners = _array(arrays, "surfaces/segments", (None,))
+    _check_indices(owners, n_segments, "surfaces/segments")
+    ends, radii = _array(arrays, "surfaces/ends", (len(owners), 3)), _array(arrays, "surfaces/radii", (len(owners), 2))
+    return Body(
+        name=str(_array(arrays, "name", ())),
+        tree=tree,
+        joints=_texts(arrays, "joints", n_segments),
+        scale_groups=groups,
+        segment_scale=segment_scale,
+        landmarks=_points_from_arrays(arrays, "landmarks", n_segments),
+        keypoint_sets=_sets(arrays, "keypoints", n_segments),
+        marker_sets=_sets(arrays, "markers", n_segments),
+        surfaces=tuple(Cylinder(int(s), tuple(e), tuple(r)) for s, e, r in zip(owners, ends.tolist(), radii.tolist())),
+        aliases={
+            unquote(key.split("/")[1]): {str(a): str(b) for a, b in _array(arrays, key, (None, 2))}
+            for key in arrays
+            if key.startswith("aliases/")
+        },
+        stature=float(_array(arrays, "stature", ())),
+    )
+
+
+def text_array(names: object) -> NDArray:
+    """(N,) array of text, also for no names at all."""
+    return np.array(list(names), dtype=np.str_)  # type: ignore[call-overload]
+
+
+def _points_to_arrays(key: str, points: PointSet) -> dict[str, NDArray]:
+    arrays = {"names": text_array(points.names), "segments": points.segments, "points": points.points}
+    return {f"{key}/{name}": np.array(array) for name, array in arrays.items()}
+
+
+def _points_from_arrays(arrays: Mapping[str, NDArray], key: str, n_segments: int) -> PointSet:
+    names = _texts(arrays, f"{key}/names")
+    segments = _array(arrays, f"{key}/segments", (len(names),))
+    _check_indices(segments, n_segments, f"{key}/segments")
+    return PointSet(names, segments, _array(arrays, f"{key}/points", (len(names), 3)))
+
+
+def _sets(arrays: Mapping[str, NDArray], kind: str, n_segments: int) -> dict[str, PointSet]:
+    keys = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/"))
+    return {unquote(key): _points_from_arrays(arrays, f"{kind}/{key}", n_segments) for key in keys}
+
+
+def _array(arrays: Mapping[str, NDArray], key: str, shape: tuple[int | None, ...]) -> NDArray:
+    if key not in arrays:
+        raise BodyError(f"no array '{key}'")
+    array = arrays[key]
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
+        told = ", ".join("any" if n is None else str(n) for n in shape)
+        raise BodyError(f"array '{key}' has shape {array.shape} instead of ({told})")
+    return array
+
+
+def _texts(arrays: Mapping[str, NDArray], key: str, count: int | None = None) -> tuple[str, ...]:
+    return tuple(str(v) for v in _array(arrays, key, (count,)))
+
+
+def _check_indices(indices: NDArray, count: int, key: str) -> None:
+    if indices.size and not (np.min(indices) >= 0 and np.max(indices) < count):
+        raise BodyError(f"array '{key}' names something that is not there", remedy=f"Indices run from 0 to {count - 1}.")

@@ -1,0 +1,55 @@
+"""Writing that leaves either the whole file or what was there before."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from os import PathLike
+from pathlib import Path
+
+from kinefit.errors import ExportError
+
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "Free some space, or write to another disk."),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Write to a folder that you may change."),
+    **dict.fromkeys((errno.EISDIR, errno.ENOTDIR, errno.EEXIST), "A folder or file of that name is in the way."),
+}
+
+
+@contextmanager
+def writing(path: str | PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside `path`; what was written there takes its place when the block ends well.
+
+    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays as it was.
+
+    Raises
+    ------
+    ExportError
+        Where the system refuses (full disk, no permission): names the file and the remedy.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "Check the path and the disk.")
+        raise ExportError(f"cannot be written ({error.strerror or error})", file=target, remedy=remedy) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def write_text(path: str | PathLike[str], text: str) -> None:
+    """Write a whole text file (UTF-8, line ends as they are) or nothing."""
+    with writing(path) as temporary:
+        temporary.write_bytes(text.encode("utf-8"))
+
+
+def write_bytes(path: str | PathLike[str], data: bytes) -> None:
+    """Write a whole binary file or nothing."""
+    with writing(path) as temporary:
+        temporary.write_bytes(data)

@@ -1,0 +1,158 @@
+"""A body as the XML of an OpenSim 4 model."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from os import PathLike
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, Cylinder
+from kinefit.errors import ExportError
+from kinefit.exporters._skeleton import plain_names
+
+PERSON = 75.0  # [kg]
+SHARES = {
+    "head": 0.0694, "thorax": 0.1396, "clavicle": 0.01, "abdomen": 0.1633, "pelvis": 0.1117, "upperarm": 0.0271,
+    "forearm": 0.0162, "hand": 0.0061, "thigh": 0.1416, "shank": 0.0433, "foot": 0.0117, "toes": 0.002,
+}  # fmt: skip
+"""Share of a segment in a person's mass (de Leva 1996; collar bones and toes are taken out of trunk and foot)."""
+
+_WATER, _LEAST = 1000.0, 0.01  # [kg/m³], [kg]
+_EYE, _ZERO = np.eye(3), "0 0 0"
+
+
+def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) -> ET.Element:
+    """The element <Model>; `root_coordinates` are the names of three turns z, x, y and three ways; `path` for messages."""
+    tree = body.tree
+    names = plain_names(body.alias("opensim", s) for s in tree.segments)
+    coordinates = plain_names(tree.coordinates)
+    surfaces = {c.segment: c for c in body.surfaces}
+    out = ET.Element("Model", name=plain_names([body.name])[0])
+    _text(out, "length_units", "meters")
+    _text(out, "force_units", "N")
+    _text(out, "gravity", "0 -9.80665 0")
+    bodies = ET.SubElement(ET.SubElement(out, "BodySet"), "objects")
+    joints = ET.SubElement(ET.SubElement(out, "JointSet"), "objects")
+    markers = ET.SubElement(ET.SubElement(out, "MarkerSet"), "objects")
+    for s, name in enumerate(names):
+        bodies.append(_body(name, tree.segments[s], surfaces.get(s)))
+        parent = "/ground" if tree.parents[s] < 0 else f"/bodyset/{names[tree.parents[s]]}"
+        dofs = range(tree.dof_start[s], tree.dof_start[s + 1])
+        turns = [(coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs if not tree.prismatic[d]]
+        ways = [(coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs if tree.prismatic[d]]
+        if tree.parents[s] < 0:
+            turns = [(c, _EYE[k], (-2 * np.pi, 2 * np.pi)) for c, k in zip(root_coordinates[:3], (2, 0, 1))] + turns
+            ways = [(c, _EYE[k], (-100.0, 100.0)) for c, k in zip(root_coordinates[3:], (0, 1, 2))] + ways
+        if len(turns) > 3 or len(ways) > 3:
+            raise ExportError("OpenSim has no joint of more than three turns and ways", file=path, place=f"joint {body.joints[s]}")
+        joints.append(_joint(plain_names([body.joints[s]])[0], parent, name, tree.offsets[s], turns, ways, path))
+    points = body.landmarks
+    for label, s, at in zip(plain_names(points.names), points.segments, points.points):
+        marker = ET.SubElement(markers, "Marker", name=label)
+        _text(marker, "socket_parent_frame", f"/bodyset/{names[s]}")
+        _text(marker, "location", _numbers(at))
+        _text(marker, "fixed", "true")
+    return out
+
+
+def _joint(
+    name: str, parent: str, child: str, at: NDArray, turns: list, ways: list, path: str | PathLike[str]
+) -> ET.Element:
+    joint = ET.Element("CustomJoint" if turns or ways else "WeldJoint", name=name)
+    _text(joint, "socket_parent_frame", f"{name}_parent")
+    _text(joint, "socket_child_frame", f"{name}_child")
+    if turns or ways:
+        coordinates = ET.SubElement(joint, "coordinates")
+        for coordinate, _, (low, high) in turns + ways:
+            entry = ET.SubElement(coordinates, "Coordinate", name=coordinate)
+            _text(entry, "default_value", _numbers([np.clip(0.0, low, high)]))
+            _text(entry, "range", _numbers([low, high]))
+            _text(entry, "clamped", "false")
+            _text(entry, "locked", "false")
+    frames = ET.SubElement(joint, "frames")
+    for frame, socket, offset in ((f"{name}_parent", parent, at), (f"{name}_child", f"/bodyset/{child}", np.zeros(3))):
+        entry = ET.SubElement(frames, "PhysicalOffsetFrame", name=frame)
+        _text(entry, "socket_parent", socket)
+        _text(entry, "translation", _numbers(offset))
+        _text(entry, "orientation", _ZERO)
+    if turns or ways:
+        transform = ET.SubElement(joint, "SpatialTransform")
+        for kind, moves in (("rotation", turns), ("translation", ways)):
+            axes = _three_axes([axis for _, axis, _ in moves])
+            if abs(np.linalg.det(axes)) < 1e-3:
+                raise ExportError(
+                    "OpenSim needs axes that do not lie in one plane",
+                    file=path, place=f"joint {name}", remedy="Turn one of the axes, or leave one out.",
+                )  # fmt: skip
+            for k in range(3):
+                _transform_axis(transform, f"{kind}{k + 1}", axes[k], moves[k][0] if k < len(moves) else None)
+    return joint
+
+
+def _three_axes(axes: Sequence[NDArray]) -> NDArray:
+    """(3, 3) the axes, made up to three by directions at right angles to them."""
+    out = [np.asarray(axis, float) for axis in axes]
+    while len(out) < 3:
+        if len(out) == 2:
+            normal = np.cross(out[0], out[1])
+            out.append(normal / max(float(np.linalg.norm(normal)), 1e-12))
+        else:
+            rest = _EYE[np.argmin(np.abs(out[0]))] if out else _EYE[0]
+            out.append(rest - (rest @ out[0]) * out[0] if out else rest)
+            out[-1] /= np.linalg.norm(out[-1])
+    return np.array(out)
+
+
+def _transform_axis(transform: ET.Element, name: str, axis: NDArray, coordinate: str | None) -> None:
+    entry = ET.SubElement(transform, "TransformAxis", name=name)
+    _text(entry, "coordinates", coordinate or "")
+    _text(entry, "axis", _numbers(axis))
+    if coordinate:
+        _text(ET.SubElement(entry, "LinearFunction", name="function"), "coefficients", "1 0")
+    else:
+        _text(ET.SubElement(entry, "Constant", name="function"), "value", "0")
+
+
+def _limits(low: float, high: float) -> tuple[float, float]:
+    return max(float(low), -99999.9), min(float(high), 99999.9)
+
+
+def _body(name: str, segment: str, surface: Cylinder | None) -> ET.Element:
+    mass, centre, inertia = mass_properties(segment, surface)
+    out = ET.Element("Body", name=name)
+    _text(out, "mass", _numbers([mass]))
+    _text(out, "mass_center", _numbers(centre))
+    _text(out, "inertia", _numbers([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]))
+    if surface is not None:
+        frame = ET.SubElement(ET.SubElement(out, "components"), "PhysicalOffsetFrame", name=f"{name}_axis")
+        geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{name}_surface")
+        _text(geometry, "radius", _numbers([np.mean(surface.radii)]))
+        _text(geometry, "half_height", _numbers([0.5 * np.linalg.norm(surface.end)]))
+        _text(frame, "socket_parent", "..")
+        _text(frame, "translation", _numbers(0.5 * np.array(surface.end)))
+        x, y, z = np.array(surface.end) / np.linalg.norm(surface.end)
+        _text(frame, "orientation", _numbers([np.arctan2(z, y), 0.0, -np.arcsin(np.clip(x, -1, 1))]))  # y to the axis
+    return out
+
+
+def mass_properties(segment: str, surface: Cylinder | None) -> tuple[float, NDArray, NDArray]:
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of a round body along the surface."""
+    end = np.array(surface.end if surface else (0.0, 0.05, 0.0))
+    length, radius = float(np.linalg.norm(end)), float(np.mean(surface.radii)) if surface else 0.02
+    share = SHARES.get(re.sub("_[lr]$", "", segment))
+    mass = max(_LEAST, share * PERSON if share else _WATER * np.pi * radius**2 * length)
+    along = np.outer(end, end) / max(length, 1e-9) ** 2
+    inertia = mass * ((3 * radius**2 + length**2) / 12 * (_EYE - along) + radius**2 / 2 * along)
+    return mass, 0.5 * end, inertia
+
+
+def _text(parent: ET.Element, tag: str, text: str) -> None:
+    ET.SubElement(parent, tag).text = text
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(f"{float(v) + 0.0:.10g}" for v in np.atleast_1d(np.asarray(values, float)))

@@ -1,0 +1,122 @@
+"""A body's round surfaces as one closed, smooth mesh whose vertices follow one or two segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, Cylinder
+
+AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
+LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
+
+
+@dataclass(frozen=True, eq=False)
+class SkinnedMesh:
+    """Mesh in the root frame at rest.
+
+    Parameters
+    ----------
+    vertices : (V, 3) [m]
+    normals : (V, 3) unit, outward.
+    colours : (V, 3) uint8 RGB
+    triangles : (T, 3) int, counterclockwise from outside.
+    segments : (V, 2) int, the segments that each vertex follows.
+    weights : (V, 2) how much it follows each; they sum to 1.
+    """
+
+    vertices: NDArray
+    normals: NDArray
+    colours: NDArray
+    triangles: NDArray
+    segments: NDArray
+    weights: NDArray
+
+
+def side_colour(name: str) -> tuple[int, int, int]:
+    """Colour of a segment by its name: left, right or in the middle."""
+    return LEFT if name.endswith("_l") else RIGHT if name.endswith("_r") else CENTRE
+
+
+def body_mesh(body: Body) -> SkinnedMesh:
+    """Tubes with rounded ends around all surfaces; near a joint the skin follows both segments."""
+    parts = [_tube(body, c) for c in body.surfaces if np.linalg.norm(c.end) > 1e-6 and min(c.radii) > 0]
+    if not parts:
+        return SkinnedMesh(*(np.zeros((0, n), t) for n, t in ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))))
+    first = np.cumsum([0] + [len(p.vertices) for p in parts])
+    return SkinnedMesh(
+        vertices=np.concatenate([p.vertices for p in parts]),
+        normals=np.concatenate([p.normals for p in parts]),
+        colours=np.concatenate([p.colours for p in parts]),
+        triangles=np.concatenate([p.triangles + n for p, n in zip(parts, first)]),
+        segments=np.concatenate([p.segments for p in parts]),
+        weights=np.concatenate([p.weights for p in parts]),
+    )
+
+
+def _tube(body: Body, c: Cylinder) -> SkinnedMesh:
+    tree, end = body.tree, np.array(c.end)
+    length = float(np.linalg.norm(end))
+    u = end / length
+    if not np.any(tree.parents == c.segment):  # the last of a limb is as long, with its rounded end, as its surface
+        length = max(0.2 * length, length - c.radii[1])
+    along, radius, slope = _profile(length, *c.radii)
+    side = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
+    side /= np.linalg.norm(side)
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    out = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(u, side))  # (AROUND, 3)
+    points = along[:, None, None] * u + radius[:, None, None] * out  # (rings, AROUND, 3)
+    normals = np.sin(slope)[:, None, None] * u + np.cos(slope)[:, None, None] * out
+    vertices = np.concatenate([[along[0] * u], points[1:-1].reshape(-1, 3), [along[-1] * u]])
+    heights = np.concatenate([[along[0]], np.repeat(along[1:-1], AROUND), [along[-1]]])
+    segments, weights = _weights(body, c, heights, length)
+    return SkinnedMesh(
+        vertices=vertices + tree.rest[c.segment],
+        normals=np.concatenate([[-u], normals[1:-1].reshape(-1, 3), [u]]),
+        colours=np.tile(np.array(side_colour(tree.segments[c.segment]), np.uint8), (len(vertices), 1)),
+        triangles=_triangles(len(along) - 2),
+        segments=segments,
+        weights=weights,
+    )
+
+
+def _profile(length: float, start: float, end: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Way along the axis [m], radius [m] and angle of the normal towards the axis [rad], from pole to pole."""
+    tilt = np.arcsin(np.clip((start - end) / length, -0.9, 0.9))  # where cone and spheres touch
+    first, last = np.linspace(-np.pi / 2, tilt, CAP + 1), np.linspace(tilt, np.pi / 2, CAP + 1)
+    t = np.linspace(0, 1, ALONG + 2)[1:-1]
+    a0, r0 = start * np.sin(tilt), start * np.cos(tilt)
+    a1, r1 = length + end * np.sin(tilt), end * np.cos(tilt)
+    along = np.concatenate([start * np.sin(first), a0 + t * (a1 - a0), length + end * np.sin(last)])
+    radius = np.concatenate([start * np.cos(first), r0 + t * (r1 - r0), end * np.cos(last)])
+    return along, radius, np.concatenate([first, np.full(ALONG, tilt), last])
+
+
+def _triangles(rings: int) -> NDArray:
+    """Vertices: pole, `rings` rings of AROUND, pole."""
+    i, j = np.meshgrid(np.arange(rings - 1), np.arange(AROUND), indexing="ij")
+    a, b = 1 + i * AROUND + j, 1 + i * AROUND + (j + 1) % AROUND
+    walls = np.concatenate([np.stack([a, b, b + AROUND], -1), np.stack([a, b + AROUND, a + AROUND], -1)]).reshape(-1, 3)
+    k = np.arange(AROUND)
+    after, top, last = (k + 1) % AROUND, 1 + rings * AROUND, 1 + (rings - 1) * AROUND
+    start = np.stack([np.zeros_like(k), 1 + after, 1 + k], -1)
+    end = np.stack([np.full_like(k, top), last + k, last + after], -1)
+    return np.concatenate([start, walls, end])
+
+
+def _weights(body: Body, c: Cylinder, heights: NDArray, length: float) -> tuple[NDArray, NDArray]:
+    """At its joint a tube follows its parent by half, at its end the child that begins there; between, itself."""
+    tree, (start, end) = body.tree, c.radii
+    segments = np.full((len(heights), 2), c.segment)
+    other = np.zeros(len(heights))
+    children = [k for k in np.flatnonzero(tree.parents == c.segment) if np.linalg.norm(tree.offsets[k] - c.end) < end]
+    reaches = [(-heights / start, tree.parents[c.segment])] + [((heights - length) / end, k) for k in children[:1]]
+    for beyond, neighbour in reaches:
+        if neighbour >= 0:
+            t = np.clip(0.5 + 0.5 * beyond, 0.0, 1.0)  # 0 a radius before the end, 1 a radius beyond it
+            share = 0.5 * t * t * (3 - 2 * t)
+            segments[share > other, 1] = neighbour
+            other = np.maximum(other, share)
+    return segments, np.stack([1.0 - other, other], axis=1)

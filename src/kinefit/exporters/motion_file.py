@@ -1,0 +1,44 @@
+"""Writing the motion file; `kinefit.readers.motion` tells what is in it."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.serial import body_to_arrays, text_array
+from kinefit.errors import ExportError
+from kinefit.exporters._atomic import writing
+from kinefit.motion import Motion
+from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, VERSION
+
+
+def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write everything of a motion into one `.npz`; `read_motion` gives it back exactly.
+
+    Raises
+    ------
+    ExportError
+        The name does not end in .npz, or the file cannot be written.
+    """
+    if Path(path).suffix != ".npz":
+        raise ExportError("a motion file ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
+    arrays: dict[str, NDArray] = {
+        "format": np.array(FORMAT),
+        "version": np.array(VERSION),
+        "name": np.array(motion.name),
+        "up": np.array(motion.up),
+        "rate": np.array(float(motion.rate)),
+    }
+    arrays |= {key: getattr(motion, key) for key in ARRAYS}
+    arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
+    for sensor, residuals in motion.residuals.items():
+        for key in RESIDUAL_ARRAYS:
+            value = getattr(residuals, key)
+            array = text_array(value) if key == "names" else np.asarray(value)
+            arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = array
+    with writing(path) as temporary:
+        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]

@@ -1,0 +1,125 @@
+"""The motion file of kinefit, `*.npz`, version 1: all of a `Motion`, its fitted body and its residuals, exactly.
+
+An uncompressed or compressed archive of numpy arrays (`numpy.load(path, allow_pickle=False)` reads it); no pickle.
+F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 unless told otherwise:
+
+    format ()                        text "kinefit motion"
+    version ()                       1
+    name ()  up ()                   text; up is "x", "y", "z", "-x", "-y" or "-z", the world's vertical axis
+    rate ()  times (F,)              [Hz], [s]
+    Ts_world_root (F, 4, 4)          pose of the root
+    angles (F, D)                    joint coordinates, named in body/coordinates
+    dof_std (F, 6 + D)               standard deviation of the root's twist (v, ω), then the angles; inf: not observed
+    joint_std (F, S, 3)              of every joint centre along the world's axes
+    quality (F,)  segment_quality (F, S)              0..1
+    body/...                         the fitted body, as `kinefit.bodies.serial` tells
+    residuals/SENSOR/names (K,)  segments (K,)        points of a sensor, and the segment of each
+    residuals/SENSOR/unit ()         "px" or "m"
+    residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN where unseen; N = 2 or 3
+    residuals/SENSOR/measured (F, K, N)  weights (F, K)
+    residuals/SENSOR/swapped (F,)    bool, left taken for right by the detector and put right
+
+Sensor names are percent-encoded in keys.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.serial import body_from_arrays
+from kinefit.errors import FileError, KinefitError
+from kinefit.motion import UP_AXES, Motion, Residuals
+
+FORMAT, VERSION = "kinefit motion", 1
+ARRAYS = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
+RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured", "swapped")
+_REMEDY = "Write it again with kinefit, or copy it again from its source."
+
+
+def read_motion(path: str | PathLike[str]) -> Motion:
+    """Read a motion file.
+
+    Raises
+    ------
+    FileError
+        No such file, not a motion file, truncated, or of a later version.
+    """
+    file = Path(path)
+    arrays = _load(file)
+    if "format" not in arrays or str(arrays["format"]) != FORMAT:
+        raise FileError("this is no motion file of kinefit", file=file, remedy="Give a file that `kinefit track` wrote.")
+    try:
+        if int(arrays["version"]) != VERSION:
+            raise FileError(
+                f"motion file of version {int(arrays['version'])}; this kinefit reads version {VERSION}",
+                file=file,
+                remedy="Use the kinefit that wrote it, or a newer one.",
+            )
+        return _motion(arrays)
+    except FileError:
+        raise
+    except KeyError as error:
+        raise FileError(f"motion file without the array {error}", file=file, remedy=_REMEDY) from error
+    except (KinefitError, ValueError, TypeError, IndexError) as error:
+        raise FileError(f"motion file with contents that do not fit together ({error})", file=file, remedy=_REMEDY) from error
+
+
+def _load(file: Path) -> dict[str, NDArray]:
+    if not file.is_file():
+        raise FileError("no such motion file", file=file, remedy="Check the path.")
+    if not zipfile.is_zipfile(file):
+        raise FileError("this is no motion file of kinefit, or only a part of one", file=file, remedy=_REMEDY)
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
+        raise FileError(f"the motion file is damaged ({error})", file=file, remedy=_REMEDY) from error
+
+
+def _motion(arrays: Mapping[str, NDArray]) -> Motion:
+    body = body_from_arrays(_below(arrays, "body/"))
+    F, S, D = len(arrays["times"]), len(body.tree.segments), len(body.tree.coordinates)
+    shapes = ((F,), (F, 4, 4), (F, D), (F, 6 + D), (F, S, 3), (F,), (F, S))
+    for key, shape in zip(ARRAYS, shapes):
+        _check(key, arrays[key], shape)
+    up = str(arrays["up"])
+    if up not in UP_AXES:
+        raise ValueError(f"vertical axis '{up}'")
+    sensors = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith("residuals/"))
+    return Motion(
+        body=body,
+        rate=float(arrays["rate"]),
+        **{key: arrays[key] for key in ARRAYS},  # type: ignore[arg-type]
+        residuals={unquote(s): _residuals(_below(arrays, f"residuals/{s}/"), s, F, S) for s in sensors},
+        up=up,
+        name=str(arrays["name"]),
+    )
+
+
+def _residuals(arrays: Mapping[str, NDArray], sensor: str, F: int, S: int) -> Residuals:
+    K, N = len(arrays["names"]), {"px": 2, "m": 3}[str(arrays["unit"])]
+    shapes = {"segments": (K,), "values": (F, K, N), "measured": (F, K, N), "weights": (F, K), "swapped": (F,)}
+    for key, shape in shapes.items():
+        _check(f"residuals/{sensor}/{key}", arrays[key], shape)
+        arrays[key].flags.writeable = False
+    if K and not (0 <= arrays["segments"].min() and arrays["segments"].max() < S):
+        raise ValueError(f"residuals/{sensor}/segments names a segment that is not there")
+    names = tuple(str(name) for name in arrays["names"])
+    return Residuals(names=names, unit=str(arrays["unit"]), **{key: arrays[key] for key in shapes})
+
+
+def _below(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, NDArray]:
+    return {key[len(prefix) :]: array for key, array in arrays.items() if key.startswith(prefix)}
+
+
+def _check(key: str, array: NDArray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"array '{key}' has shape {array.shape} instead of {shape}")

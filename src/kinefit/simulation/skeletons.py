@@ -1,0 +1,204 @@
+"""Recorded skeletons of several families, told as the same few joints and directions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.motion import rotation_between_up
+from kinefit.observations import SkeletonMotion
+
+_SIDES = {"l": {"s": "l", "S": "L", "Side": "Left"}, "r": {"s": "r", "S": "R", "Side": "Right"}}
+_LIMBS = ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist", "knuckle")
+_LEAST_BONE = 0.005  # [m] a shorter bone has no direction
+
+
+@dataclass(frozen=True)
+class Family:
+    """Joint names of one family of skeletons.
+
+    Parameters
+    ----------
+    name : str
+    spine : names of the joints at the sacrum, a third of the way up the spine, at the root of the neck, in the head.
+    limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist, knuckles; {s}, {S}, {Side} are l, L, Left.
+    toe_end : name of the tip of the toes.
+    across_hand : names of two joints, the second one on the thumb's side.
+    head_top : name of the top of the head; None where the eyes tell how the head is turned.
+    eyes : name of the eyes, or None.
+    """
+
+    name: str
+    spine: tuple[str, str, str, str]
+    limbs: tuple[str, ...]
+    toe_end: str
+    across_hand: tuple[str, str]
+    head_top: str | None = None
+    eyes: str | None = None
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """All joints that the family is recognised by."""
+        both = [name.format(**side) for side in _SIDES.values() for name in (*self.limbs, self.toe_end, *self.across_hand)]
+        eyes = [self.eyes.format(**side) for side in _SIDES.values()] if self.eyes else []
+        return tuple(dict.fromkeys([*self.spine, *([self.head_top] if self.head_top else []), *both, *eyes]))
+
+
+FAMILIES = (
+    Family(
+        "Acclaim (CMU)", ("root", "upperback", "lowerneck", "head"),
+        ("{s}femur", "{s}tibia", "{s}foot", "{s}toes", "{s}humerus", "{s}radius", "{s}wrist", "{s}fingers"),
+        "{s}toes_end", ("{s}thumb", "{s}thumb_end"), "head_end",
+    ),
+    Family(
+        "MotionBuilder (CMU)", ("Hips", "Spine", "Neck", "Head"),
+        ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand",
+         "{Side}HandIndex1"),
+        "{Side}ToeBase_end", ("{S}Thumb", "{S}Thumb_end"), "Head_end",
+    ),
+    Family(
+        "hip and knee (CMU)", ("Hips", "Chest", "lowerneck", "Head"),
+        ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist", "{S}Fingers"),
+        "{Side}Toe_end", ("{S}Thumb", "{S}Thumb_end"), "Head_end",
+    ),
+    Family(
+        "AnimatedDrawings", ("Hips", "Spine1", "Neck", "Head"),
+        ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand",
+         "{Side}HandEnd"),
+        "{Side}ToeBase_end", ("{Side}Hand", "{Side}HandThumb1"), "Head_end",
+    ),
+    Family(
+        "iClone", ("CC_Base_Waist", "CC_Base_Spine01", "CC_Base_NeckTwist01", "CC_Base_Head"),
+        ("CC_Base_{S}_Thigh", "CC_Base_{S}_Calf", "CC_Base_{S}_Foot", "CC_Base_{S}_ToeBase", "CC_Base_{S}_Upperarm",
+         "CC_Base_{S}_Forearm", "CC_Base_{S}_Hand", "CC_Base_{S}_Mid1"),
+        "CC_Base_{S}_MidToe1", ("CC_Base_{S}_Pinky1", "CC_Base_{S}_Index1"), eyes="CC_Base_{S}_Eye",
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class BoneDirections:
+    """A recorded motion without its lengths, y up; all arrays (F, 3), directions of unit length or NaN.
+
+    Parameters
+    ----------
+    rate : float [Hz]
+    hip_centre : (F, 3) [m]
+    leg_length : float [m] of thigh and shank.
+    bones : name -> direction
+        "pelvis" (hip centre to sacrum), "abdomen", "thorax", "head" (from the root of the neck to the top of the head,
+        or between the eyes), and with _l and _r "thigh", "shank", "foot", "toes", "clavicle" (from the root of the neck
+        to the shoulder), "upperarm", "forearm", "hand".
+    across : name -> direction
+        From left to right across "pelvis", "thorax" and "head"; towards the thumb across "hand_l" and "hand_r".
+    by_eyes : bool, whether "head" points between the eyes.
+    """
+
+    rate: float
+    hip_centre: NDArray
+    leg_length: float
+    bones: Mapping[str, NDArray]
+    across: Mapping[str, NDArray]
+    by_eyes: bool
+
+    def __len__(self) -> int:
+        return len(self.hip_centre)
+
+    def resampled(self, rate: float) -> BoneDirections:
+        """The same at another rate [Hz], linearly between frames."""
+        if not 0 < rate < np.inf:
+            raise ObservationError(f"the rate {rate} is not positive", remedy="Give frames a second.")
+        at = np.arange(int((len(self) - 1) / self.rate * rate + 1e-6) + 1) * (self.rate / rate)
+        low = np.minimum(at.astype(int), len(self) - 1)
+        high, share = np.minimum(low + 1, len(self) - 1), (at - low)[:, None]
+
+        def between(array: NDArray) -> NDArray:
+            return (1 - share) * array[low] + share * array[high]
+
+        return BoneDirections(
+            rate, between(self.hip_centre), self.leg_length,
+            {name: _unit(between(v)) for name, v in self.bones.items()},
+            {name: _unit(between(v)) for name, v in self.across.items()}, self.by_eyes,
+        )
+
+
+def family_of(skeleton: SkeletonMotion) -> Family:
+    """The family of a skeleton by the names of its joints.
+
+    Raises
+    ------
+    ObservationError
+        None fits; the message tells what lacks for the nearest one.
+    """
+    lacking = {family: [name for name in family.joints if name not in skeleton.names] for family in FAMILIES}
+    family = min(FAMILIES, key=lambda family: len(lacking[family]) / len(family.joints))
+    if lacking[family]:
+        names = ", ".join(family.name for family in FAMILIES)
+        raise ObservationError(
+            f"the skeleton is of no known family ({names}); for '{family.name}' it lacks: {', '.join(lacking[family])}",
+            file=skeleton.source or None, remedy="Rename its joints to those of a known family.",
+        )
+    return family
+
+
+def bone_directions(skeleton: SkeletonMotion) -> BoneDirections:
+    """Directions of the bones of a recorded skeleton of a known family.
+
+    Raises
+    ------
+    ObservationError
+        Of no known family, or a bone of the trunk, the arms or the legs has no length.
+    """
+    family = family_of(skeleton)
+    positions = skeleton.positions @ rotation_between_up(skeleton.up, "y").T
+
+    def at(name: str, side: str = "l") -> NDArray:
+        return positions[:, skeleton.names.index(name.format(**_SIDES[side]))]
+
+    joint = {f"{limb}_{side}": at(name, side) for side in _SIDES for limb, name in zip(_LIMBS, family.limbs)}
+    sacrum, spine, neck = (at(name) for name in family.spine[:3])
+    hip_centre = 0.5 * (joint["hip_l"] + joint["hip_r"])
+    bones = {"pelvis": sacrum - hip_centre, "abdomen": spine - sacrum, "thorax": neck - spine}
+    across = {"pelvis": joint["hip_r"] - joint["hip_l"], "thorax": joint["shoulder_r"] - joint["shoulder_l"]}
+    if family.eyes:
+        left, right = at(family.eyes, "l"), at(family.eyes, "r")
+        bones["head"], across["head"] = 0.5 * (left + right) - neck, right - left
+    else:
+        bones["head"], across["head"] = at(family.head_top or "") - neck, _head_right(skeleton, family)
+    for side in _SIDES:
+        chain = [joint[f"{limb}_{side}"] for limb in _LIMBS]
+        for name, (start, end) in {
+            "thigh": chain[0:2], "shank": chain[1:3], "foot": chain[2:4],
+            "toes": (chain[3], at(family.toe_end, side)), "clavicle": (neck, chain[4]),
+            "upperarm": chain[4:6], "forearm": chain[5:7], "hand": chain[6:8],
+        }.items():
+            bones[f"{name}_{side}"] = end - start
+        start, end = (at(name, side) for name in family.across_hand)
+        across[f"hand_{side}"] = end - start
+    legs = [np.linalg.norm(bones[f"{bone}_{side}"], axis=1).mean() for bone in ("thigh", "shank") for side in _SIDES]
+    for name, vector in bones.items():
+        if not name.startswith(("hand", "toes")) and np.any(np.linalg.norm(vector, axis=1) < _LEAST_BONE):
+            raise ObservationError(f"the bone '{name}' has no length", file=skeleton.source or None)
+    return BoneDirections(
+        skeleton.rate, hip_centre, float(sum(legs) / 2),
+        {name: _unit(v) for name, v in bones.items()}, {name: _unit(v) for name, v in across.items()}, bool(family.eyes),
+    )
+
+
+def _head_right(skeleton: SkeletonMotion, family: Family) -> NDArray:
+    """(F, 3) the head's right-hand side: that of the rest pose, turned with the head's joint frame."""
+    rest = np.array(skeleton.offsets)
+    for joint, parent in enumerate(skeleton.parents):
+        rest[joint] += rest[parent] if parent >= 0 else 0.0
+    hips = [skeleton.names.index(family.limbs[0].format(**side)) for side in _SIDES.values()]
+    turn = rotation_between_up(skeleton.up, "y") @ skeleton.Ts_world_joint[:, skeleton.names.index(family.spine[3]), :3, :3]
+    return turn @ (rest[hips[1]] - rest[hips[0]])
+
+
+def _unit(vectors: NDArray) -> NDArray:
+    norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.where(norms >= _LEAST_BONE, vectors / np.where(norms > 0, norms, 1.0), np.nan)

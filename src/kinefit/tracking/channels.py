@@ -1,0 +1,134 @@
+"""Channels: every keypoint of every camera as one flat list, the form in which a frame is tracked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.errors import ObservationError, choices
+from kinefit.geometry.camera import Rig
+from kinefit.observations import Keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """N measurements a frame: one for each source (a camera's detector) and point.
+
+    Parameters
+    ----------
+    rig : Rig
+    points : PointSet of the K points of all keypoint sets in use, set after set.
+    sets : {keypoint set: slice of its points}
+    sources : (Q,) names, one for each Keypoints record.
+    source, camera, column : (N,) int
+        Which record, which camera of the rig, which of the K points.
+    partner : (N,) int
+        Channel of the same source with left and right exchanged; itself for a point in the middle.
+    sigma : (N,) [px] standard deviation at full confidence.
+    uv : (F, N, 2) [px], NaN where unseen.
+    confidence : (F, N) in 0..1
+    """
+
+    rig: Rig
+    points: PointSet
+    sets: dict[str, slice]
+    sources: tuple[str, ...]
+    source: NDArray
+    camera: NDArray
+    column: NDArray
+    partner: NDArray
+    sigma: NDArray
+    uv: NDArray
+    confidence: NDArray
+
+    @property
+    def weight(self) -> NDArray:
+        """(F, N) [1/px²] confidence² / σ², 0 where unseen."""
+        seen = np.isfinite(self.uv).all(axis=-1)
+        return np.where(seen, np.square(self.confidence / self.sigma), 0.0)
+
+    def with_points(self, body: Body) -> Channels:
+        """The same measurements of another body's points."""
+        parts = [body.keypoints(name).select(self.points.names[span]) for name, span in self.sets.items()]
+        return replace(self, points=joined(parts))
+
+    def only(self, cameras: Sequence[int]) -> Channels:
+        """As if only some cameras had seen anything."""
+        kept = np.isin(self.camera, cameras)
+        return replace(self, uv=np.where(kept[None, :, None], self.uv, np.nan))
+
+
+def joined(parts: Sequence[PointSet]) -> PointSet:
+    """Several point sets as one."""
+    return PointSet(
+        tuple(n for p in parts for n in p.names),
+        np.concatenate([p.segments for p in parts]),
+        np.concatenate([p.points for p in parts]),
+    )
+
+
+def mirror_name(name: str) -> str:
+    """Name of the point on the other side, in the detectors' spellings; the same name for one in the middle."""
+    if name[:1] in "LR" and name[1:2].isupper():
+        return ("R" if name[0] == "L" else "L") + name[1:]
+    if "left" in name:
+        return name.replace("left", "right")
+    return name.replace("right", "left")
+
+
+def make_channels(
+    body: Body, rig: Rig, keypoints: Sequence[Keypoints], people: Sequence[NDArray], sigma: Sequence[float]
+) -> Channels:
+    """Channels of one person.
+
+    Parameters
+    ----------
+    keypoints : Q records, all with the same frames.
+    people : Q arrays (F,) int, which person of each record; -1 for none.
+    sigma : (Q,) [px] accuracy of each record.
+    """
+    if not keypoints:
+        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+    names: dict[str, list[str]] = {}
+    for record in keypoints:
+        if record.camera not in rig:
+            raise ObservationError(choices("camera", record.camera, rig.names), file=record.source or None)
+        known = body.keypoints(record.keypoint_set).names
+        names.setdefault(record.keypoint_set, [n for n in record.names if n in known])
+    sets, parts, start = {}, [], 0
+    for name, chosen in names.items():
+        if not chosen:
+            raise ObservationError(f"body '{body.name}' has none of the points of {name}")
+        parts.append(body.keypoints(name).select(tuple(chosen)))
+        sets[name] = slice(start, start := start + len(chosen))
+    source, camera, column, partner, spread, uv, confidence = [], [], [], [], [], [], []
+    for q, (record, person) in enumerate(zip(keypoints, people, strict=True)):
+        span, chosen = sets[record.keypoint_set], names[record.keypoint_set]
+        first = len(source)
+        mirrored = [mirror_name(n) for n in chosen]
+        partner += [first + (chosen.index(m) if m in chosen else i) for i, m in enumerate(mirrored)]
+        source += [q] * len(chosen)
+        camera += [rig.index(record.camera)] * len(chosen)
+        column += list(range(span.start, span.stop))
+        spread += [float(sigma[q])] * len(chosen)
+        columns = [record.names.index(n) for n in chosen]
+        frames, one = np.arange(len(record)), np.maximum(person, 0)
+        there = (np.asarray(person) >= 0)[:, None]
+        uv.append(np.where(there[..., None], record.points[frames, one][:, columns], np.nan))
+        confidence.append(np.where(there, record.confidence[frames, one][:, columns], 0.0))
+    twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
+    labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
+    return Channels(
+        rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
+        np.array(spread), np.concatenate(uv, axis=1), np.nan_to_num(np.concatenate(confidence, axis=1)),
+    )  # fmt: skip
+
+
+def exchange(channels: Channels, frame: NDArray, swapped: NDArray) -> NDArray:
+    """Values (N, ...) of one frame with left and right exchanged in the sources marked in swapped (Q,)."""
+    order = np.where(swapped[channels.source], channels.partner, np.arange(len(channels.partner)))
+    return frame[order]

@@ -1,0 +1,165 @@
+"""A start with no pose given: triangulated points -> bone lengths -> pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import point_rows
+from kinefit.errors import TrackingError
+from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.rows import ParameterRows
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.losses import geman_mcclure
+from kinefit.solvers.shape import posture_weights
+from kinefit.tracking.channels import Channels, exchange
+
+
+def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float = 30.0) -> NDArray:
+    """(F, K, 3) [m] points of some frames on which two or more cameras agree, NaN elsewhere.
+
+    Frames in which exchanging left and right in some sources makes more of them agree are put right.
+    """
+    out = np.full((len(frames), len(channels.points), 3), np.nan)
+    for i, f in enumerate(frames):
+        best = -1.0
+        for swapped in _swap_patterns(len(channels.sources)):
+            x, support = _agreed(channels, int(f), swapped, max_residual_px)
+            support -= 0.02 * swapped.sum() * len(channels.points)  # for nothing, believe the detector
+            if support > best:
+                best, out[i] = support, x
+    return out
+
+
+def _swap_patterns(sources: int) -> list[NDArray]:
+    """No source, then each one alone: more at once are found when the track runs."""
+    return [np.zeros(sources, bool), *(np.eye(sources, dtype=bool) if sources > 2 else [])]
+
+
+def _agreed(channels: Channels, frame: int, swapped: NDArray, limit: float) -> tuple[NDArray, float]:
+    uv, weight = exchange(channels, channels.uv[frame], swapped), exchange(channels, channels.confidence[frame], swapped)
+    Q, K = len(channels.sources), len(channels.points)
+    grid, sure = np.full((K, Q, 2), np.nan), np.zeros((K, Q))
+    grid[channels.column, channels.source], sure[channels.column, channels.source] = uv, weight
+    cameras = [int(channels.camera[channels.source == q][0]) for q in range(Q)]
+    # one column per camera: of several detectors in one camera each has its own points, so columns never clash
+    view = np.full((K, len(channels.rig), 2), np.nan)
+    trust = np.zeros((K, len(channels.rig)))
+    for q, c in enumerate(cameras):
+        here = np.isfinite(grid[:, q]).all(-1) & (sure[:, q] > 0.1)
+        view[here, c], trust[here, c] = grid[here, q], sure[here, q]
+    x, inliers, _ = triangulate_robust(channels.rig, view, trust, max_residual_px=limit)
+    return x, float(np.sum(np.where(inliers.sum(1) >= 2, (inliers * trust).sum(1), 0.0)))
+
+
+def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
+    """Pairs of points whose distance no angle changes: (point, point, scale group, distance at rest [m]).
+
+    A point at a joint's centre belongs to both segments there.
+    """
+    tree = body.tree
+    hosts: list[dict[int, NDArray]] = []
+    for s, x in zip(points.segments, points.points, strict=True):
+        here = {int(s): x}
+        if np.linalg.norm(x) < 1e-9 and tree.parents[s] >= 0:
+            here[int(tree.parents[s])] = tree.offsets[s]
+        hosts.append(here)
+    out = []
+    for i in range(len(hosts)):
+        for j in range(i + 1, len(hosts)):
+            for s in hosts[i].keys() & hosts[j].keys():
+                length = float(np.linalg.norm(hosts[i][s] - hosts[j][s]))
+                if length > 0.05:
+                    out.append((i, j, int(body.segment_scale[s]), length))
+    return out
+
+
+def first_scales(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
+    """(G,) scales from the median lengths of bones over frames: x_world (F, K, 3) [m], NaN where unknown.
+
+    Groups without a bone to measure take the median of the others.
+
+    Raises
+    ------
+    TrackingError
+        No bone can be measured in any frame.
+    """
+    ratios: dict[int, list[tuple[float, float]]] = {}
+    for i, j, group, length in rigid_pairs(body, points):
+        distances = np.linalg.norm(x_world[:, i] - x_world[:, j], axis=1)
+        if np.isfinite(distances).any():
+            ratios.setdefault(group, []).append((float(np.nanmedian(distances)) / length, length))
+    if not ratios:
+        raise TrackingError(
+            "no bone of the body can be measured: too few keypoints are seen by two cameras at once",
+            remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
+        )
+    means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
+    whole = float(np.median(list(means.values())))
+    if not 0.2 < whole < 5.0:
+        raise TrackingError(
+            f"the person would be {whole:.2g} times as large as the body: the calibration's unit is wrong",
+            remedy="Set unit under [calibration].",
+        )
+    return np.array([np.clip(means.get(g, whole), 0.6 * whole, 1.6 * whole) for g in range(len(body.scale_groups))])
+
+
+def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
+    """T_world_root (4, 4) that lays the resting body on known points (K, 3) best, trunk before limbs (Kabsch)."""
+    rest, known = body.points_rest(points), np.isfinite(x_world).all(axis=1)
+    depth = np.zeros(len(body.tree.segments))
+    for s in range(1, len(depth)):
+        depth[s] = depth[body.tree.parents[s]] + 1
+    near = np.exp(-np.linalg.norm(rest[:, [0, 2]], axis=1) / 0.2) * np.where(rest[:, 1] < -0.1, 0.05, 1.0)
+    w = np.where(known, near / (1 + 0.2 * depth[points.segments]), 0.0)
+    a, b = rest - w @ rest / w.sum(), np.where(known[:, None], x_world, 0.0)
+    b = b - w @ b / w.sum()
+    u, _, vt = np.linalg.svd((w[:, None] * b).T @ a)
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = w @ np.where(known[:, None], x_world, 0.0) / w.sum() - R @ (w @ rest / w.sum())
+    return T
+
+
+def pose_from_points(body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03) -> tuple[BodyState, float]:
+    """State of a body from points (K, 3) [m] with no pose given, and the median distance left [m].
+
+    Several starts are tried (the aligned rest pose, turned about its long axis too); the cheapest end wins.
+    """
+    known = np.isfinite(x_world).all(axis=1)
+    if known.sum() < 6:
+        raise TrackingError("fewer than six points are known in space", remedy="Start where more cameras see the body.")
+    weight = posture_weights(body)
+    count = len(body.tree.coordinates)
+
+    def rows(state: BodyState) -> list:
+        return [
+            point_rows(body, state, points, x_world, sigma=sigma),
+            ParameterRows(6 + np.arange(count), -state.angles, weight),
+        ]
+
+    T = aligned_root(body, points, x_world)
+    best = None
+    for turn in (0.0, np.pi):
+        start = body.rest_state(T @ _turn(turn))
+        fit = levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-6)
+        fit = levenberg_marquardt(body, fit.state, rows, loss=geman_mcclure(), max_iterations=40, tolerance=1e-6)
+        if best is None or fit.equations.cost < best.equations.cost:
+            best = fit
+    assert best is not None
+    left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
+    return best.state, float(np.median(left))
+
+
+def _turn(angle: float) -> NDArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+
+
+def scaled_channels(body: Body, channels: Channels) -> Channels:
+    """Channels whose points are those of a fitted body."""
+    return replace(channels.with_points(body))

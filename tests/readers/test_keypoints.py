@@ -1,0 +1,227 @@
+"""Keypoints of detectors: real folders and arrays, and every bad file named."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.geometry.camera import ImageFrame
+from kinefit.readers.keypoints import (
+    KEYPOINT_SETS,
+    keypoint_names,
+    read_caliscope_csv,
+    read_keypoints,
+    read_mediapipe,
+    read_openpose,
+)
+
+
+def person(count=17, value=100.0, confidence=0.9):
+    return {"pose_keypoints_2d": [value, value + 1, confidence] * count, "face_keypoints_2d": []}
+
+
+def write(folder, frames, name="cam_{:012d}_keypoints.json"):
+    folder.mkdir(exist_ok=True)
+    for i, people in frames.items():
+        (folder / name.format(i)).write_text(json.dumps({"version": 1.3, "people": people}))
+    return folder
+
+
+def read(folder, **options):
+    return read_openpose(folder, camera="cam", rate=50, **{"keypoint_set": "COCO_17", **options})
+
+
+def test_sets_have_the_detectors_sizes_and_unique_names():
+    sizes = {name: len(names) for name, names in KEYPOINT_SETS.items()}
+    assert sizes == {"BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33}
+    assert all(len(set(names)) == len(names) for names in KEYPOINT_SETS.values())
+    assert KEYPOINT_SETS["MEDIAPIPE_33"][23:26] == ("left_hip", "right_hip", "left_knee")
+    assert KEYPOINT_SETS["MEDIAPIPE_33"][9:13] == ("mouth_left", "mouth_right", "left_shoulder", "right_shoulder")
+    with pytest.raises(ObservationError, match="no keypoint set 'BODY_26'; there are: BODY_25B"):
+        keypoint_names("BODY_26")
+
+
+def test_real_openpose_folders(data_dir):
+    folder = data_dir("video_balancing_4cam") / "openpose_json"
+    people = {}
+    for camera in ("cam01", "cam02", "cam03", "cam04"):
+        keypoints = read_openpose(folder / camera, camera=camera, rate=60)
+        people[camera] = keypoints.points.shape[1]
+        assert keypoints.points.shape == (100, people[camera], 25, 2)
+        assert np.isnan(keypoints.points[keypoints.confidence == 0]).all()
+        assert np.isfinite(keypoints.points[keypoints.confidence > 0]).all()
+        assert keypoints.times[-1] == pytest.approx(99 / 60)
+
+        def distance(a, b, points=keypoints.points[:, 0], names=keypoints.names):
+            return np.nanmedian(np.linalg.norm(points[:, names.index(a)] - points[:, names.index(b)], axis=-1))
+
+        assert distance("LHeel", "LAnkle") < 40 < distance("LHeel", "RAnkle")  # the order of the names is right
+        assert distance("UpperNeck", "LShoulder") < distance("HeadTop", "LShoulder")
+    assert people == {"cam01": 3, "cam02": 2, "cam03": 1, "cam04": 1}
+
+
+def test_static_trial_names_with_digits_in_front(data_dir):
+    folder = data_dir("video_balancing_4cam") / "static_trial" / "pose" / "cam02_json"
+    assert read_openpose(folder, camera="cam02", rate=60).points.shape[0] == 12
+
+
+def test_people_frames_and_unseen_points(tmp_path):
+    unseen = person()
+    unseen["pose_keypoints_2d"][3:6] = [0, 0, 0]
+    folder = write(tmp_path / "json", {8: [person(value=1)], 9: [], 10: [person(value=3), unseen], 11: [person()]})
+    keypoints = read(folder, time_offset=0.5)
+    assert keypoints.points.shape == (4, 2, 17, 2)
+    np.testing.assert_array_equal(np.isfinite(keypoints.points[..., 0]).sum(axis=(1, 2)), [17, 0, 17 + 16, 17])
+    assert np.isnan(keypoints.points[2, 1, 1]).all()
+    assert keypoints.points[2, 0, 0].tolist() == [3, 4]
+    part = read(folder, time_offset=0.5, frames=(2, 4))
+    np.testing.assert_array_equal(part.points, keypoints.points[2:])
+    np.testing.assert_allclose(part.times, keypoints.times[2:])
+    with pytest.raises(ObservationError, match=r"frames \[2, 5\] of 4"):
+        read(folder, frames=(2, 5))
+
+
+@given(st.lists(st.tuples(*[st.floats(-5000, 5000)] * 2, st.floats(0.01, 1)), min_size=17, max_size=17))
+def test_what_is_written_is_read(tmp_path_factory, rows):
+    flat = [number for row in rows for number in row]
+    folder = write(tmp_path_factory.mktemp("k") / "json", {0: [{"pose_keypoints_2d": flat}]})
+    keypoints = read(folder)
+    np.testing.assert_array_equal(keypoints.points[0, 0], np.array(rows)[:, :2])
+    np.testing.assert_array_equal(keypoints.confidence[0, 0], np.array(rows)[:, 2])
+
+
+BAD = {
+    "broken json": '{"people": [{"pose_keypoints_2d": [1, 2',
+    "broken json.*people": '{"version": 1.3}',
+    "NaN": json.dumps({"people": [person(value=float("nan"))]}),
+    "NaN or infinity": json.dumps({"people": [person(value=float("inf"))]}),
+    "broken json.*null": json.dumps({"people": [person(value=0) | {"pose_keypoints_2d": [None] * 51}]}),
+    "75 numbers where COCO_17 has 17 x 3": json.dumps({"people": [person(count=25)]}),
+    "0 numbers": json.dumps({"people": [person(count=0)]}),
+}
+
+
+@pytest.mark.parametrize("problem", BAD)
+def test_a_bad_file_is_named(tmp_path, problem):
+    folder = write(tmp_path / "json", {0: [person()], 1: [person()], 2: [person()]})
+    bad = folder / "cam_000000000001_keypoints.json"
+    bad.write_text(BAD[problem])
+    with pytest.raises(ObservationError, match=problem) as caught:
+        read(folder)
+    assert caught.value.file == bad
+    assert caught.value.remedy
+
+
+def test_the_keypoint_set_that_fits_is_proposed(tmp_path):
+    with pytest.raises(ObservationError, match="This number fits: HALPE_26"):
+        read(write(tmp_path / "json", {0: [person(count=26)]}))
+
+
+def test_missing_and_doubled_frames(tmp_path):
+    folder = write(tmp_path / "json", {0: [person()], 1: [person()], 4: [person()]})
+    with pytest.raises(ObservationError, match="2 of the frames 0 to 4 are missing, the first is 2"):
+        read(folder)
+    other = write(tmp_path / "two", {0: [person()]})
+    write(other, {0: [person()]}, name="other_{:03d}.json")
+    with pytest.raises(ObservationError, match="frame 0 is there twice"):
+        read(other)
+    (tmp_path / "named").mkdir()
+    (tmp_path / "named" / "all.json").write_text("{}")
+    with pytest.raises(ObservationError, match="no frame number"):
+        read(tmp_path / "named")
+
+
+def test_nobody_and_nothing(tmp_path):
+    with pytest.raises(ObservationError, match="nobody is seen in any of the 3 frames of camera cam"):
+        read(write(tmp_path / "json", {0: [], 1: [], 2: []}))
+    with pytest.raises(FileError, match="no such folder"):
+        read(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileError, match="no json files"):
+        read(tmp_path / "empty")
+    with pytest.raises(ObservationError, match="rate"):
+        read_openpose(write(tmp_path / "one", {0: [person()]}), camera="c", rate=0, keypoint_set="COCO_17")
+
+
+def test_mediapipe_of_a_letterboxed_video(data_dir):
+    path = data_dir("video_balancing_4cam") / "mediapipe_landmarks_cam01.npy"
+    image = ImageFrame.letterboxed((1088, 1920), (1080, 1920))
+    keypoints = read_mediapipe(path, camera="cam01", rate=60, image_frame=image)
+    raw = np.load(path)
+    assert keypoints.points.shape == (100, 1, 33, 2)
+    np.testing.assert_allclose(image.from_calibration(keypoints.points[:, 0]), raw[..., :2], atol=1e-9)
+    assert 0.5 < np.median(keypoints.points[..., 0] / raw[:, None, :, 0]) / (1088 / 1080) < 1.001
+    np.testing.assert_allclose((keypoints.points[:, 0, :, 1] - 959.5) / (raw[..., 1] - 959.5), 1088 / 1080)
+    np.testing.assert_array_equal(keypoints.confidence[:, 0], raw[..., 2])
+    part = read_mediapipe(path, camera="cam01", rate=60, frames=(10, 20))
+    assert part.times[0] == pytest.approx(10 / 60)
+    np.testing.assert_array_equal(part.points[:, 0], raw[10:20, :, :2])
+
+
+def test_both_detectors_agree_in_the_calibrations_frame(data_dir):
+    """Knees and elbows of the two detectors are nearer to each other with the letterbox undone than without."""
+    folder = data_dir("video_balancing_4cam")
+    openpose = read_openpose(folder / "openpose_json" / "cam01", camera="cam01", rate=60)
+    image = ImageFrame.letterboxed((1088, 1920), (1080, 1920))
+    apart = []
+    for frame in (None, image):
+        mediapipe = read_mediapipe(folder / "mediapipe_landmarks_cam01.npy", camera="cam01", rate=60, image_frame=frame)
+        ours = mediapipe.points[:, 0, [mediapipe.names.index(n) for n in ("left_knee", "right_knee", "left_elbow")]]
+        theirs = openpose.points[:, :, [openpose.names.index(n) for n in ("LKnee", "RKnee", "LElbow")]]
+        distance = np.linalg.norm(theirs - ours[:, None], axis=-1)
+        apart.append(np.nanmedian(np.fmin.reduce(distance, axis=1)))
+    assert apart[1] < apart[0]
+    assert apart[1] < 15
+
+
+def test_mediapipe_bad_arrays(tmp_path):
+    def of(array):
+        np.save(tmp_path / "m.npy", array)
+        return read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
+
+    good = np.ones((5, 33, 3))
+    gap = good.copy()
+    gap[2] = np.nan
+    assert np.isnan(of(gap).points[2]).all() and np.isfinite(of(gap).points[[0, 1, 3, 4]]).all()
+    gap[3, 7, 0] = np.nan
+    with pytest.raises(ObservationError, match="frame 3.*left_ear"):
+        of(gap)
+    with pytest.raises(ObservationError, match="nobody"):
+        of(0 * good)
+    with pytest.raises(ObservationError, match=r"shape \(5, 32, 3\)"):
+        of(good[:, :32])
+    with pytest.raises(FileError, match="no such file"):
+        read_mediapipe(tmp_path / "none.npy", camera="c", rate=30)
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "m.npy").read_bytes()[:300])
+    with pytest.raises(FileError, match="not a numpy array"):
+        read_mediapipe(tmp_path / "cut.npy", camera="c", rate=30)
+
+
+def test_caliscope_table(data_dir, tmp_path):
+    path = data_dir("mv4_landmarks_caliscope") / "HOLISTIC" / "xy_HOLISTIC.csv"
+    cameras = read_caliscope_csv(path)
+    assert list(cameras) == ["cam_0", "cam_1", "cam_2", "cam_3"]
+    assert all(k.points.shape == (267, 1, 33, 2) for k in cameras.values())
+    assert cameras["cam_0"].rate == pytest.approx(30.4, abs=0.1)
+    assert cameras["cam_0"].points[0, 0, 0].tolist() == [520, 193]
+    (tmp_path / "x.csv").write_text("sync_index,port\n0,1\n")
+    with pytest.raises(ObservationError, match="no column frame_time"):
+        read_caliscope_csv(tmp_path / "x.csv")
+    with pytest.raises(FileError, match="no such file"):
+        read_caliscope_csv(tmp_path / "y.csv")
+    text = path.read_text().splitlines()[:9]
+    (tmp_path / "x.csv").write_text("\n".join([*text, "0,0,0,1.0,3,abc,5,,"]))
+    with pytest.raises(ObservationError, match="not a number"):
+        read_caliscope_csv(tmp_path / "x.csv")
+
+
+def test_any_format(data_dir, tmp_path):
+    folder = data_dir("video_balancing_4cam")
+    by_kind = read_keypoints(folder / "openpose_json" / "cam03", camera="cam03", rate=60)
+    assert by_kind.keypoint_set == "BODY_25B"
+    assert read_keypoints(folder / "mediapipe_landmarks_cam03.npy", camera="c", rate=60).keypoint_set == "MEDIAPIPE_33"
+    with pytest.raises(ObservationError, match="no keypoint format 'alphapose'; there are: openpose, mediapipe"):
+        read_keypoints(tmp_path, format="alphapose", camera="c", rate=60)
