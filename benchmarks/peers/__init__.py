@@ -65,8 +65,9 @@ class Problem:
         return np.array([marker["point"] for marker in self.markers], dtype=float)
 
 
-def write_problem(folder: Path, segments: list[dict[str, Any]], markers: list[dict[str, Any]],
-                  **arrays: np.ndarray) -> None:
+def write_problem(
+    folder: Path, segments: list[dict[str, Any]], markers: list[dict[str, Any]], **arrays: np.ndarray
+) -> None:
     """Write an exchange folder; `arrays` as named in the module's text."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "problem.json").write_text(json.dumps({"segments": segments, "markers": markers}), encoding="utf-8")
@@ -91,8 +92,9 @@ def rotation_matrix(axis: Sequence[float], angle: Any) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
-def world_points(problem: Problem, root: np.ndarray, angles: np.ndarray, segments: np.ndarray, points: np.ndarray
-                 ) -> np.ndarray:
+def world_points(
+    problem: Problem, root: np.ndarray, angles: np.ndarray, segments: np.ndarray, points: np.ndarray
+) -> np.ndarray:
     """Points of segments in the world: root (F, 4, 4), angles (F, N), segments (P,), points (P, 3) -> (F, P, 3)."""
     rotations, origins, column = [], [], 0
     for segment in problem.segments:
@@ -160,7 +162,7 @@ def measure(
     settings: Sequence[float],
     truth: np.ndarray,
     notes: str = "",
-    repeats: int = 5,
+    repeats: int = 15,
     default: float | None = None,
 ) -> dict[str, Any]:
     """Time `solve` at the first of `settings` that converges and print the result as one line of JSON.
@@ -212,8 +214,9 @@ def measure(
     return result
 
 
-def _time(solve: Callable, residuals: Callable, setting: float, repeats: int
-          ) -> tuple[float, float, int | None, np.ndarray]:
+def _time(
+    solve: Callable, residuals: Callable, setting: float, repeats: int
+) -> tuple[float, float, int | None, np.ndarray]:
     """Least CPU and wall time [s] of `repeats` runs, iterations and residuals of the last."""
     cpu = wall = np.inf
     for _ in range(repeats):

@@ -103,8 +103,12 @@ def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
         command = [taskset, "-c", str(max(os.sched_getaffinity(0))), *command]
     try:
         done = subprocess.run(
-            command, cwd=_ROOT, env=variables | dict.fromkeys(_ONE_THREAD, "1"), timeout=timeout,
-            capture_output=True, text=True,
+            command,
+            cwd=_ROOT,
+            env=variables | dict.fromkeys(_ONE_THREAD, "1"),
+            timeout=timeout,
+            capture_output=True,
+            text=True,
         )
         return json.loads(done.stdout.splitlines()[-1])
     except subprocess.TimeoutExpired:

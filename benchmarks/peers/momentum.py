@@ -10,9 +10,6 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from pymomentum import geometry, solver2
-from scipy.spatial.transform import Rotation
-
 from benchmarks.peers import (
     Problem,
     axes_frame,
@@ -22,10 +19,12 @@ from benchmarks.peers import (
     read_problem,
     root_frame,
 )
+from pymomentum import geometry, solver2
+from scipy.spatial.transform import Rotation
 
 CENTIMETRES = 100.0
 THRESHOLDS = (1e7, 3e6, 1e6, 3e5, 1e5, 3e4, 1e4, 1e3, 1e2)  # in units of single precision's epsilon
-REGULARIZATION = 1e-7
+REGULARIZATION = 0.05  # Momentum's default; less does not save an iteration and can diverge in single precision
 TX, RX = 0, 3  # a Momentum joint: tx ty tz rx ry rz scale; parent * translation * pre-rotation * Rz * Ry * Rx
 
 
@@ -57,9 +56,7 @@ class Figure:
             transform[row, parameter] = factor
         skeleton = geometry.Skeleton(self.joints)
         self.size = column
-        self.character = geometry.Character(
-            "body", skeleton, geometry.ParameterTransform(names, skeleton, transform)
-        )
+        self.character = geometry.Character("body", skeleton, geometry.ParameterTransform(names, skeleton, transform))
 
     @staticmethod
     def joinable(dofs: list[dict]) -> bool:
@@ -113,8 +110,9 @@ class Figure:
         return root, states[:, 6:]
 
 
-def solve_sequence(figure: Figure, error: solver2.SkeletonErrorFunction, renew: list, start: np.ndarray,
-                   threshold: float) -> tuple[np.ndarray, int]:
+def solve_sequence(
+    figure: Figure, error: solver2.SkeletonErrorFunction, renew: list, start: np.ndarray, threshold: float
+) -> tuple[np.ndarray, int]:
     """Fit every frame from the one before; `renew` holds one call per frame that sets the targets of `error`."""
     options = solver2.GaussNewtonSolverOptions()
     options.max_iterations, options.threshold, options.regularization = 50, threshold, REGULARIZATION

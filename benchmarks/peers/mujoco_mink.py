@@ -14,7 +14,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-
 from benchmarks.peers import Problem, marker_residuals, measure, read_problem
 from benchmarks.peers._gauss_newton import THRESHOLDS, solve_sequence
 
@@ -73,8 +72,9 @@ def configuration_order(problem: Problem, model: mujoco.MjModel) -> np.ndarray:
     return np.array([model.joint(dof["name"]).qposadr[0] for segment in problem.segments for dof in segment["dofs"]])
 
 
-def solve_with_mujoco(model: mujoco.MjModel, problem: Problem, start: np.ndarray, threshold: float
-                      ) -> tuple[list[np.ndarray], int]:
+def solve_with_mujoco(
+    model: mujoco.MjModel, problem: Problem, start: np.ndarray, threshold: float
+) -> tuple[list[np.ndarray], int]:
     """Damped Gauss-Newton on MuJoCo's site Jacobians."""
     data, marked = mujoco.MjData(model), Marked(model, problem)
 
@@ -93,8 +93,9 @@ def solve_with_mujoco(model: mujoco.MjModel, problem: Problem, start: np.ndarray
     return solve_sequence(linearise, integrate, start, targets, threshold)
 
 
-def solve_with_mink(model: mujoco.MjModel, problem: Problem, start: np.ndarray, threshold: float
-                    ) -> tuple[list[np.ndarray], int]:
+def solve_with_mink(
+    model: mujoco.MjModel, problem: Problem, start: np.ndarray, threshold: float
+) -> tuple[list[np.ndarray], int]:
     """mink.solve_ik with its daqp solver, no limits, until the predicted decrease is below the threshold."""
     import mink
 

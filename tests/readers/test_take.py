@@ -14,7 +14,7 @@ CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 
 def balancing(data, kind, *, letterbox='image = "letterboxed"', head="", frame=None):
     """A take of the balancing trial with the keypoints of one detector."""
-    text = f'[take]\nup = "y"\nheight = 1.75\n{head}\n'
+    text = f'[take]\nup = "z"\nheight = 1.75\n{head}\n'
     text += f'[calibration]\nfile = "{data}/Calib_refined_static.toml"\nunit = "m"\n'
     for camera in CAMERAS:
         picture = letterbox if camera in ("cam01", "cam02") else ""
@@ -37,7 +37,7 @@ def written(folder, text, name="take.toml"):
 @pytest.mark.parametrize(("kind", "count"), [("openpose", 25), ("mediapipe", 33)])
 def test_the_balancing_trial(data_dir, tmp_path, kind, count):
     take = read_take(written(tmp_path, balancing(data_dir("video_balancing_4cam"), kind)))
-    assert (take.name, take.up, take.height, take.body, take.rate) == ("take", "y", 1.75, "humanoid", None)
+    assert (take.name, take.up, take.height, take.body, take.rate) == ("take", "z", 1.75, "humanoid", None)
     assert [source.accuracy for source in take.keypoints] == [8.0 if kind == "openpose" else 11.0] * 4
     seen = load_observations(take)
     assert (seen.rate, seen.frames, seen.rig.names, tuple(seen.videos)) == (60, (0, 100), CAMERAS, CAMERAS)

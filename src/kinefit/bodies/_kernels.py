@@ -69,3 +69,38 @@ def forward_many(parents, dof_start, prismatic, axes, rest, roots, angles, frame
     screws = np.empty((axes.shape[0], 6))
     for i in range(roots.shape[0]):
         forward(parents, dof_start, prismatic, axes, rest, roots[i], angles[i], frames[i], screws)
+
+
+@jit
+def difference(root, other, angles, other_angles, out):
+    """δ (6 + D,) from one state to another: shift of the root, its turn (logarithm), then the angles."""
+    for i in range(3):
+        out[i] = other[i, 3] - root[i, 3]
+    m = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = other[i, 0] * root[j, 0] + other[i, 1] * root[j, 1] + other[i, 2] * root[j, 2]
+    # the largest of the quaternion's parts first (Shepperd): exact for every angle up to π
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    q = np.empty(4)
+    best, value = 0, trace
+    for i in range(3):
+        if m[i, i] > value:
+            best, value = i + 1, m[i, i]
+    if best == 0:
+        q[0] = 1.0 + trace
+        q[1], q[2], q[3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    else:
+        i = best - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0] = m[k, j] - m[j, k]
+        q[1 + i] = 1.0 + m[i, i] - m[j, j] - m[k, k]
+        q[1 + j], q[1 + k] = m[i, j] + m[j, i], m[i, k] + m[k, i]
+    sine = np.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    norm = np.sqrt(q[0] * q[0] + sine * sine)
+    sign = -1.0 if q[0] < 0.0 else 1.0
+    factor = 2.0 / norm if sine < 1e-9 * norm else 2.0 * np.arctan2(sine, sign * q[0]) / sine
+    for i in range(3):
+        out[3 + i] = sign * factor * q[1 + i]
+    for d in range(angles.size):
+        out[6 + d] = other_angles[d] - angles[d]

@@ -31,6 +31,7 @@ class _Joint(_Record):
     axes: list[str | Vector] = []
     coordinates: list[str] = []
     range: list[tuple[float, float]] = []
+    spread: list[float] = []
 
 
 class _Surface(_Record):
@@ -198,7 +199,7 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
 
 def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> KinematicTree:
     names: list[str] = []
-    rows: list[tuple[int, Any, bool, float, float]] = []
+    rows: list[tuple[int, Any, bool, float, float, float]] = []
     for i, s in enumerate(segments):
         j, place = s.joint, f"joint {s.joint.name}"
         if j.type not in JOINT_TYPES:
@@ -211,10 +212,10 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
             axes, slides = ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
         count = JOINT_TYPES[j.type]
         coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
-        if len(axes) != count or len(coordinates) != count or len(j.range) not in (0, count):
+        if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.spread)} - {0, count}:
             raise BodyError(
-                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges; here are {len(axes)}, "
-                f"{len(coordinates)} and {len(j.range)}",
+                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges and spreads; here are {len(axes)}, "
+                f"{len(coordinates)}, {len(j.range)} and {len(j.spread)}",
                 file=source,
                 place=place,
             )
@@ -231,9 +232,12 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
             low, high = j.range[k] if j.range else (-np.inf, np.inf)
             if not low <= high:
                 raise BodyError(f"range [{low}, {high}] of {coordinates[k]} is empty", file=source, place=place)
+            spread = j.spread[k] if j.spread else max(0.5 * (high - low), 1e-3)
+            if not spread > 0:
+                raise BodyError(f"spread {spread} of {coordinates[k]} is not positive", file=source, place=place)
             unit = 1.0 if slides[k] else np.pi / 180.0
             names.append(coordinates[k])
-            rows.append((i, axis / norm, slides[k], low * unit, high * unit))
+            rows.append((i, axis / norm, slides[k], low * unit, high * unit, spread * unit))
     twice = {n for n in names if names.count(n) > 1}
     if twice:
         raise BodyError(f"coordinate named twice: {', '.join(sorted(twice))}", file=source)
@@ -247,6 +251,7 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
         prismatic=np.array([r[2] for r in rows], bool),
         lower=np.array([r[3] for r in rows]),
         upper=np.array([r[4] for r in rows]),
+        spread=np.array([r[5] for r in rows]),
         root_free=segments[0].joint.type == "free",
     )
 

@@ -1,12 +1,14 @@
 """Body as plain arrays, exactly: for files that hold a fitted body beside its motion.
 
-S segments, D coordinates, G scale groups; names are arrays of text, indices int64, the rest float64, metres and radians:
+S segments, D coordinates, G scale groups; names are arrays of text, indices int64, the rest float64, in metres and
+radians:
 
     name ()  stature ()  root_free ()                  the body; stature [m]
     segments (S,)  joints (S,)  parents (S,)           parents: index, -1 for the root
     offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
     prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
+    spread (D,)                                        how far from zero it usually is [rad] or [m], inf where not told
     scale_groups (G,)  segment_scale (S,)
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
@@ -29,7 +31,7 @@ from kinefit.bodies.body import Body, Cylinder, PointSet
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
-_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper")
+_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", "spread")
 
 
 def body_to_arrays(body: Body) -> dict[str, NDArray]:
@@ -139,4 +141,5 @@ def _texts(arrays: Mapping[str, NDArray], key: str, count: int | None = None) ->
 
 def _check_indices(indices: NDArray, count: int, key: str) -> None:
     if indices.size and not (np.min(indices) >= 0 and np.max(indices) < count):
-        raise BodyError(f"array '{key}' names something that is not there", remedy=f"Indices run from 0 to {count - 1}.")
+        remedy = f"Its indices run from 0 to {count - 1}."
+        raise BodyError(f"array '{key}' names something that is not there", remedy=remedy)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import _kernels
 from kinefit.geometry import se3
 
 
@@ -38,6 +39,6 @@ class BodyState:
 
     def difference(self, other: BodyState) -> NDArray:
         """δ (6 + D,) such that `self.retract(δ)` is `other`."""
-        R = other.T_world_root[:3, :3] @ self.T_world_root[:3, :3].T
-        shift = other.T_world_root[:3, 3] - self.T_world_root[:3, 3]
-        return np.concatenate([shift, se3.log_so3(R), other.angles - self.angles])
+        out = np.empty(6 + len(self.angles))
+        _kernels.difference(self.T_world_root, other.T_world_root, self.angles, other.angles, out)
+        return out

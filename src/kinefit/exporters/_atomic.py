@@ -22,7 +22,7 @@ _REMEDIES = {
 def writing(path: str | PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; what was written there takes its place when the block ends well.
 
-    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays as it was.
+    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays.
 
     Raises
     ------

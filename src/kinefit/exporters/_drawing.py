@@ -14,7 +14,8 @@ from kinefit.exporters._tubes import side_colour
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 
-LOST, OUTLIER, MEASURED, WAY, DARK, WHITE = (150, 150, 150), (255, 40, 40), (255, 240, 60), (255, 90, 220), (15, 15, 15), (255,) * 3
+LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
+MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
@@ -53,8 +54,9 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
     edge = max(1, round(image.shape[0] / 900))
     for b in np.argsort(-depth):
         lost = motion.segment_quality[frame, owners[b]] <= 0
-        _line(image, uv[b], DARK, int(thick[b]) + 2 * edge)
-        _line(image, uv[b], LOST if lost else colours[b], max(1, int(thick[b]) // 3) if lost else int(thick[b]))
+        width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
+        _line(image, uv[b], DARK, width + 2 * edge)
+        _line(image, uv[b], LOST if lost else colours[b], width)
     for b in range(len(uv)):
         _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 

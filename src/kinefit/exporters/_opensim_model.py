@@ -26,7 +26,7 @@ _EYE, _ZERO = np.eye(3), "0 0 0"
 
 
 def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) -> ET.Element:
-    """The element <Model>; `root_coordinates` are the names of three turns z, x, y and three ways; `path` for messages."""
+    """The element <Model>; `root_coordinates`: names of the turns z, x, y and the three ways; `path` for messages."""
     tree = body.tree
     names = plain_names(body.alias("opensim", s) for s in tree.segments)
     coordinates = plain_names(tree.coordinates)
@@ -42,13 +42,15 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
         bodies.append(_body(name, tree.segments[s], surfaces.get(s)))
         parent = "/ground" if tree.parents[s] < 0 else f"/bodyset/{names[tree.parents[s]]}"
         dofs = range(tree.dof_start[s], tree.dof_start[s + 1])
-        turns = [(coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs if not tree.prismatic[d]]
-        ways = [(coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs if tree.prismatic[d]]
+        moves = {d: (coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs}
+        turns = [move for d, move in moves.items() if not tree.prismatic[d]]
+        ways = [move for d, move in moves.items() if tree.prismatic[d]]
         if tree.parents[s] < 0:
             turns = [(c, _EYE[k], (-2 * np.pi, 2 * np.pi)) for c, k in zip(root_coordinates[:3], (2, 0, 1))] + turns
             ways = [(c, _EYE[k], (-100.0, 100.0)) for c, k in zip(root_coordinates[3:], (0, 1, 2))] + ways
         if len(turns) > 3 or len(ways) > 3:
-            raise ExportError("OpenSim has no joint of more than three turns and ways", file=path, place=f"joint {body.joints[s]}")
+            place = f"joint {body.joints[s]}"
+            raise ExportError("OpenSim has no joint of more than three turns or three ways", file=path, place=place)
         joints.append(_joint(plain_names([body.joints[s]])[0], parent, name, tree.offsets[s], turns, ways, path))
     points = body.landmarks
     for label, s, at in zip(plain_names(points.names), points.segments, points.points):

@@ -62,6 +62,14 @@ def _given_z(R: NDArray, z: NDArray, before: NDArray) -> NDArray:
     return angles + 2.0 * np.pi * np.round((before - angles) / (2.0 * np.pi))
 
 
+def continuous_quaternions(rotations: NDArray) -> NDArray:
+    """Quaternions (F, 4) as (w, x, y, z) of rotations (F, 3, 3); of the two signs the nearer to the frame before."""
+    q = se3.quaternion(rotations)
+    flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
+    q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    return q
+
+
 def plain_names(names: Iterable[str]) -> list[str]:
     """Names without blanks and slashes, each once: a repeated one gets a number."""
     out: list[str] = []

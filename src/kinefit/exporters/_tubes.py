@@ -44,7 +44,8 @@ def body_mesh(body: Body) -> SkinnedMesh:
     """Tubes with rounded ends around all surfaces; near a joint the skin follows both segments."""
     parts = [_tube(body, c) for c in body.surfaces if np.linalg.norm(c.end) > 1e-6 and min(c.radii) > 0]
     if not parts:
-        return SkinnedMesh(*(np.zeros((0, n), t) for n, t in ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))))
+        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))
+        return SkinnedMesh(*(np.zeros((0, count), kind) for count, kind in columns))
     first = np.cumsum([0] + [len(p.vertices) for p in parts])
     return SkinnedMesh(
         vertices=np.concatenate([p.vertices for p in parts]),

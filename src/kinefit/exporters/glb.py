@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters._atomic import write_bytes
-from kinefit.exporters._skeleton import local_poses, plain_names, slides
+from kinefit.exporters._skeleton import continuous_quaternions, local_poses, plain_names, slides
 from kinefit.exporters._tubes import body_mesh
-from kinefit.geometry import se3
 from kinefit.motion import Motion
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -118,15 +117,7 @@ def _animation(motion: Motion, buffer: _Buffer) -> gl.Animation:
 
     for s in range(len(tree.segments)):
         if turning[s]:
-            channel(s, "rotation", continuous_quaternions(Ts[:, s, :3, :3]))
+            channel(s, "rotation", np.roll(continuous_quaternions(Ts[:, s, :3, :3]), -1, axis=-1))  # glTF: x, y, z, w
         if moving[s]:
             channel(s, "translation", Ts[:, s, :3, 3])
     return out
-
-
-def continuous_quaternions(rotations: NDArray) -> NDArray:
-    """Quaternions (F, 4) as (x, y, z, w) of rotations (F, 3, 3); of the two signs the one nearer to the frame before."""
-    q = np.roll(se3.quaternion(rotations), -1, axis=-1)
-    flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
-    q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    return q

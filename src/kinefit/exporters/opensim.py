@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.errors import ExportError, choices
@@ -66,8 +65,8 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
     angles = np.where(tree.prismatic, motion.angles, np.degrees(motion.angles))
     table = np.concatenate([motion.times[:, None], root, y_up.Ts_world_root[:, :3, 3], angles], axis=1) + 0.0
     names = ["time", *root_coordinates(motion.body), *plain_names(tree.coordinates)]
-    lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}", "inDegrees=yes"]
-    lines += ["", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees.", "", "endheader"]
+    lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}"]
+    lines += ["inDegrees=yes", "", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees.", "", "endheader"]
     lines += ["\t".join(names)]
     row = "\t".join(["%.9f"] + ["%.8f"] * (table.shape[1] - 1))
     lines += [row % tuple(values) for values in table.tolist()]

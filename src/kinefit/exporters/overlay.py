@@ -21,7 +21,7 @@ from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
 
 _NOTE = (255, 200, 60)
-_CODECS = {"libx264": {"preset": "veryfast", "crf": "21"}, "mpeg4": {"qscale": "3"}}
+_CODECS = {"libx264": {"preset": "superfast", "crf": "21"}, "mpeg4": {"qscale": "3"}}
 
 
 def write_overlay(
@@ -64,8 +64,8 @@ def write_overlay(
     with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
         for i, image in enumerate(video.frames()):
             frame = nearest_frame(motion, i / video.rate + time_offset)
-            out = draw_overlay(image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}")
-            encode(out[:height, :width])
+            more = {"image_frame": image_frame, "residuals": residuals, "label": f"frame {i}"}
+            encode(draw_overlay(image, motion, frame, camera, **more)[:height, :width])
             if progress:
                 progress(i + 1)
 
@@ -122,7 +122,7 @@ def draw_overlay(
 def write_montage(
     images: Mapping[str, NDArray[np.uint8]], path: str | PathLike[str], *, height: int = 960, gap: int = 8
 ) -> None:
-    """Write pictures {name: (H, W, 3) uint8 RGB} side by side as one PNG (or JPEG, by the suffix), all `height` px tall.
+    """Write pictures {name: (H, W, 3) uint8 RGB} side by side as one PNG (or .jpg), all `height` px tall.
 
     Raises
     ------
@@ -183,7 +183,8 @@ class _encoder:
         return self._encode
 
     def _encode(self, image: NDArray) -> None:
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)  # four times as fast as FFmpeg's
+        frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
         for packet in self.stream.encode(frame):
             _told_by_system(self.container.mux, packet)
 

@@ -1,7 +1,7 @@
 """Tables: a motion as CSV or Parquet files, one for each kind of result.
 
-    angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as way
-                [m] and rotation vector [deg] in the world, its deviations about the world's axes
+    angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as place [m]
+                and unit quaternion in the world, its deviations along [m] and about [deg] the world's axes
     joints      joint centres [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters._atomic import writing
-from kinefit.geometry import se3
+from kinefit.exporters._skeleton import continuous_quaternions
 from kinefit.motion import Motion, Residuals
 
 Table = dict[str, NDArray]  # column -> (rows,)
@@ -86,24 +86,14 @@ def tables(motion: Motion) -> dict[str, Table]:
 
 def _angles(motion: Motion) -> Table:
     body = motion.body
-    turn = _unwrapped(se3.log_so3(motion.Ts_world_root[:, :3, :3]))
-    values = np.concatenate([motion.Ts_world_root[:, :3, 3], turn, motion.angles], axis=1)
-    in_metres = np.concatenate([[True] * 3, [False] * 3, body.tree.prismatic])
-    units = ["m" if metres else "deg" for metres in in_metres]
-    values, stds = (np.where(in_metres, a, np.degrees(a)) for a in (values, motion.dof_std))
-    out = {f"{name} [{unit}]": values[:, d] for d, (name, unit) in enumerate(zip(body.dof_names, units))}
+    units = ["m"] * 3 + ["deg"] * 3 + ["m" if slides else "deg" for slides in body.tree.prismatic]
+    stds = motion.dof_std * [1.0 if unit == "m" else np.degrees(1.0) for unit in units]
+    angles = np.where(body.tree.prismatic, motion.angles, np.degrees(motion.angles))
+    quaternions = continuous_quaternions(motion.Ts_world_root[:, :3, :3])
+    out = {f"root_t{axis} [m]": motion.Ts_world_root[:, i, 3] for i, axis in enumerate("xyz")}
+    out |= {f"root_q{part}": quaternions[:, i] for i, part in enumerate("wxyz")}
+    out |= {f"{name} [{unit}]": angles[:, d] for d, (name, unit) in enumerate(zip(body.tree.coordinates, units[6:]))}
     return out | {f"{name} std [{unit}]": stds[:, d] for d, (name, unit) in enumerate(zip(body.dof_names, units))}
-
-
-def _unwrapped(vectors: NDArray) -> NDArray:
-    """Rotation vectors (F, 3) without jumps: the same rotations, by whole turns nearest to the one before."""
-    out = np.array(vectors)
-    for i in range(1, len(out)):
-        angle = float(np.linalg.norm(out[i]))
-        if angle > 1e-9:
-            axis = out[i] / angle
-            out[i] += 2 * np.pi * np.round((out[i - 1] @ axis - angle) / (2 * np.pi)) * axis
-    return out
 
 
 def _xyz(names: tuple[str, ...], positions: NDArray, suffix: str = "") -> Table:

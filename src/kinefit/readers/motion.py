@@ -55,7 +55,8 @@ def read_motion(path: str | PathLike[str]) -> Motion:
     file = Path(path)
     arrays = _load(file)
     if "format" not in arrays or str(arrays["format"]) != FORMAT:
-        raise FileError("this is no motion file of kinefit", file=file, remedy="Give a file that `kinefit track` wrote.")
+        remedy = "Give a file that `kinefit track` wrote."
+        raise FileError("this is no motion file of kinefit", file=file, remedy=remedy)
     try:
         if int(arrays["version"]) != VERSION:
             raise FileError(
@@ -69,7 +70,8 @@ def read_motion(path: str | PathLike[str]) -> Motion:
     except KeyError as error:
         raise FileError(f"motion file without the array {error}", file=file, remedy=_REMEDY) from error
     except (KinefitError, ValueError, TypeError, IndexError) as error:
-        raise FileError(f"motion file with contents that do not fit together ({error})", file=file, remedy=_REMEDY) from error
+        problem = f"motion file whose contents do not fit together ({error})"
+        raise FileError(problem, file=file, remedy=_REMEDY) from error
 
 
 def _load(file: Path) -> dict[str, NDArray]:

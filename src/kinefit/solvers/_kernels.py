@@ -355,3 +355,81 @@ def assemble(
     accumulate(data, segment, factor, count, centre[0], centre[1], centre[2], blocks)
     project(parents, dof_start, dof_parent, screws, blocks, H, g)
     return cost
+
+
+@jit
+def invert(H, dof_parent, out):
+    """Inverse of H (lower triangle, destroyed) into out; returns -1, or a degree of freedom without information of its own."""
+    n = H.shape[0]
+    own = np.empty(n)
+    for k in range(n):
+        own[k] = H[k, k]
+        if not own[k] > 0.0:
+            return k
+    if not factor_tree(H, dof_parent):
+        return 0
+    for k in range(n):
+        if 1.0 / (H[k, k] * H[k, k]) < 1e-10 * own[k]:
+            return k
+    for k in range(n):
+        for i in range(n):
+            out[k, i] = 0.0
+        out[k, k] = 1.0
+        solve_tree(H, dof_parent, out[k])
+    return -1
+
+
+@jit
+def joint_moves(frames, screws, rest, root, dof_parent, last_dof, moves):
+    """moves (S, 3, n): derivative of every joint centre by every degree of freedom."""
+    moves[:] = 0.0
+    for s in range(rest.shape[0]):
+        f = frames[s]
+        x = f[0] * rest[s, 0] + f[1] * rest[s, 1] + f[2] * rest[s, 2] + f[9] - root[0, 3]
+        y = f[3] * rest[s, 0] + f[4] * rest[s, 1] + f[5] * rest[s, 2] + f[10] - root[1, 3]
+        z = f[6] * rest[s, 0] + f[7] * rest[s, 1] + f[8] * rest[s, 2] + f[11] - root[2, 3]
+        m = moves[s]
+        m[0, 0] = m[1, 1] = m[2, 2] = 1.0
+        m[0, 4], m[0, 5], m[1, 5] = z, -y, x
+        m[1, 3], m[2, 3], m[2, 4] = -z, y, -x
+        d = last_dof[s]
+        while d >= 6:
+            t = screws[d - 6]
+            m[0, d] = t[0] + t[4] * z - t[5] * y
+            m[1, d] = t[1] + t[5] * x - t[3] * z
+            m[2, d] = t[2] + t[3] * y - t[4] * x
+            d = dof_parent[d]
+
+
+@jit
+def eliminate(H, g, n, damping, dof_parent, S, b, both):
+    """Take n poses out of a joint system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
+
+    Leaves both (p + 1, n) = A⁻¹ [B, g] for the way back. A is damped by its own diagonal. False if not positive.
+    """
+    p = H.shape[0] - n
+    A = np.empty((n, n))
+    mean = 0.0
+    for i in range(n):
+        mean += H[i, i] / n
+    for i in range(n):
+        for j in range(i + 1):
+            A[i, j] = H[i, j]
+        A[i, i] += damping * (H[i, i] + 1e-6 * mean)
+    if not factor_tree(A, dof_parent):
+        return False
+    for q in range(p + 1):
+        for i in range(n):
+            both[q, i] = H[n + q, i] if q < p else g[i]
+        solve_tree(A, dof_parent, both[q])
+    for q in range(p):
+        for r in range(q + 1):
+            v = 0.0
+            for i in range(n):
+                v += H[n + q, i] * both[r, i]
+            S[q, r] -= v
+        v = 0.0
+        for i in range(n):
+            v += H[n + q, i] * both[p, i]
+        b[q] -= v
+    return True

@@ -70,39 +70,43 @@ def normal_equations(
     return Equations(body, state, rows, factor, H, g, float(cost), pattern)
 
 
-def covariance(H: NDArray, *, tolerance: float = 1e-10) -> NDArray:
-    """(n, n) inverse of an undamped normal matrix; what nothing observes has infinite variance (and no covariance).
+def covariance(equations: Equations) -> NDArray:
+    """(n, n) inverse of the undamped normal matrix; what nothing observes has infinite variance and no covariance.
 
-    A degree of freedom counts as unobserved when it takes part in a direction whose information is below `tolerance` of
-    the largest, each degree of freedom measured in units of its own information.
+    A degree of freedom counts as unobserved where its information, given all others, is below 1e-10 of its own.
     """
+    H, pattern = np.array(equations.lower), equations.pattern
     n = len(H)
-    diagonal = np.diag(H).copy()
-    seen = diagonal > tolerance * max(float(diagonal.max(initial=0.0)), 1e-300)
-    scale = np.where(seen, 1.0 / np.sqrt(np.where(seen, diagonal, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh(H * scale[:, None] * scale[None, :])
-    strong = values > tolerance * max(float(values[-1]), 1e-300)
-    inverse = (vectors[:, strong] / values[strong]) @ vectors[:, strong].T
-    out = inverse * scale[:, None] * scale[None, :]
-    lost = ~seen | (np.sum(vectors[:, ~strong] ** 2, axis=1) > 1e-6)
+    out = np.empty((n, n))
+    lost = np.zeros(n, bool)
+    while True:  # a free direction is found at one of its degrees of freedom, which is then taken out
+        found = _kernels.invert(np.where(lost[:, None] | lost[None, :], np.eye(n), H), pattern, out)
+        if found < 0:
+            break
+        lost |= _free_direction(equations.matrix, lost, found)
     out[lost, :] = out[:, lost] = 0.0
-    out[np.arange(n)[lost], np.arange(n)[lost]] = np.inf
+    out[lost, lost] = np.inf
     return out
 
 
-def joint_covariance(body: Body, state: BodyState, cov: NDArray) -> NDArray:
-    """(S, 3, 3) [m²] covariance of every joint centre in the world; infinite where a needed angle is unobserved."""
+def _free_direction(H: NDArray, lost: NDArray, found: int) -> NDArray:
+    """(n,) degrees of freedom that take part in directions without information, by eigenvalues of the scaled H."""
+    scale = 1.0 / np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
+    kept = np.where(lost[:, None] | lost[None, :], np.eye(len(H)), H * scale[:, None] * scale[None, :])
+    values, vectors = np.linalg.eigh(kept)
+    weak = values < 1e-10
+    out = np.sum(np.square(vectors[:, weak]), axis=1) > 1e-8
+    out[found] = True
+    return out
+
+
+def joint_std(body: Body, state: BodyState, cov: NDArray) -> NDArray:
+    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where it depends on the unobserved."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
-    rotations = frames[:, :9].reshape(-1, 3, 3)
-    x = (rotations @ tree.rest[:, :, None])[..., 0] + frames[:, 9:] - state.T_world_root[:3, 3]
     lost = ~np.isfinite(np.diag(cov))
-    finite = np.where(np.isfinite(cov), cov, 0.0)
-    out = np.empty((len(x), 3, 3))
-    for s in range(len(x)):
-        J = tree.segment_jacobian(screws, s)
-        moves = J[:3] + np.cross(J[3:].T, x[s]).T
-        out[s] = moves @ finite @ moves.T
-        blind = np.abs(moves[:, lost]).max(axis=1, initial=0.0) > 1e-9
-        out[s][blind, blind] = np.inf
-    return out
+    moves = np.empty((len(tree.segments), 3, tree.n_dofs))
+    _kernels.joint_moves(frames, screws, tree.rest, state.T_world_root, tree.dof_parent, tree.last_dof, moves)
+    variance = np.einsum("sin,sin->si", moves @ np.where(np.isfinite(cov), cov, 0.0), moves)
+    blind = np.abs(moves[:, :, lost]).max(axis=2, initial=0.0) > 1e-9
+    return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))

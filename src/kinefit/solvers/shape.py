@@ -10,12 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.solvers import _kernels, _kernels_shape
 from kinefit.solvers.losses import Loss, geman_mcclure
+
+
+_MIDDLE = 0.002  # [m] spread of a point in the middle to either side
+_POSTURE = 0.01  # share of the posture prior: here lengths matter, and it would bend them
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,38 @@ def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, N
     return lead, sign
 
 
+@dataclass(frozen=True, eq=False)
+class _Parameters:
+    """What a shape consists of: scales (G,), then three shifts for each point that leads its mirror images."""
+
+    body: Body
+    points: PointSet
+    shift: NDArray  # (K,) first shift parameter of each point
+    mirror: NDArray  # (K,) ±1, sign of z
+    prior: NDArray  # (p,) 1/σ²
+    mean: NDArray  # (p,)
+
+    def geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
+        """The tree, the points (K, 3) in the root frame at rest, and their shifts (K, 3)."""
+        tree, groups = self.body.tree, len(self.body.scale_groups)
+        factor = theta[:groups][self.body.segment_scale]
+        scaled = tree.with_offsets(tree.offsets * factor[np.maximum(tree.parents, 0)][:, None])
+        shifts = theta[groups:][self.shift[:, None] + np.arange(3)]
+        shifts[:, 2] *= self.mirror
+        owner = self.points.segments
+        return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
+
+
+def _parameters(body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float) -> _Parameters:
+    lead, sign = mirror_points(points, body.tree.segments)
+    leaders = np.unique(lead)
+    shift = 3 * np.searchsorted(leaders, lead)
+    prior = np.concatenate([np.full(len(scales), scale_sigma**-2), np.full(3 * len(leaders), shift_sigma**-2)])
+    prior[len(scales) + shift[sign == 0.0] + 2] = _MIDDLE**-2
+    mean = np.concatenate([scales, np.zeros(3 * len(leaders))])
+    return _Parameters(body, points, shift, np.where(sign == 0.0, 1.0, sign), prior, mean)
+
+
 def fit_shape(
     body: Body,
     rig: Rig,
@@ -75,11 +110,10 @@ def fit_shape(
     scales: NDArray,
     *,
     scale_sigma: float = 0.1,
-    shift_sigma: float = 0.03,
-    posture_sigma: NDArray | None = None,
+    shift_sigma: float = 0.02,
     loss: Loss | None = None,
     max_iterations: int = 12,
-    tolerance: float = 1e-4,
+    tolerance: float = 1e-3,
 ) -> Shape:
     """Scales, point shifts and poses that explain the pixels of all frames best (P4-7, P4-8's alternation made joint).
 
@@ -91,105 +125,80 @@ def fit_shape(
     scale_sigma : float
         Spread of each scale about its start, as a share.
     shift_sigma : float [m]
-        Spread of a detector's point about the anatomical one, along each axis.
-    posture_sigma : (D,) [rad]
-        Spread of the angles about zero; default: half of each range.
+        Spread of a detector's point about the anatomical one, along each axis. It also decides what the data cannot: a
+        point shifted along a joint's turn looks the same as the joint turned.
+    loss : Loss of a pixel; default Geman-McClure.
+    tolerance : float
+        Stop when an iteration lowers the cost by less than this share.
     """
     loss = loss or geman_mcclure()
-    tree, G, n = body.tree, len(body.scale_groups), body.tree.n_dofs
-    base = frames.points.points
-    lead, sign = mirror_points(frames.points, tree.segments)
-    owners = np.unique(lead)
-    first = {int(k): 3 * i for i, k in enumerate(owners)}
-    shift_index = np.array([first[int(k)] for k in lead])
-    z_sign = np.where(sign == 0.0, 1.0, sign)
-    p = G + 3 * len(owners)
-    prior = np.concatenate([np.full(G, scale_sigma**-2), np.full(p - G, shift_sigma**-2)])
-    for k in np.flatnonzero(sign == 0.0):
-        prior[G + shift_index[k] + 2] = 0.002**-2  # a point in the middle stays there
-    mean = np.concatenate([scales, np.zeros(p - G)])
-    posture = posture_weights(body) if posture_sigma is None else np.asarray(posture_sigma, float) ** -2.0
-    theta, states = mean.copy(), list(states)
+    tree, n = body.tree, body.tree.n_dofs
+    model = _parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma)
+    posture = _POSTURE * posture_weights(body)
+    p, groups = len(model.mean), len(body.scale_groups)
+    owner, cameras = frames.points.segments, rig.packed
 
-    def rest_points(theta: NDArray) -> tuple[NDArray, NDArray]:
-        factor = theta[:G][body.segment_scale]
-        offsets = tree.offsets * factor[np.maximum(tree.parents, 0)][:, None]
-        rest = tree.with_offsets(offsets)
-        shifts = theta[G:][shift_index[:, None] + np.arange(3)] * np.stack([np.ones_like(z_sign)] * 2 + [z_sign], 1)
-        points = base * factor[frames.points.segments][:, None] + shifts
-        return rest, points + rest.rest[frames.points.segments]  # type: ignore[return-value]
-
-    def evaluate(theta: NDArray, states: list[BodyState]) -> float:
-        moved, rest = rest_points(theta)
-        total = float(prior @ (theta - mean) ** 2)
+    def cost_of(theta: NDArray, states: Sequence[BodyState]) -> float:
+        moved, rest, _ = model.geometry(theta)
+        total = float(model.prior @ np.square(theta - model.mean))
         for f, state in enumerate(states):
-            placed, _ = moved.forward(state.T_world_root, state.angles)  # type: ignore[attr-defined]
-            total += _kernels_shape.frame_cost(
-                frames.points.segments, rest, rig.packed, frames.camera, frames.column, frames.uv[f], frames.weight[f],
-                placed, loss.kind, loss.scale,
-            ) + float(posture @ state.angles**2)  # fmt: skip
+            placed, _ = moved.forward(state.T_world_root, state.angles)
+            total += float(posture @ np.square(state.angles)) + _kernels_shape.frame_cost(
+                owner, rest, cameras, frames.camera, frames.column, frames.uv[f], frames.weight[f], placed,
+                loss.kind, loss.scale,
+            )  # fmt: skip
         return total
 
-    cost, damping = evaluate(theta, states), 1e-3
-    for _ in range(max_iterations):
-        moved, rest = rest_points(theta)
-        S, b = np.diag(prior), prior * (mean - theta)
-        parts = []
-        for f, state in enumerate(states):
-            placed, screws = moved.forward(state.T_world_root, state.angles)  # type: ignore[attr-defined]
-            H, g = np.zeros((n + p, n + p)), np.zeros(n + p)
-            _kernels_shape.frame_system(
-                tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, G,
-                frames.points.segments, rest, base, shift_index, z_sign, rig.packed, frames.camera, frames.column,
-                frames.uv[f], frames.weight[f], placed, screws, np.ascontiguousarray(state.T_world_root[:3, 3]),
-                loss.kind, loss.scale, H, g,
-            )  # fmt: skip
-            H += np.tril(H, -1).T
-            H[range(6, n), range(6, n)] += posture
-            g[6:n] -= posture * state.angles
-            parts.append((H[:n, :n], H[:n, n:], g[:n]))
+    def system(theta: NDArray, state: BodyState, f: int) -> tuple[NDArray, NDArray]:
+        moved, rest, _ = geometry
+        placed, screws = moved.forward(state.T_world_root, state.angles)
+        H, g = np.zeros((n + p, n + p)), np.zeros(n + p)
+        _kernels_shape.frame_system(
+            tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, groups, owner, rest,
+            frames.points.points, model.shift, model.mirror, cameras, frames.camera, frames.column, frames.uv[f],
+            frames.weight[f], placed, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
+            H, g,
+        )  # fmt: skip
+        H[range(6, n), range(6, n)] += posture
+        g[6:n] -= posture * state.angles
+        return H, g
+
+    def step(theta: NDArray, states: Sequence[BodyState], damping: float) -> tuple[NDArray, list[BodyState]]:
+        S, b = np.diag(model.prior), model.prior * (model.mean - theta)
+        kept = np.empty((len(states), p + 1, n))
+        for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-        while True:
-            reduced, right, kept = S + damping * np.diag(np.diag(S)), b.copy(), []
-            for A, B, g in parts:
-                factor = cho_factor(A + damping * np.diag(np.diag(A) + 1e-6 * np.trace(A) / n), check_finite=False)
-                both = cho_solve(factor, np.concatenate([B, g[:, None]], axis=1), check_finite=False)
-                reduced -= B.T @ both[:, :-1]
-                right -= B.T @ both[:, -1]
-                kept.append(both)
-            delta = np.linalg.solve(reduced, right)
-            new_theta = theta + delta
-            new_theta[:G] = np.clip(new_theta[:G], 0.3, 3.0)
-            new_states = [
-                _within(body, s.retract(both[:, -1] - both[:, :-1] @ delta)) for s, both in zip(states, kept, strict=True)
-            ]
-            new_cost = evaluate(new_theta, new_states)
-            if new_cost < cost or damping > 1e6:
-                break
+            if not _kernels.eliminate(H, g, n, damping, tree.dof_parent, S, b, kept[f]):
+                kept[f] = 0.0
+        S += np.tril(S, -1).T - np.triu(S, 1) + damping * np.diag(np.diag(S))
+        delta = np.linalg.solve(S, b)
+        moves = kept[:, p] - delta @ kept[:, :p]
+        new = theta + delta
+        new[:groups] = np.clip(new[:groups], 0.2, 5.0)
+        return new, [_within(body, s.retract(m)) for s, m in zip(states, moves, strict=True)]
+
+    theta, states = model.mean.copy(), list(states)
+    cost, damping = cost_of(theta, states), 1e-3
+    for _ in range(max_iterations):
+        geometry = model.geometry(theta)
+        systems = [system(theta, state, f) for f, state in enumerate(states)]
+        new, moved = step(theta, states, damping)
+        while not (new_cost := cost_of(new, moved)) < cost and damping < 1e4:
             damping *= 10.0
-        if new_cost >= cost:
+            new, moved = step(theta, states, damping)
+        if not new_cost < cost:
             break
-        gain, theta, states, cost = cost - new_cost, new_theta, new_states, new_cost
-        damping = max(damping * 0.2, 1e-9)
-        if gain < tolerance * cost:
+        fall, theta, states, cost = cost - new_cost, new, moved, new_cost
+        damping = max(damping * 0.1, 1e-9)
+        if fall < tolerance * cost:
             break
-    _, rest = rest_points(theta)
-    factor = theta[:G][body.segment_scale]
-    shifts = rest - moved_rest(body, theta[:G])[frames.points.segments] - base * factor[frames.points.segments][:, None]
-    return Shape(theta[:G].copy(), shifts, tuple(states), cost)
+    return Shape(theta[:groups].copy(), model.geometry(theta)[2], tuple(states), cost)
 
 
 def posture_weights(body: Body) -> NDArray:
-    """(D,) [1/rad²] weak prior towards zero: half of each coordinate's range is one standard deviation."""
-    half = 0.5 * (body.tree.upper - body.tree.lower)
-    return np.where(np.isfinite(half), 1.0 / np.square(np.where(np.isfinite(half), np.maximum(half, 0.05), 1.0)), 0.0)
-
-
-def moved_rest(body: Body, scales: NDArray) -> NDArray:
-    """(S, 3) [m] joint centres at rest of a body with other scales."""
-    factor = np.asarray(scales)[body.segment_scale]
-    return body.tree.with_offsets(body.tree.offsets * factor[np.maximum(body.tree.parents, 0)][:, None]).rest
+    """(D,) [1/rad²] weight of the prior towards zero, from each coordinate's usual spread."""
+    return np.square(1.0 / body.tree.spread)
 
 
 def _within(body: Body, state: BodyState) -> BodyState:

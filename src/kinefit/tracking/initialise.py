@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,38 +17,48 @@ from kinefit.tracking.channels import Channels, exchange
 
 
 def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float = 30.0) -> NDArray:
-    """(F, K, 3) [m] points of some frames on which two or more cameras agree, NaN elsewhere.
+    """(F, K, 3) [m] points of some frames on which two or more cameras agree, NaN elsewhere; see `triangulated_frame`."""
+    return np.stack(
+        [
+            triangulated_frame(channels, channels.uv[f], channels.confidence[f], max_residual_px=max_residual_px)[0]
+            for f in frames
+        ]
+    )
 
-    Frames in which exchanging left and right in some sources makes more of them agree are put right.
+
+def triangulated_frame(
+    channels: Channels, uv: NDArray, confidence: NDArray, *, max_residual_px: float = 30.0
+) -> tuple[NDArray, NDArray]:
+    """Points (K, 3) [m] of one frame on which two or more cameras agree, NaN elsewhere; and which sources were exchanged.
+
+    Where exchanging left and right in some sources makes more of them agree, it is done: one source after the other,
+    the best first. (Q,) bool tells which.
     """
-    out = np.full((len(frames), len(channels.points), 3), np.nan)
-    for i, f in enumerate(frames):
-        best = -1.0
-        for swapped in _swap_patterns(len(channels.sources)):
-            x, support = _agreed(channels, int(f), swapped, max_residual_px)
-            support -= 0.02 * swapped.sum() * len(channels.points)  # for nothing, believe the detector
-            if support > best:
-                best, out[i] = support, x
-    return out
+    swapped = np.zeros(len(channels.sources), bool)
+    best, support = _agreed(channels, uv, confidence, swapped, max_residual_px)
+    while swapped.sum() < (len(swapped) - 1) // 2:
+        trials = []
+        for q in np.flatnonzero(~swapped):
+            trial = swapped.copy()
+            trial[q] = True
+            trials.append((*_agreed(channels, uv, confidence, trial, max_residual_px), trial))
+        x, more, trial = max(trials, key=lambda t: t[1])
+        if more < support + 0.02 * len(channels.points):  # for nothing, believe the detector
+            break
+        best, support, swapped = x, more, trial
+    return best, swapped
 
 
-def _swap_patterns(sources: int) -> list[NDArray]:
-    """No source, then each one alone: more at once are found when the track runs."""
-    return [np.zeros(sources, bool), *(np.eye(sources, dtype=bool) if sources > 2 else [])]
-
-
-def _agreed(channels: Channels, frame: int, swapped: NDArray, limit: float) -> tuple[NDArray, float]:
-    uv, weight = exchange(channels, channels.uv[frame], swapped), exchange(channels, channels.confidence[frame], swapped)
-    Q, K = len(channels.sources), len(channels.points)
-    grid, sure = np.full((K, Q, 2), np.nan), np.zeros((K, Q))
-    grid[channels.column, channels.source], sure[channels.column, channels.source] = uv, weight
-    cameras = [int(channels.camera[channels.source == q][0]) for q in range(Q)]
-    # one column per camera: of several detectors in one camera each has its own points, so columns never clash
-    view = np.full((K, len(channels.rig), 2), np.nan)
-    trust = np.zeros((K, len(channels.rig)))
-    for q, c in enumerate(cameras):
-        here = np.isfinite(grid[:, q]).all(-1) & (sure[:, q] > 0.1)
-        view[here, c], trust[here, c] = grid[here, q], sure[here, q]
+def _agreed(
+    channels: Channels, uv: NDArray, confidence: NDArray, swapped: NDArray, limit: float
+) -> tuple[NDArray, float]:
+    """Triangulated points of one frame, and the summed confidence of the views that agree."""
+    uv, confidence = exchange(channels, uv, swapped), exchange(channels, confidence, swapped)
+    view = np.full((len(channels.points), len(channels.rig), 2), np.nan)
+    trust = np.zeros(view.shape[:2])
+    use = np.isfinite(uv).all(axis=1) & (confidence > 0.1)
+    view[channels.column[use], channels.camera[use]] = uv[use]
+    trust[channels.column[use], channels.camera[use]] = confidence[use]
     x, inliers, _ = triangulate_robust(channels.rig, view, trust, max_residual_px=limit)
     return x, float(np.sum(np.where(inliers.sum(1) >= 2, (inliers * trust).sum(1), 0.0)))
 
@@ -158,8 +166,3 @@ def pose_from_points(body: Body, points: PointSet, x_world: NDArray, *, sigma: f
 def _turn(angle: float) -> NDArray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
-
-
-def scaled_channels(body: Body, channels: Channels) -> Channels:
-    """Channels whose points are those of a fitted body."""
-    return replace(channels.with_points(body))

@@ -1,0 +1,5 @@
+"""A result against the truth, as numbers."""
+
+from kinefit.evaluation.accuracy import Coverage, angle_errors, coverage, joint_errors, orientation_errors
+
+__all__ = ["Coverage", "angle_errors", "coverage", "joint_errors", "orientation_errors"]

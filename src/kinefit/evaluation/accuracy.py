@@ -1,0 +1,90 @@
+"""How far a result is from the truth: joint centres, angles, turns of the segments, error bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.motion import Motion
+
+
+def joint_errors(truth: Motion, result: Motion) -> NDArray:
+    """Distances (F, S) [m] between the joint centres of two motions; their bodies may have different lengths.
+
+    Raises
+    ------
+    ObservationError
+        The motions differ in frames or in their bodies' segments; so also the other functions here.
+    """
+    result = _comparable(truth, result)
+    return np.linalg.norm(result.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3], axis=-1)
+
+
+def angle_errors(truth: Motion, result: Motion) -> NDArray:
+    """Differences (F, D) [deg] of all angles, result minus truth, between -180 and 180; of prismatic joints [m].
+
+    Where a ball joint is near the pose in which two of its axes fall together, large errors of both angles may mean the
+    same turn: see `orientation_errors`.
+    """
+    result = _comparable(truth, result)
+    turns = np.degrees(np.angle(np.exp(1j * (result.angles - truth.angles))))
+    return np.where(truth.body.tree.prismatic, result.angles - truth.angles, turns)
+
+
+def orientation_errors(truth: Motion, result: Motion, *, relative: bool = False) -> NDArray:
+    """Angles (F, S) [deg] between the orientations of every segment: in the world, or relative to its parent."""
+    result = _comparable(truth, result)
+    a, b = (m.segment_poses()[..., :3, :3] for m in (truth, result))
+    if relative:
+        parents, child = truth.body.tree.parents, truth.body.tree.parents >= 0
+        for R in (a, b):
+            R[:, child] = R[:, parents[child]].swapaxes(-1, -2) @ R[:, child]
+    # |A - B| (Frobenius) = 2 √2 sin(θ/2), exact for small angles too
+    return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=(-2, -1)) / np.sqrt(8.0), 0.0, 1.0)))
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of the truth within the error bars, 0..1; NaN where no finite error bar is given.
+
+    Parameters
+    ----------
+    joints : of the coordinates of all joint centres.
+    angles : of all angles.
+    """
+
+    joints: float
+    angles: float
+
+
+def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> Coverage:
+    """Share of joint centres and angles whose truth lies within so many standard deviations; 0.954 is right for two."""
+    turned = _comparable(truth, result)
+    shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
+    angles = angle_errors(truth, result)
+    angles = np.abs(np.where(truth.body.tree.prismatic, angles, np.radians(angles)))
+    return Coverage(_share(shift, sigmas * turned.joint_std), _share(angles, sigmas * turned.dof_std[:, 6:]))
+
+
+def _share(errors: NDArray, bars: NDArray) -> float:
+    known = np.isfinite(bars)
+    return float(np.mean(errors[known] <= bars[known])) if known.any() else float("nan")
+
+
+def _comparable(truth: Motion, result: Motion) -> Motion:
+    """The result in the truth's world."""
+    a, b = truth.body.tree, result.body.tree
+    if a.segments != b.segments or a.coordinates != b.coordinates:
+        raise ObservationError(
+            f"the bodies '{truth.body.name}' and '{result.body.name}' have different segments",
+            remedy="Compare motions of one kind of body.",
+        )
+    if len(truth) != len(result) or not np.isclose(truth.rate, result.rate):
+        raise ObservationError(
+            f"{len(truth)} frames at {truth.rate:g} Hz against {len(result)} at {result.rate:g} Hz",
+            remedy="Cut and resample one of them (kinefit.simulation).",
+        )
+    return result if result.up == truth.up else result.turned(truth.up)

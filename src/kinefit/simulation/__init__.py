@@ -1,0 +1,1 @@
+"""A known motion, and what sensors would have seen of it."""

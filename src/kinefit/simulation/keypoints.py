@@ -1,0 +1,213 @@
+"""What 2D keypoint detectors would have seen of a known motion, with their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import Motion, rotation_between_up
+from kinefit.observations import Keypoints
+from kinefit.readers.keypoints import keypoint_names
+
+_MARGIN = 0.04  # of the image, that stays free around the person
+_BURST = 8  # frames that a confusion of left and right lasts, on average
+_VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m] where nothing else is asked for, y up
+
+
+def studio_rig(
+    motion: Motion | None = None,
+    *,
+    cameras: int = 4,
+    up: str | None = None,
+    size: tuple[int, int] = (1088, 1920),
+    focal: float | None = None,
+) -> Rig:
+    """Cameras around a motion, as near as they can stand and have all of it in view.
+
+    Parameters
+    ----------
+    motion : Motion, optional
+        Default: a volume of 1.6 x 1.6 m and 2 m height at the origin.
+    cameras : int
+        One or more; at the heights of tripods, around the motion but no two opposite each other.
+    up : str, optional
+        Vertical axis of the world; default: the motion's, or "y".
+    size : (width, height) [px]
+    focal : float [px], optional
+        Default: 1675 px for images 1920 px high, and in proportion.
+
+    Returns
+    -------
+    Rig
+        Cameras cam01, cam02, ... with a mild lens distortion.
+    """
+    if cameras < 1:
+        raise ObservationError(f"a rig of {cameras} cameras", remedy="Give one or more.")
+    up = up or (motion.up if motion is not None else "y")
+    R_world = rotation_between_up("y", up)  # built y up, then turned
+    if motion is None:
+        corners = np.array(np.meshgrid(*_VOLUME.T)).reshape(3, -1).T
+    else:
+        corners = motion.positions().reshape(-1, 3) @ rotation_between_up(motion.up, "y").T
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    centre = np.array([0.5 * (low + high)[0], min(low[1] + 0.9, 0.5 * (low + high)[1]), 0.5 * (low + high)[2]])
+    focal = focal or 1675.0 * size[1] / 1920.0
+    placed = []
+    for k in range(cameras):
+        azimuth = 2 * np.pi * (k + 0.5) / cameras + (0.22 if k % 2 else -0.12)
+        height = low[1] + (1.3, 1.9, 1.5, 2.2)[k % 4]
+        for distance in np.arange(2.5, 60.0, 0.1):
+            place = centre + distance * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
+            place[1] = height
+            camera = _camera(f"cam{k + 1:02d}", size, focal, place, centre)
+            if _sees(camera, corners):
+                break
+        placed.append(camera.with_pose(camera.T_camera_world @ _turn(R_world.T)))
+    return Rig(tuple(placed))
+
+
+def _turn(R: NDArray) -> NDArray:
+    T = np.eye(4)
+    T[:3, :3] = R
+    return T
+
+
+def _camera(name: str, size: tuple[int, int], focal: float, place: NDArray, aim: NDArray) -> Camera:
+    """A camera at a place that looks at another; y up."""
+    z = (aim - place) / np.linalg.norm(aim - place)
+    x = np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    T = _turn(R)
+    T[:3, 3] = -R @ place
+    matrix = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1]])
+    return Camera(name, size, matrix, np.array([-0.06, 0.03, 0.0004, -0.0003]), "radtan", T)
+
+
+def _sees(camera: Camera, x_world: NDArray) -> bool:
+    uv = camera.project(x_world) / camera.size
+    return bool(np.all((uv > _MARGIN) & (uv < 1 - _MARGIN)))  # NaN is not seen
+
+
+def simulate_keypoints(
+    motion: Motion,
+    rig: Rig,
+    keypoint_set: str = "BODY_25B",
+    *,
+    noise_px: float = 3.0,
+    outliers: float = 0.1,
+    missing: float = 0.1,
+    swaps: float = 0.0,
+    bystander: Motion | None = None,
+    seed: int = 0,
+) -> list[Keypoints]:
+    """Keypoints of a motion in every camera of a rig, as a detector would give them.
+
+    Parameters
+    ----------
+    motion : Motion
+        In the rig's world.
+    keypoint_set : str
+        Points that the body lacks are never seen.
+    noise_px : float [px]
+        Standard deviation of a point along u and v.
+    outliers : share of the points seen
+        One half lies anywhere in the person's box, the other 20 to 200 px away from where it should.
+    missing : share of the points
+        NaN with confidence 0, as are points outside the image.
+    swaps : share of each camera's frames
+        In bursts of about eight frames, left is taken for right in the whole person.
+    bystander : Motion, optional
+        A second person, seen in as many frames as it has, with the same errors.
+    seed : int
+        The same seed gives the same keypoints.
+
+    Returns
+    -------
+    list of Keypoints, one for each camera
+        Confidences of outliers are lower on average, but not always.
+
+    Raises
+    ------
+    ObservationError
+        Shares that are not in 0..1, an unknown keypoint set.
+    """
+    for name, share in (("outliers", outliers), ("missing", missing), ("swaps", swaps)):
+        if not 0.0 <= share <= 1.0:
+            raise ObservationError(f"{name} is {share}", remedy="Give a share between 0 and 1.")
+    if not 0.0 <= noise_px < np.inf:
+        raise ObservationError(f"noise_px is {noise_px}", remedy="Give a standard deviation in pixels.")
+    names = keypoint_names(keypoint_set)
+    random = np.random.default_rng(seed)
+    people = [motion] if bystander is None else [motion, bystander]
+    seen = []
+    for camera in rig:
+        points = np.full((len(motion), len(people), len(names), 2), np.nan)
+        confidence = np.zeros(points.shape[:3])
+        for p, person in enumerate(people):
+            frames = min(len(motion), len(person))
+            uv = _project(person, camera, keypoint_set, names)[:frames]
+            points[:frames, p], confidence[:frames, p] = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
+        if len(people) > 1:  # the order of people means nothing
+            order = random.permuted(np.tile(np.arange(len(people)), (len(motion), 1)), axis=1)
+            points = np.take_along_axis(points, order[:, :, None, None], axis=1)
+            confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
+        seen.append(Keypoints(camera.name, keypoint_set, names, motion.rate, points, confidence, source="simulation"))
+    return seen
+
+
+def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str, ...]) -> NDArray:
+    """(F, K, 2) [px], NaN for points that the body lacks and outside the image."""
+    points = motion.body.keypoints(keypoint_set)
+    columns = [names.index(name) for name in points.names]
+    uv = np.full((len(motion), len(names), 2), np.nan)
+    uv[:, columns] = camera.project(motion.positions(points))
+    inside = np.all((uv >= -0.5) & (uv < np.array(camera.size) - 0.5), axis=-1)
+    uv[~inside] = np.nan
+    return uv
+
+
+def _detect(
+    uv: NDArray, camera: Camera, names: tuple[str, ...], random: np.random.Generator,
+    noise_px: float, outliers: float, missing: float, swaps: float,
+) -> tuple[NDArray, NDArray]:
+    """Points (F, K, 2) with the errors of a detector, and its confidence (F, K)."""
+    frames, count = uv.shape[:2]
+    found = uv + noise_px * random.standard_normal(uv.shape)
+    wrong = random.random((frames, count)) < outliers
+    box = np.ma.masked_invalid(uv)
+    low, high = box.min(axis=1, keepdims=True).filled(0.0), box.max(axis=1, keepdims=True).filled(0.0)
+    anywhere = low + random.random(uv.shape) * (high - low)
+    angle, reach = random.uniform(0, 2 * np.pi, (frames, count)), random.uniform(20.0, 200.0, (frames, count))
+    jump = uv + reach[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    stray = np.where(random.random((frames, count, 1)) < 0.5, anywhere, jump)
+    found = np.where(wrong[..., None], np.clip(stray, 0.0, np.array(camera.size) - 1.0), found)
+    confidence = np.where(wrong, random.beta(4, 3, (frames, count)), random.beta(8, 2, (frames, count)))
+    lost = (random.random((frames, count)) < missing) | np.isnan(uv).any(axis=-1)
+    found[lost], confidence[lost] = np.nan, 0.0
+    swapped = _bursts(frames, swaps, random)
+    mirror = [names.index(_mirrored(name, names)) for name in names]
+    found[swapped], confidence[swapped] = found[swapped][:, mirror], confidence[swapped][:, mirror]
+    return found, confidence
+
+
+def _bursts(frames: int, share: float, random: np.random.Generator) -> NDArray:
+    """(F,) bool, true in bursts that make up about a share of all frames."""
+    out = np.zeros(frames, bool)
+    while out.sum() < round(share * frames):
+        start, length = random.integers(frames), 1 + random.poisson(_BURST - 1)
+        out[start : min(start + length, start + round(share * frames) - int(out.sum()))] = True
+    return out
+
+
+def _mirrored(name: str, names: tuple[str, ...]) -> str:
+    """Name of the same point on the other side; its own for a point in the middle."""
+    for a, b in (("left", "right"), ("Left", "Right"), ("L", "R")):
+        for old, new in ((a, b), (b, a)):
+            other = name.replace(old, new, 1) if len(a) > 1 else new + name[1:] if name.startswith(old) else name
+            if other != name and other in names:
+                return other
+    return name
+

@@ -1,0 +1,224 @@
+"""The loop over frames: predict, put left and right right, fit, judge, recover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences import _kernels
+from kinefit.errors import TrackingError
+from kinefit.rows import ParameterRows, Rows
+from kinefit.solvers.equations import covariance, joint_std, normal_equations
+from kinefit.solvers.least_squares import Fit, levenberg_marquardt
+from kinefit.solvers.losses import Loss, geman_mcclure
+from kinefit.solvers.shape import posture_weights
+from kinefit.tracking.channels import Channels
+from kinefit.tracking.initialise import pose_from_points, triangulated_frame
+from kinefit.tracking.swaps import find_swaps, limb_groups
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a track runs.
+
+    Parameters
+    ----------
+    loss : Loss of a keypoint, in its standard deviations.
+    angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
+        How abruptly a person moves: one standard deviation; times dt² it is that of the predicted pose.
+    poor : float in 0..1
+        Quality below which a frame is started anew from its own keypoints.
+    """
+
+    loss: Loss = geman_mcclure()
+    angle_acceleration: float = 200.0
+    root_acceleration: float = 60.0
+    poor: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """One tracked frame.
+
+    Parameters
+    ----------
+    state : BodyState
+    dof_std : (6 + D,) [m, rad]
+    joint_std : (S, 3) [m]
+    factor : (N,) robust factor of every channel, 0 where unseen.
+    uv, fitted : (N, 2) [px] measurements as used, and where the body is seen.
+    swapped : (N,) bool, channels exchanged with their partner.
+    quality : float, and segment_quality (S,), in 0..1.
+    """
+
+    state: BodyState
+    dof_std: NDArray
+    joint_std: NDArray
+    factor: NDArray
+    uv: NDArray
+    fitted: NDArray
+    swapped: NDArray
+    quality: float
+    segment_quality: NDArray
+
+
+class Tracker:
+    """Follows one body from frame to frame.
+
+    Parameters
+    ----------
+    body : Body, fitted to the person.
+    channels : Channels
+        Layout of the measurements (`uv` and `confidence` of it are not used).
+    rate : float [Hz]
+    """
+
+    def __init__(self, body: Body, channels: Channels, rate: float, settings: Settings | None = None) -> None:
+        self.body, self.channels, self.dt = body, channels, 1.0 / rate
+        self.settings = settings or Settings()
+        self._rest = body.points_rest(channels.points)[channels.column]
+        self._owner = channels.points.segments[channels.column]
+        self._posture = posture_weights(body)
+        self._groups = limb_groups(body, channels)
+        self._informs = informing(body, channels)
+        n = 2 * len(self._owner)
+        self._buffers = np.empty((8, n)), np.empty(n, np.int64), np.empty(n, np.int64)
+        self._state: BodyState | None = None
+        self._velocity = np.zeros(body.tree.n_dofs)
+
+    @cached_property
+    def _spread(self) -> NDArray:
+        s = np.full(self.body.tree.n_dofs, self.settings.angle_acceleration * self.dt**2)
+        s[:3] = self.settings.root_acceleration * self.dt**2
+        return np.square(s)
+
+    def forget(self) -> None:
+        """Start anew with the next frame."""
+        self._state, self._velocity = None, np.zeros_like(self._velocity)
+
+    def start_at(self, state: BodyState) -> None:
+        """Take a state as that of the last frame."""
+        self._state, self._velocity = state, np.zeros_like(self._velocity)
+
+    def update(self, uv: NDArray, confidence: NDArray) -> FrameResult | None:
+        """Track one frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None while there is nothing to start from."""
+        seen = np.isfinite(uv).all(axis=1)
+        weight = np.where(seen, np.square(confidence / self.channels.sigma), 0.0)
+        uv = np.where(seen[:, None], uv, np.nan)
+        result = None
+        if self._state is not None:
+            predicted = self._state.retract(self._velocity)
+            result = self._fit(predicted, predicted, uv, weight)
+        if result is None or result.quality < self.settings.poor:
+            again = self._start(uv, weight, confidence)
+            if again is not None and (result is None or again.quality > result.quality + 0.1):
+                result = again
+                self._state = None
+        if result is None:
+            return None
+        if self._state is not None:
+            moved = self._state.difference(result.state)
+            keep = 0.5 if result.quality > self.settings.poor else 0.0
+            self._velocity = keep * self._velocity + 0.5 * moved if keep else 0.5 * self._velocity
+        else:
+            self._velocity = np.zeros_like(self._velocity)
+        self._state = result.state
+        return result
+
+    def _start(self, uv: NDArray, weight: NDArray, confidence: NDArray) -> FrameResult | None:
+        x, exchanged = triangulated_frame(self.channels, uv, confidence)
+        try:
+            state, _ = pose_from_points(self.body, self.channels.points, x)
+        except TrackingError:
+            return None
+        return self._fit(state, None, uv, weight)
+
+    def _fit(self, start: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> FrameResult:
+        swapped = find_swaps(self.channels, self._groups, uv, weight, self.fitted(start))
+        partner = np.arange(len(swapped))
+        for _ in range(3):
+            order = np.where(swapped, self.channels.partner, partner)
+            used, used_weight = np.ascontiguousarray(uv[order]), np.ascontiguousarray(weight[order])
+            fit = levenberg_marquardt(
+                self.body, start, lambda s: self._rows(s, predicted, used, used_weight),  # noqa: B023
+                loss=self.settings.loss, max_iterations=40, tolerance=1e-5,
+            )  # fmt: skip
+            fitted = self.fitted(fit.state)
+            again = find_swaps(self.channels, self._groups, uv, weight, fitted)
+            if np.array_equal(again, swapped):
+                break
+            swapped, start = again, fit.state
+        return self._judge(fit, used, used_weight, fitted, swapped)
+
+    def _rows(self, state: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> list:
+        frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
+        data, segment, group = self._buffers[0].copy(), self._buffers[1].copy(), self._buffers[2].copy()
+        end = _kernels.pixel_rows(
+            frames, self._owner, self._rest, self.channels.rig.packed, self.channels.camera, uv, weight,
+            data, segment, group, 0,
+        )  # fmt: skip
+        rows = Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
+        parts: list = [rows, self._posture_rows(state)]
+        if predicted is not None:
+            every = np.arange(self.body.tree.n_dofs)
+            parts.append(ParameterRows(every, state.difference(predicted), 1.0 / self._spread))
+        return parts
+
+    def _posture_rows(self, state: BodyState) -> ParameterRows:
+        return ParameterRows(np.arange(6, self.body.tree.n_dofs), -state.angles, self._posture)
+
+    def fitted(self, state: BodyState) -> NDArray:
+        """(N, 2) [px] where every channel's point is seen."""
+        frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
+        f = frames[self._owner]
+        x = (f[:, :9].reshape(-1, 3, 3) @ self._rest[:, :, None])[..., 0] + f[:, 9:]
+        out = np.empty((len(x), 2))
+        for c, camera in enumerate(self.channels.rig):
+            mine = self.channels.camera == c
+            out[mine] = camera.project(x[mine])
+        return out
+
+    def _judge(self, fit: Fit, uv: NDArray, weight: NDArray, fitted: NDArray, swapped: NDArray) -> FrameResult:
+        factor = np.zeros(len(weight))
+        factor[fit.equations.rows.group] = fit.equations.factor
+        seen = weight > 0
+        support = self._informs @ factor
+        cameras = np.stack(
+            [self._informs[:, self.channels.camera == c] @ (factor > 0.3)[self.channels.camera == c] > 0
+             for c in range(len(self.channels.rig))]
+        ).sum(axis=0)  # fmt: skip
+        share = support / np.maximum(self._informs @ seen, 1.0)
+        quality = share * np.minimum(cameras, 2) / 2.0
+        own = normal_equations(
+            self.body, fit.state, [fit.equations.rows, self._posture_rows(fit.state)], loss=self.settings.loss
+        )
+        cov = covariance(own)
+        blind = 6 + np.flatnonzero(np.diag(cov)[6:] > 0.9 / self._posture)  # known from the prior alone
+        cov[blind, :] = cov[:, blind] = 0.0
+        cov[blind, blind] = np.inf
+        return FrameResult(
+            fit.state, np.sqrt(np.diag(cov)), joint_std(self.body, fit.state, cov), factor, uv, fitted, swapped,
+            float(np.mean(quality)), quality,
+        )  # fmt: skip
+
+
+def informing(body: Body, channels: Channels) -> NDArray:
+    """(S, N) 0 or 1: channels that tell where a segment is: those on it and those at its children's joints.
+
+    A segment without any is known through its children.
+    """
+    tree = body.tree
+    owner, place = channels.points.segments[channels.column], channels.points.points[channels.column]
+    near = np.linalg.norm(place, axis=1) < 0.05
+    out = np.zeros((len(tree.segments), len(owner)))
+    for s in range(len(tree.segments)):
+        out[s] = (owner == s) | (near & (tree.parents[owner] == s))
+    for s in range(len(tree.segments) - 1, 0, -1):
+        if not out[s].any():
+            children = [c for c in range(len(tree.segments)) if tree.parents[c] == s]
+            out[s] = np.max([out[c] for c in children], axis=0) if children else 0.0
+    return out

@@ -1,0 +1,185 @@
+"""From 2D keypoints of calibrated cameras to a motion: the main job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.errors import ObservationError, TrackingError
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion, Residuals
+from kinefit.observations import Keypoints
+from kinefit.solvers.shape import PixelFrames, fit_shape
+from kinefit.tracking.association import choose_people
+from kinefit.tracking.channels import Channels, make_channels
+from kinefit.tracking.initialise import first_scales, pose_from_points, triangulated
+from kinefit.tracking.tracker import FrameResult, Settings, Tracker
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A body fitted to a person: its lengths, and where on it the detectors' points sit."""
+
+    body: Body
+    scales: NDArray
+
+
+def track(
+    rig: Rig,
+    keypoints: Sequence[Keypoints],
+    body: Body,
+    *,
+    accuracy: float | Sequence[float] = 8.0,
+    subject: Subject | None = None,
+    settings: Settings | None = None,
+    shape_frames: int = 25,
+    up: str = "z",
+    name: str = "motion",
+    progress: Progress | None = None,
+) -> Motion:
+    """Motion of one person from keypoints of several calibrated cameras, with no pose given.
+
+    The person is chosen among all detected, bone lengths are found from frames spread over the take, then every frame is
+    fitted straight to the pixels, with outliers and exchanged sides set right and error bars from the normal matrix.
+
+    Parameters
+    ----------
+    rig : Rig
+    keypoints : records of the same number of frames and the same rate.
+    body : Body, generic.
+    accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
+    subject : Subject
+        Known already; default: fitted from this take.
+    shape_frames : int, how many frames bone lengths are found from.
+    progress : called with (what, done, total).
+
+    Raises
+    ------
+    TrackingError
+        Nobody can be found, or no frame shows enough of the person.
+    """
+    if not keypoints:
+        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+    lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
+    if len(lengths) > 1 or len(rates) > 1:
+        told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
+        raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
+    sigma = [float(accuracy)] * len(keypoints) if isinstance(accuracy, int | float) else [float(a) for a in accuracy]
+    channels = make_channels(body, rig, keypoints, choose_people(rig, keypoints), sigma)
+    if subject is None:
+        subject = fit_subject(body, channels, frames=shape_frames, progress=progress)
+    channels = channels.with_points(subject.body)
+    results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
+    return _motion(subject.body, channels, results, keypoints[0], up, name)
+
+
+def fit_subject(body: Body, channels: Channels, *, frames: int = 25, progress: Progress | None = None) -> Subject:
+    """Bone lengths and the places of the detectors' points, from frames spread over a take."""
+    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(frames, len(channels.uv))).astype(int))
+    if progress:
+        progress("bone lengths", 0, 1)
+    x = triangulated(channels, chosen)
+    scales = first_scales(body, channels.points, x)
+    sized = body.scaled(scales)
+    points = channels.with_points(sized).points
+    states, used = [], []
+    for i, f in enumerate(chosen):
+        try:
+            state, left = pose_from_points(sized, points, x[i])
+        except TrackingError:
+            continue
+        if left < 0.15:
+            states.append(state)
+            used.append(f)
+    if not states:
+        raise TrackingError(
+            "no frame shows enough of the person in two cameras to start from",
+            remedy="Check the calibration and that the cameras are in step; see which points agree with kinefit track -v.",
+        )
+    picked = np.array(used)
+    weight = _swap_free(channels, sized, points, states, picked)
+    pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[picked], weight)
+    shape = fit_shape(body, channels.rig, pixels, states, scales)
+    fitted = body.scaled(shape.scales)
+    for name, span in channels.sets.items():
+        whole = fitted.keypoints(name)
+        moved = np.array(whole.points)
+        rows = [whole.index(n) for n in channels.points.names[span]]
+        moved[rows] += shape.shifts[span]
+        fitted = fitted.with_keypoints(name, moved)
+    if progress:
+        progress("bone lengths", 1, 1)
+    return Subject(fitted, shape.scales)
+
+
+def _swap_free(channels: Channels, body: Body, points: object, states: list, frames: NDArray) -> NDArray:
+    """(F, N) weights without the channels whose left and right look exchanged."""
+    tracker = Tracker(body, channels.with_points(body), 1.0)
+    weight = channels.weight[frames].copy()
+    from kinefit.tracking.swaps import find_swaps
+
+    for i, f in enumerate(frames):
+        swapped = find_swaps(channels, tracker._groups, channels.uv[f], weight[i], tracker.fitted(states[i]))
+        weight[i, swapped] = 0.0
+    return weight
+
+
+def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> list[FrameResult | None]:
+    total = len(channels.uv)
+    results: list[FrameResult | None] = []
+    for f in range(total):
+        results.append(tracker.update(channels.uv[f], channels.confidence[f]))
+        if progress:
+            progress("frames", f + 1, total)
+    first = next((f for f, r in enumerate(results) if r is not None), None)
+    if first is None:
+        raise TrackingError("the body was found in no frame", remedy="Check the calibration and the keypoints.")
+    if first > 0:  # what came before the first good frame, backwards from it
+        found = results[first]
+        assert found is not None
+        tracker.start_at(found.state)
+        for f in range(first - 1, -1, -1):
+            results[f] = tracker.update(channels.uv[f], channels.confidence[f])
+    return results
+
+
+def _motion(
+    body: Body, channels: Channels, results: list[FrameResult | None], record: Keypoints, up: str, name: str
+) -> Motion:
+    frames = [r for r in results if r is not None]
+    assert len(frames) == len(results)
+    factor, uv = np.stack([r.factor for r in frames]), np.stack([r.uv for r in frames])
+    fitted, swapped = np.stack([r.fitted for r in frames]), np.stack([r.swapped for r in frames])
+    residuals = {}
+    for q, label in enumerate(channels.sources):
+        mine = channels.source == q
+        columns = channels.column[mine]
+        residuals[label] = Residuals(
+            names=tuple(channels.points.names[c] for c in columns),
+            segments=channels.points.segments[columns],
+            values=uv[:, mine] - fitted[:, mine],
+            weights=factor[:, mine],
+            unit="px",
+            measured=uv[:, mine],
+            swapped=swapped[:, mine].any(axis=1),
+        )
+    return Motion(
+        body=body,
+        rate=record.rate,
+        times=record.times,
+        Ts_world_root=np.stack([r.state.T_world_root for r in frames]),
+        angles=np.stack([r.state.angles for r in frames]),
+        dof_std=np.stack([r.dof_std for r in frames]),
+        joint_std=np.stack([r.joint_std for r in frames]),
+        quality=np.array([r.quality for r in frames]),
+        segment_quality=np.stack([r.segment_quality for r in frames]),
+        residuals=residuals,
+        up=up,
+        name=name,
+    )
