@@ -51,7 +51,8 @@ def with_residuals(motion, cameras, rng):
         values[rng.uniform(size=values.shape[:2]) < 0.1] = np.nan
         out[camera.name] = Residuals(
             points.names, points.segments, values,
-            np.where(np.isnan(values[..., 0]), 0.0, rng.uniform(0, 1, values.shape[:2])), "px", camera.project(motion.positions(points)) + values, rng.uniform(size=len(motion)) < 0.2,
+            np.where(np.isnan(values[..., 0]), 0.0, rng.uniform(0, 1, values.shape[:2])), "px",
+            camera.project(motion.positions(points)) + values, rng.uniform(size=len(motion)) < 0.2,
         )
     markers = motion.body.markers("HANIM_45")
     values = rng.normal(0, 0.01, (len(motion), len(markers), 3))

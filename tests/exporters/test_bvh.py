@@ -1,5 +1,7 @@
 """BVH read back has its joints where the motion has them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.exporters.synthetic import smooth_motion
@@ -46,14 +48,18 @@ def test_angles_do_not_jump_and_every_joint_has_its_channels(tmp_path):
 
 def test_a_joint_that_slides_has_its_position_in_channels(tmp_path):
     text = """
-        body = { name = "lift" }
-        segment = [
-          { name = "base", joint = { name = "ground", type = "free" } },
-          { name = "car", parent = "base", joint.name = "rail", joint.type = "prismatic", joint.axes = ["y"],
-            joint.at = [0, 1, 0], joint.range = [[0, 2]] },
-          { name = "door", parent = "car", joint.name = "hinge", joint.type = "revolute", joint.axes = ["z"],
-            joint.at = [0.5, 0, 0], joint.range = [[0, 90]] },
-        ]
+        body.name = "lift"
+        [[segment]]
+        name = "base"
+        joint = { name = "ground", type = "free" }
+        [[segment]]
+        name = "car"
+        parent = "base"
+        joint = { name = "rail", type = "prismatic", at = [0, 1, 0], axes = ["y"], range = [[0, 2]] }
+        [[segment]]
+        name = "door"
+        parent = "car"
+        joint = { name = "hinge", type = "revolute", at = [0.5, 0, 0], axes = ["z"], range = [[0, 90]] }
     """
     motion = smooth_motion(30, body=with_sets(parse_body(text)))
     write_bvh(motion, tmp_path / "a.bvh", unit="m")
@@ -64,8 +70,6 @@ def test_a_joint_that_slides_has_its_position_in_channels(tmp_path):
 
 def with_sets(body):
     """The body with the (empty) point sets that made-up residuals need."""
-    from dataclasses import replace
-
     none = load_body("humanoid").landmarks.select(())
     return replace(body, keypoint_sets={"BODY_25B": none}, marker_sets={"HANIM_45": none})
 

@@ -57,7 +57,8 @@ def test_bodies_come_back_exactly(name):
     back = body_from_arrays(body_to_arrays(body))
     assert_same_arrays(body_to_arrays(back), body_to_arrays(body))
     for field in fields(KinematicTree):  # also those that are added later
-        np.testing.assert_array_equal(getattr(back.tree, field.name), getattr(body.tree, field.name), err_msg=field.name)
+        one, other = getattr(back.tree, field.name), getattr(body.tree, field.name)
+        np.testing.assert_array_equal(one, other, err_msg=field.name)
     assert {f.name for f in fields(body)} == {
         "name", "tree", "joints", "scale_groups", "segment_scale", "landmarks", "keypoint_sets", "marker_sets",
         "surfaces", "aliases", "stature",

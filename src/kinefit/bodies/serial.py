@@ -8,7 +8,7 @@ radians:
     offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
     prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
-    spread (D,)                                        how far from zero it usually is [rad] or [m], inf where not told
+    spread (D,)                                        usual departure from zero [rad] or [m], inf for no prior
     scale_groups (G,)  segment_scale (S,)
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
@@ -78,6 +78,8 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
         **{name: _array(arrays, name, shapes.get(name, (n_coordinates,))) for name in _TREE},  # type: ignore[arg-type]
     )
     _check_indices(tree.owners, n_segments, "owners")
+    if n_segments == 0 or tree.parents[0] != -1:
+        raise BodyError("the first segment is no root")
     _check_indices(tree.parents[1:], n_segments, "parents")
     groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
     _check_indices(segment_scale, len(groups), "segment_scale")

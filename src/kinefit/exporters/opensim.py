@@ -66,8 +66,8 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
     table = np.concatenate([motion.times[:, None], root, y_up.Ts_world_root[:, :3, 3], angles], axis=1) + 0.0
     names = ["time", *root_coordinates(motion.body), *plain_names(tree.coordinates)]
     lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}"]
-    lines += ["inDegrees=yes", "", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees.", "", "endheader"]
-    lines += ["\t".join(names)]
+    lines += ["inDegrees=yes", "", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees."]
+    lines += ["", "endheader", "\t".join(names)]
     row = "\t".join(["%.9f"] + ["%.8f"] * (table.shape[1] - 1))
     lines += [row % tuple(values) for values in table.tolist()]
     write_text(path, "\n".join(lines) + "\n")

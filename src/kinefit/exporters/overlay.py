@@ -64,8 +64,10 @@ def write_overlay(
     with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
         for i, image in enumerate(video.frames()):
             frame = nearest_frame(motion, i / video.rate + time_offset)
-            more = {"image_frame": image_frame, "residuals": residuals, "label": f"frame {i}"}
-            encode(draw_overlay(image, motion, frame, camera, **more)[:height, :width])
+            drawn = draw_overlay(
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}"
+            )
+            encode(drawn[:height, :width])
             if progress:
                 progress(i + 1)
 

@@ -1,7 +1,7 @@
 """Tables: a motion as CSV or Parquet files, one for each kind of result.
 
-    angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as place [m]
-                and unit quaternion in the world, its deviations along [m] and about [deg] the world's axes
+    angles      one row a frame: every coordinate [deg] (sliding ones [m]) with its standard deviation; the root as
+                place [m] and unit quaternion in the world, its deviations along [m] and about [deg] the world's axes
     joints      joint centres [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1

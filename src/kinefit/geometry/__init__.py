@@ -1,0 +1,1 @@
+"""Space: twists, lines, cameras; knows no body."""

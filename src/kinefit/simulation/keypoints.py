@@ -12,6 +12,7 @@ from kinefit.observations import Keypoints
 from kinefit.readers.keypoints import keypoint_names
 
 _MARGIN = 0.04  # of the image, that stays free around the person
+_NEAREST = 3.0  # [m]
 _BURST = 8  # frames that a confusion of left and right lasts, on average
 _VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m] where nothing else is asked for, y up
 
@@ -58,7 +59,7 @@ def studio_rig(
     for k in range(cameras):
         azimuth = 2 * np.pi * (k + 0.5) / cameras + (0.22 if k % 2 else -0.12)
         height = low[1] + (1.3, 1.9, 1.5, 2.2)[k % 4]
-        for distance in np.arange(2.5, 60.0, 0.1):
+        for distance in np.arange(_NEAREST, 60.0, 0.1):
             place = centre + distance * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
             place[1] = height
             camera = _camera(f"cam{k + 1:02d}", size, focal, place, centre)

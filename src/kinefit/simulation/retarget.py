@@ -15,7 +15,7 @@ from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.observations import SkeletonMotion
-from kinefit.simulation.skeletons import BoneDirections, bone_directions
+from kinefit.simulation.skeletons import BoneDirections, bone_directions, steps
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 
 _ACCURACY = 0.001  # [m] of the target points; small beside a bone, so that the priors only fill in what is free
@@ -222,8 +222,18 @@ def _turn_from_usual(directions: NDArray, R: NDArray) -> NDArray:
 
 
 def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
-    """Frames [start, stop) of a motion, as of a Python slice; its time begins at zero."""
+    """Frames [start, stop) of a motion, as of a Python slice; its time begins at zero.
+
+    Raises
+    ------
+    ObservationError
+        No frames are left.
+    """
     rows = slice(start, stop)
+    if not len(motion.times[rows]):
+        raise ObservationError(
+            f"no frames between {start} and {stop} of '{motion.name}'", remedy=f"It has the frames 0 to {len(motion) - 1}."
+        )
     residuals = {
         name: replace(
             r, values=r.values[rows], weights=r.weights[rows], measured=r.measured[rows], swapped=r.swapped[rows]
@@ -240,8 +250,13 @@ def resampled(motion: Motion, rate: float) -> Motion:
     """A motion at another rate [Hz]: angles and the root's place linearly, its turn along the shortest way.
 
     Deviations and qualities are those of the worse neighbour; residuals are left out.
+
+    Raises
+    ------
+    ObservationError
+        The rate is not positive.
     """
-    at = np.arange(int((len(motion) - 1) / motion.rate * rate + 1e-6) + 1) * (motion.rate / rate)
+    at = steps(len(motion), motion.rate, rate)
     low = np.minimum(at.astype(int), len(motion) - 1)
     high, share = np.minimum(low + 1, len(motion) - 1), at - low
     A, B = motion.Ts_world_root[low], motion.Ts_world_root[high]

@@ -117,9 +117,7 @@ class BoneDirections:
 
     def resampled(self, rate: float) -> BoneDirections:
         """The same at another rate [Hz], linearly between frames."""
-        if not 0 < rate < np.inf:
-            raise ObservationError(f"the rate {rate} is not positive", remedy="Give frames a second.")
-        at = np.arange(int((len(self) - 1) / self.rate * rate + 1e-6) + 1) * (self.rate / rate)
+        at = steps(len(self), self.rate, rate)
         low = np.minimum(at.astype(int), len(self) - 1)
         high, share = np.minimum(low + 1, len(self) - 1), (at - low)[:, None]
 
@@ -131,6 +129,19 @@ class BoneDirections:
             {name: _unit(between(v)) for name, v in self.bones.items()},
             {name: _unit(between(v)) for name, v in self.across.items()}, self.upright,
         )
+
+
+def steps(frames: int, rate: float, new_rate: float) -> NDArray:
+    """Where the frames at a new rate [Hz] lie among the old ones (0 .. frames - 1).
+
+    Raises
+    ------
+    ObservationError
+        The new rate is not positive.
+    """
+    if not 0 < new_rate < np.inf:
+        raise ObservationError(f"the rate {new_rate} is not positive", remedy="Give frames a second.")
+    return np.arange(int((frames - 1) / rate * new_rate + 1e-6) + 1) * (rate / new_rate)
 
 
 def family_of(skeleton: SkeletonMotion) -> Family:

@@ -47,9 +47,9 @@ class Channels:
 
     @property
     def weight(self) -> NDArray:
-        """(F, N) [1/px²] confidence² / σ², 0 where unseen."""
+        """(F, N) [1/px²] confidence / σ², 0 where unseen: a point half as sure has twice the variance."""
         seen = np.isfinite(self.uv).all(axis=-1)
-        return np.where(seen, np.square(self.confidence / self.sigma), 0.0)
+        return np.where(seen, self.confidence / np.square(self.sigma), 0.0)
 
     def with_points(self, body: Body) -> Channels:
         """The same measurements of another body's points."""

@@ -35,7 +35,7 @@ class Settings:
     """
 
     loss: Loss = geman_mcclure()
-    angle_acceleration: float = 200.0
+    angle_acceleration: float = 400.0
     root_acceleration: float = 60.0
     poor: float = 0.5
 
@@ -107,7 +107,7 @@ class Tracker:
     def update(self, uv: NDArray, confidence: NDArray) -> FrameResult | None:
         """Track one frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None while there is nothing to start from."""
         seen = np.isfinite(uv).all(axis=1)
-        weight = np.where(seen, np.square(confidence / self.channels.sigma), 0.0)
+        weight = np.where(seen, confidence / np.square(self.channels.sigma), 0.0)
         uv = np.where(seen[:, None], uv, np.nan)
         result = None
         if self._state is not None:

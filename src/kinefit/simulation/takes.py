@@ -1,0 +1,97 @@
+"""A whole recording of a known motion: videos, keypoints, calibration and take file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+from kinefit.errors import ExportError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import Motion
+from kinefit.observations import Keypoints
+from kinefit.readers.calibration import write_calibration
+from kinefit.simulation.exercise import squat_and_wave
+from kinefit.simulation.figures import draw_figure
+from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
+
+_SIZE = (544, 960)  # px
+_ACCURACY = 2.0  # px
+
+
+def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
+    """Write a take of a drawn figure that squats and waves: four videos with keypoints, calibration and take.toml.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it does not exist; files of the same names in it are replaced.
+    seed : int
+        Of the keypoints' errors: 1.5 px noise, 5 % outliers, 5 % missing.
+
+    Returns
+    -------
+    Path
+        The take file, written last.
+
+    Raises
+    ------
+    ExportError
+        The folder cannot be written; then no take file is there.
+    """
+    folder, motion = Path(folder), squat_and_wave()
+    rig = studio_rig(motion, size=_SIZE)
+    seen = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+            staging = Path(name)
+            for camera, keypoints in zip(rig, seen):
+                _write_video(motion, camera, staging / f"{camera.name}.mp4")
+                np.save(staging / f"mediapipe_{camera.name}.npy", _landmarks(keypoints))
+            write_calibration(rig, staging / "calibration.toml")
+            (staging / "take.toml").write_text(_take(motion, rig), encoding="utf-8")
+            for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
+                path.replace(folder / path.name)
+    except OSError as error:  # PyAV's errors of files are of this kind too
+        raise ExportError(
+            f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
+            remedy="Name a folder that can be written and has 10 MB free.",
+        ) from error
+    return folder / "take.toml"
+
+
+def _write_video(motion: Motion, camera: Camera, path: Path) -> None:
+    codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(motion.rate).limit_denominator(1001))
+        stream.width, stream.height = camera.size
+        stream.pix_fmt = "yuv420p"
+        for frame in range(len(motion)):
+            picture = av.VideoFrame.from_ndarray(draw_figure(motion, frame, camera), format="bgr24")
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def _landmarks(keypoints: Keypoints) -> np.ndarray:
+    """(F, 33, 3) as MediaPipe gives them: x, y [px] and visibility, zero where unseen."""
+    array = np.concatenate([keypoints.points[:, 0], keypoints.confidence[:, 0, :, None]], axis=-1)
+    return np.nan_to_num(array).astype(np.float32)
+
+
+def _take(motion: Motion, rig: Rig) -> str:
+    parts = [
+        "# A drawn figure that squats and waves, in four cameras. No recording of a person.\n",
+        f'[take]\nname = "{motion.name}"\nrate = {motion.rate}\nup = "{motion.up}"\nbody = "{motion.body.name}"\n',
+        '[calibration]\nfile = "calibration.toml"\n',
+    ]
+    parts += [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mp4"\n' for name in rig.names]
+    parts += [
+        f'[[keypoints]]\ncamera = "{name}"\nfile = "mediapipe_{name}.npy"\nformat = "mediapipe"\naccuracy = {_ACCURACY}\n'
+        for name in rig.names
+    ]
+    return "\n".join(parts)

@@ -1,0 +1,160 @@
+"""Recorded motions on the humanoid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit.bodies import load_body
+from kinefit.errors import BodyError, ObservationError
+from kinefit.motion import rotation_between_up
+from kinefit.observations import SkeletonMotion
+from kinefit.readers.amc import read_amc
+from kinefit.readers.bvh import read_bvh
+from kinefit.simulation import cut, resampled, retarget, squat_and_wave
+from kinefit.simulation.skeletons import bone_directions, family_of
+
+BONES = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
+RECORDINGS = [  # file, family, frames, largest median and 95th percentile of the error [deg]
+    ("motion_cmu_bvh/cmu_12_01_walk.bvh", "MotionBuilder (CMU)", 262, 1.0, 3.0),
+    ("motion_animateddrawings_bvh/jumping_jacks.bvh", "hip and knee (CMU)", 125, 1.0, 3.0),
+    ("motion_animateddrawings_bvh/wave_hello.bvh", "AnimatedDrawings", 420, 1.0, 3.0),
+    ("motion_cmu_bvh/002_01.bvh", "iClone", 171, 1.0, 3.0),
+    ("motion_cmu_amc/02_01.amc", "Acclaim (CMU)", 172, 1.0, 3.0),
+]
+
+
+def read(data_dir, name):
+    folder, file = name.split("/")
+    path = data_dir(folder) / file
+    return read_amc(path.with_name("02.asf"), path) if path.suffix == ".amc" else read_bvh(path)
+
+
+def directions(motion):
+    joints, tree = motion.segment_poses()[..., :3, 3], motion.body.tree
+    out = {}
+    for parent, child in BONES.items():
+        for side in "lr":
+            d = joints[:, tree.segment(f"{child}_{side}")] - joints[:, tree.segment(f"{parent}_{side}")]
+            out[f"{parent}_{side}"] = d / np.linalg.norm(d, axis=1, keepdims=True)
+    return out
+
+
+@pytest.mark.parametrize(("name", "family", "frames", "median", "p95"), RECORDINGS)
+def test_bones_point_where_the_recorded_ones_do(data_dir, name, family, frames, median, p95):
+    skeleton = read(data_dir, name)
+    rate = min(60.0, skeleton.rate)
+    motion = retarget(skeleton, rate=rate)
+    assert (family_of(skeleton).name, len(motion), motion.rate, motion.up) == (family, frames, rate, "y")
+    source = bone_directions(skeleton)
+    source = source if rate == skeleton.rate else source.resampled(rate)
+    errors = np.concatenate([
+        np.degrees(np.arccos(np.clip(np.sum(d * source.bones[bone], axis=1), -1, 1)))
+        for bone, d in directions(motion).items()
+    ])
+    assert np.median(errors) < median and np.percentile(errors, 95) < p95
+    tree = motion.body.tree
+    assert np.all((motion.angles >= tree.lower) & (motion.angles <= tree.upper))
+    poses = motion.segment_poses()[1:, :, :3, :3]  # the first frame may be a T-pose
+    turn = np.linalg.norm(poses[1:] - poses[:-1], axis=(-2, -1)) / np.sqrt(2)  # 2 sin(θ/2)
+    assert np.percentile(turn[:, : tree.segment("clavicle_r")], 99) < 0.2  # [rad] a frame, trunk and head
+    height = motion.positions(motion.body.landmarks.select(("skull_vertex", "r_heel", "l_heel")))[..., 1]
+    assert np.median(height[:, 0] - height[:, 1:].min(axis=1)) > 1.3  # [m] upright
+
+
+def test_walking_angles_are_those_of_walking(data_dir):
+    motion = cut(retarget(read(data_dir, "motion_cmu_amc/02_01.amc"), rate=60.0), 1)
+    span = {name: np.degrees(np.ptp(motion.angles[:, motion.body.tree.coordinate(name)]))
+            for name in ("hip_flexion_r", "knee_angle_r", "ankle_angle_r", "lumbar_bending")}
+    assert 25 < span["hip_flexion_r"] < 60 and 45 < span["knee_angle_r"] < 80 and 15 < span["ankle_angle_r"] < 55
+    assert span["lumbar_bending"] < 25
+    way = np.ptp(motion.Ts_world_root[:, :3, 3], axis=0)
+    assert way[1] < 0.1 < 1.5 < np.hypot(way[0], way[2])
+
+
+def as_skeleton(motion, up="y"):
+    """The motion of a humanoid told as an Acclaim skeleton."""
+    places = {
+        "root": "sacroiliac", "upperback": "abdomen", "lowerneck": "head", "head": "head", "head_end": "skull_vertex",
+        **{f"{s}{new}": f"{old}_{s}" for s in "lr" for new, old in {
+            "femur": "thigh", "tibia": "shank", "foot": "foot", "toes": "toes", "humerus": "upperarm",
+            "radius": "forearm", "wrist": "hand", "hand": "hand"}.items()},
+        **{f"{s}fingers": f"{s}_metacarpal_phalanx_3" for s in "lr"}, **{f"{s}toes_end": f"{s}_digit_2" for s in "lr"},
+    }
+    body, poses = motion.body, motion.segment_poses()
+    Ts = np.tile(np.eye(4), (len(motion), len(places), 1, 1))
+    rest = np.zeros((len(places), 3))
+    for j, (name, place) in enumerate(places.items()):
+        place = "thorax" if name == "upperback" else place
+        segment = body.tree.segments.index(place) if place in body.tree.segments else None
+        if segment is None:
+            k = body.landmarks.index(place)
+            segment, point = body.landmarks.segments[k], body.landmarks.points[k]
+        else:
+            point = np.zeros(3)
+        Ts[:, j] = poses[:, segment]
+        Ts[:, j, :3, 3] += poses[:, segment, :3, :3] @ point
+        rest[j] = body.tree.rest[segment] + point
+    R = rotation_between_up("y", up)
+    T = np.eye(4)
+    T[:3, :3] = R
+    Ts = T @ Ts
+    Ts[..., :3, :3] = Ts[..., :3, :3] @ R.T
+    parents = np.array([-1] + [0] * (len(places) - 1))
+    offsets = rest @ R.T
+    offsets[1:] -= offsets[0]
+    return SkeletonMotion(tuple(places), parents, offsets, motion.rate, Ts, up=up)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_a_motion_of_the_humanoid_itself_comes_back(up):
+    truth = squat_and_wave(up="y")
+    found = retarget(as_skeleton(truth, up))
+    a, b = directions(truth), directions(found)
+    for bone in a:
+        np.testing.assert_allclose(b[bone], a[bone], atol=np.radians(1.0), err_msg=bone)
+    shift = found.Ts_world_root[:, :3, 3] - truth.Ts_world_root[:, :3, 3]
+    assert np.abs(shift).max() < 0.02
+    errors = np.degrees(np.abs(found.angles - truth.angles))
+    weak = [truth.body.tree.coordinate(n) for n in truth.body.tree.coordinates if n.startswith(("clav", "subtalar", "mtp"))]
+    assert np.delete(errors, weak, axis=1).mean() < 3.0
+
+
+def test_the_legs_scale_the_way():
+    truth = squat_and_wave(up="y")
+    skeleton = as_skeleton(truth)
+    Ts = np.array(skeleton.Ts_world_joint)
+    Ts[..., :3, 3] *= 1.2
+    found = retarget(replace(skeleton, Ts_world_joint=Ts, offsets=1.2 * skeleton.offsets))
+    assert np.abs(found.Ts_world_root[:, :3, 3] - truth.Ts_world_root[:, :3, 3]).max() < 0.02
+
+
+def test_unknown_skeletons_and_bodies_are_told():
+    skeleton = as_skeleton(squat_and_wave(up="y"))
+    names = tuple("knie" if name == "ltibia" else name for name in skeleton.names)
+    with pytest.raises(ObservationError, match=r"for 'Acclaim \(CMU\)' it lacks: ltibia"):
+        retarget(replace(skeleton, names=names))
+    with pytest.raises(BodyError, match="humanoid"):
+        retarget(skeleton, load_body("arm"))
+    with pytest.raises(ObservationError, match="rate"):
+        retarget(skeleton, rate=0.0)
+    Ts = np.array(skeleton.Ts_world_joint)
+    Ts[3, names.index("lfoot"), :3, 3] = Ts[3, names.index("knie"), :3, 3]
+    with pytest.raises(ObservationError, match="'shank_l' has no length"):
+        retarget(replace(skeleton, Ts_world_joint=Ts))
+
+
+def test_cut_and_resampled():
+    motion = squat_and_wave(rate=30.0)
+    part = cut(motion, 10, 20)
+    assert len(part) == 10 and part.times[0] == 0 and np.array_equal(part.angles, motion.angles[10:20])
+    twice = resampled(motion, 60.0)
+    assert len(twice) == 2 * len(motion) - 1
+    np.testing.assert_allclose(twice.Ts_world_root[::2], motion.Ts_world_root, atol=1e-12)
+    np.testing.assert_allclose(resampled(twice, 30.0).angles, motion.angles, atol=1e-12)
+    fine = squat_and_wave(rate=60.0)
+    assert np.abs(twice.Ts_world_root - fine.Ts_world_root[: len(twice)]).max() < 0.01
+    with pytest.raises(ObservationError, match="rate"):
+        resampled(motion, float("nan"))
+    with pytest.raises(ObservationError, match="frames"):
+        cut(motion, 60)
