@@ -7,6 +7,7 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import BodyError, ObservationError
+from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.amc import read_amc
@@ -94,6 +95,9 @@ def as_skeleton(motion, up="y"):
             point = np.zeros(3)
         Ts[:, j] = poses[:, segment]
         Ts[:, j, :3, 3] += poses[:, segment, :3, :3] @ point
+        if name in ("lhand", "rhand"):  # whose rest pose has the thumbs in front, not outside
+            turn = np.array([0.0, np.pi / 2 if name == "lhand" else -np.pi / 2, 0.0])
+            Ts[:, j, :3, :3] = Ts[:, j, :3, :3] @ se3.exp_so3(turn)
         rest[j] = body.tree.rest[segment] + point
     R = rotation_between_up("y", up)
     T = np.eye(4)
@@ -116,8 +120,7 @@ def test_a_motion_of_the_humanoid_itself_comes_back(up):
     shift = found.Ts_world_root[:, :3, 3] - truth.Ts_world_root[:, :3, 3]
     assert np.abs(shift).max() < 0.02
     errors = np.degrees(np.abs(found.angles - truth.angles))
-    weak = [truth.body.tree.coordinate(n) for n in truth.body.tree.coordinates if n.startswith(("clav", "subtalar", "mtp"))]
-    assert np.delete(errors, weak, axis=1).mean() < 3.0
+    assert errors.mean() < 1.0 and errors.max() < 10.0
 
 
 def test_the_legs_scale_the_way():

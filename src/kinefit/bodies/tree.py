@@ -85,7 +85,7 @@ class KinematicTree:
 
     @cached_property
     def dof_parent(self) -> NDArray:
-        """(6 + D,) the next degree of freedom towards the root, -1 for the first: the sparsity of the normal matrix."""
+        """(6 + D,) the next degree of freedom towards the root, -1 for the first."""
         last = np.full(len(self.segments), 5)
         out = list(range(-1, 5))
         for s, parent in enumerate(self.parents):
@@ -104,6 +104,24 @@ class KinematicTree:
             if self.dof_start[s + 1] > self.dof_start[s]:
                 last[s] = 5 + self.dof_start[s + 1]
         return _frozen(last, np.int64)
+
+    @cached_property
+    def depth(self) -> NDArray:
+        """(n,) how many degrees of freedom stand above each one."""
+        out = np.zeros(self.n_dofs, np.int64)
+        for k in range(1, self.n_dofs):
+            out[k] = out[self.dof_parent[k]] + 1
+        return _frozen(out, np.int64)
+
+    @cached_property
+    def chain(self) -> NDArray:
+        """(n, m) degrees of freedom from the root down to each one itself: the pattern of the normal matrix; then -1."""
+        out = np.full((self.n_dofs, int(self.depth.max()) + 1), -1)
+        for k in range(self.n_dofs):
+            if k:
+                out[k] = out[self.dof_parent[k]]
+            out[k, self.depth[k]] = k
+        return _frozen(out, np.int64)
 
     def segment(self, name: str) -> int:
         """Index of a segment by name."""

@@ -1,1 +1,69 @@
-"""The command line."""
+"""The command line: `kinefit demo`, `track`, `export`, `retarget`, `warmup`; one file a command.
+
+Heavy imports stand inside the commands, so that help comes at once.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import click
+
+from kinefit import __version__
+from kinefit.cli import _screen
+from kinefit.errors import KinefitError
+
+COMMANDS = ("demo", "track", "export", "retarget", "warmup")
+INTERRUPTED = 130
+
+
+class _Commands(click.Group):
+    """Commands that are imported when they are called; errors become messages and exit codes."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the order of use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """Import a command."""
+        if name not in COMMANDS:
+            return None
+        return getattr(import_module(f"kinefit.cli.{name}"), name)
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run a command."""
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except KinefitError as error:
+            _screen.tell_error(error)
+            code = error.exit_code
+        except KeyboardInterrupt as error:
+            _screen.tell_interrupted(str(error))
+            code = INTERRUPTED
+        except Exception as error:
+            _screen.tell_bug(error)
+            code = 1
+        ctx.exit(code)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, "-V", "--version")
+def main() -> None:
+    """Fit one articulated body to whatever the sensors saw.
+
+    \b
+    Examples:
+      kinefit demo                          four videos of a person, done in a minute
+      kinefit track my_take/take.toml       the same for a recording of your own
+      kinefit export motion.npz --to bvh    a result in another format
+      kinefit COMMAND --help                what a command takes, with examples
+
+    \b
+    Exit codes:
+      0    done
+      1    a fault of kinefit's own; -v shows where
+      2    the input or the command line is wrong, or a result cannot be written: the message says what would work
+      130  stopped by Ctrl-C; what was done is kept and named
+    """

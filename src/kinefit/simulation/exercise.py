@@ -32,14 +32,17 @@ def squat_and_wave(body: Body | None = None, *, rate: float = 30.0, duration: fl
     degrees = {
         "lumbar_extension": -12 * depth, "thorax_extension": 3 * look, "thorax_rotation": 8 * look,
         "neck_extension": 20 * depth, "neck_rotation": 30 * look, "neck_bending": 6 * wave * raised,
-        "clav_elev_r": -10 * raised, "arm_flex_r": 15 * raised, "arm_add_r": -8 - 60 * raised, "arm_rot_r": -75 * raised,
-        "elbow_flex_r": 15 + (65 + 25 * wave) * raised, "pro_sup_r": 80 - 60 * raised, "wrist_flex_r": 10 * wave * raised,
+        "clav_elev_r": -10 * raised, "arm_flex_r": 15 * raised, "arm_add_r": -8 - 60 * raised,
+        "arm_rot_r": -75 * raised,
+        "elbow_flex_r": 15 + (65 + 25 * wave) * raised, "pro_sup_r": 80 - 60 * raised,
+        "wrist_flex_r": 10 * wave * raised,
         "arm_flex_l": 70 * depth, "arm_add_l": -8 - 4 * look, "elbow_flex_l": 15 + 20 * depth, "pro_sup_l": 80 + 0 * t,
     }
     for side in "lr":
         degrees |= {
-            f"hip_flexion_{side}": 5 + 80 * depth, f"hip_adduction_{side}": -4 - 8 * depth, f"knee_angle_{side}": 10 + 85 * depth,
-            f"ankle_angle_{side}": 5 + 25 * depth, f"subtalar_angle_{side}": 2 * depth,
+            f"hip_flexion_{side}": 5 + 80 * depth, f"hip_adduction_{side}": -4 - 8 * depth,
+            f"knee_angle_{side}": 10 + 85 * depth, f"ankle_angle_{side}": 5 + 25 * depth,
+            f"subtalar_angle_{side}": 2 * depth,
         }
     angles = np.zeros((len(t), len(body.tree.coordinates)))
     for name, values in degrees.items():

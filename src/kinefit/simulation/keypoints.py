@@ -150,7 +150,8 @@ def simulate_keypoints(
         for p, person in enumerate(people):
             frames = min(len(motion), len(person))
             uv = _project(person, camera, keypoint_set, names)[:frames]
-            points[:frames, p], confidence[:frames, p] = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
+            found = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
+            points[:frames, p], confidence[:frames, p] = found
         if len(people) > 1:  # the order of people means nothing
             order = random.permuted(np.tile(np.arange(len(people)), (len(motion), 1)), axis=1)
             points = np.take_along_axis(points, order[:, :, None, None], axis=1)

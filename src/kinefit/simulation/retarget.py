@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.correspondences import point_rows, prediction_rows, prior_rows
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.observations import SkeletonMotion
@@ -23,9 +23,10 @@ _POSTURE = 2.0  # [rad] spread of the angles about rest
 _CHANGE = 0.2  # [rad] spread of their change from frame to frame
 _LOOSE = 0.004  # [m] the same of hands and feet, which recordings often have bent further than a joint goes
 _POOR = 1000.0  # cost of a frame that is not fitted well
-_ANCHORS = 5
+_QUALITIES = ("dof_std", "joint_std", "quality", "segment_quality")
+_ANCHORS = 5  # frames tried to begin with
 _STARTS = ((-1.2, 1.3), (0.0, 1.3), (1.2, 1.3))  # [rad] turn of the upper arm, pronation
-_JOINTS = ("shank", "foot", "toes", "upperarm", "forearm", "hand")
+_CHAIN = (("thigh", "shank"), ("shank", "foot"), ("foot", "toes"), ("upperarm", "forearm"), ("forearm", "hand"))
 _POINTS = ("skull_vertex", "l_tragion", "r_tragion") + tuple(
     f"{side}_{name}" for side in "lr" for name in ("digit_2", *(f"metacarpal_phalanx_{k}" for k in (2, 3, 5)))
 )
@@ -135,7 +136,8 @@ def _anchor(body: Body, points: PointSet, targets: NDArray, Ts_world_root: NDArr
         for turns in product(_STARTS, repeat=2):
             start = np.array(body.rest_state().angles)
             for side, (rotation, pronation) in zip("lr", turns):
-                for name, value in (("arm_rot", rotation), ("pro_sup", pronation), ("elbow_flex", 0.8), ("knee_angle", 0.3)):
+                bent = {"arm_rot": rotation, "pro_sup": pronation, "elbow_flex": 0.8, "knee_angle": 0.3}
+                for name, value in bent.items():
                     start[body.tree.coordinate(f"{name}_{side}")] = value
             fit = _fit(body, BodyState(Ts_world_root[frame], start), points, targets[frame], change=np.inf)
             if fit.equations.cost < least:
@@ -147,7 +149,9 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
     """Points (K) of the body, where they should be (F, K, 3) [m], and the root's pose (F, 4, 4)."""
     tree = body.tree
     lacking = [name for name in _POINTS if name not in body.landmarks.names]
-    lacking += [f"{name}_{side}" for name in _JOINTS for side in "lr" if f"{name}_{side}" not in tree.segments]
+    joints = [f"{name}_{side}" for pair in _CHAIN for name in pair for side in "lr"]
+    joints += ["abdomen", "thorax", "head", "clavicle_l", "clavicle_r"]
+    lacking += [name for name in joints if name not in tree.segments]
     if lacking:
         raise BodyError(
             choices("segment or landmark", lacking[0], (*tree.segments, *body.landmarks.names)),
@@ -178,7 +182,7 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
         place[name] = place["head"] + R @ local[name]
 
     for side in "lr":
-        for parent, child in (("thigh", "shank"), ("shank", "foot"), ("foot", "toes"), ("upperarm", "forearm"), ("forearm", "hand")):
+        for parent, child in _CHAIN:
             length = np.linalg.norm(offset[f"{child}_{side}"])
             place[f"{child}_{side}"] = place[f"{parent}_{side}"] + length * bones.bones[f"{parent}_{side}"]
         tip = f"{side}_digit_2"
@@ -196,9 +200,9 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
 
 
 def _frames(bone: NDArray, across: NDArray, rest: NDArray, *, keep_across: bool = False) -> NDArray:
-    """Rotations (F, 3, 3) that take z to `across` and (rest, 0) to `bone`, both (F, 3), as far as they are at right angles.
+    """Rotations (F, 3, 3) that take z to `across` and (rest, 0) to `bone`, both (F, 3).
 
-    Where they are not, the bone is kept and the other turned; or the other way round.
+    Where those are not at right angles, the bone is kept and the other turned; or the other way round.
     """
     first, second = (across, bone) if keep_across else (bone, across)
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
@@ -232,7 +236,8 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
     rows = slice(start, stop)
     if not len(motion.times[rows]):
         raise ObservationError(
-            f"no frames between {start} and {stop} of '{motion.name}'", remedy=f"It has the frames 0 to {len(motion) - 1}."
+            f"no frames between {start} and {stop} of '{motion.name}'",
+            remedy=f"It has the frames 0 to {len(motion) - 1}.",
         )
     residuals = {
         name: replace(
@@ -241,8 +246,7 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
         for name, r in motion.residuals.items()
     }
     times = motion.times[rows]
-    arrays = {name: getattr(motion, name)[rows] for name in
-              ("Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")}
+    arrays = {name: getattr(motion, name)[rows] for name in ("Ts_world_root", "angles", *_QUALITIES)}
     return replace(motion, times=times - times[:1], residuals=residuals, **arrays)
 
 
@@ -264,11 +268,9 @@ def resampled(motion: Motion, rate: float) -> Motion:
     R = se3.exp_so3(share[:, None] * step) @ A[:, :3, :3]
     origin = A[:, :3, 3] + share[:, None] * (B[:, :3, 3] - A[:, :3, 3])
     angles = motion.angles[low] + share[:, None] * (motion.angles[high] - motion.angles[low])
-    worst = {name: np.maximum(getattr(motion, name)[low], getattr(motion, name)[high]) for name in ("dof_std", "joint_std")}
-    least = {
-        name: np.minimum(getattr(motion, name)[low], getattr(motion, name)[high]) for name in ("quality", "segment_quality")
-    }
+    ends = {name: (getattr(motion, name)[low], getattr(motion, name)[high]) for name in _QUALITIES}
+    worse = {name: (np.maximum if name.endswith("std") else np.minimum)(*pair) for name, pair in ends.items()}
     return replace(
         motion, rate=rate, times=motion.times[0] + np.arange(len(at)) / rate, Ts_world_root=se3.transform(R, origin),
-        angles=angles, residuals={}, **worst, **least,
+        angles=angles, residuals={}, **worse,
     )

@@ -25,7 +25,8 @@ class Family:
     ----------
     name : str
     spine : names of the joints at the sacrum, a third of the way up the spine, at the root of the neck, in the head.
-    limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist, knuckles; {s}, {S}, {Side} are l, L, Left.
+    limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist, knuckles; {s}, {S}, {Side}
+        are l, L, Left.
     toe_end : name of the tip of the toes.
     hand : names of the joint whose frame turns with the hand (at rest the thumbs are in front), or of two joints, the
         second one on the thumb's side.
@@ -66,7 +67,8 @@ FAMILIES = (
     ),
     Family(
         "hip and knee (CMU)", ("Hips", "Chest", "lowerneck", "Head"),
-        ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist", "{S}Fingers"),
+        ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist",
+         "{S}Fingers"),
         "{Side}Toe_end", ("{s}hand",), "Head_end",
     ),
     Family(

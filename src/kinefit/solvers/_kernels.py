@@ -1,7 +1,6 @@
-"""Normal equations of a tree and their solution: rows -> 6×6 a segment -> H -> step.
+"""Normal equations of a tree: rows -> 6×6 a segment -> H.
 
-The tree makes H sparse: two angles meet only when one is above the other. `dof_parent` tells that pattern; the
-factorisation H = Lᵀ L keeps it (Featherstone 2005). A chain 0, 1, 2, ... as `dof_parent` makes the same code dense.
+H is packed by the tree's pattern, see `_kernels_linear`.
 """
 
 from __future__ import annotations
@@ -136,8 +135,8 @@ def accumulate(data, segment, factor, count, cx, cy, cz, blocks):
 
 
 @jit
-def project(parents, dof_start, dof_parent, screws, blocks, H, g):
-    """H = Σ Jₛᵀ Hₛ Jₛ (lower triangle, the pattern of `dof_parent`) and g = Σ Jₛᵀ gₛ; `blocks` are summed up the tree."""
+def project(parents, dof_start, chain, depth, screws, blocks, C, g):
+    """H = Σ Jₛᵀ Hₛ Jₛ, packed in C, and g = Σ Jₛᵀ gₛ; `blocks` are summed up the tree."""
     for s in range(parents.size - 1, -1, -1):
         b = blocks[s]
         for d in range(dof_start[s + 1] - 1, dof_start[s] - 1, -1):
@@ -150,13 +149,11 @@ def project(parents, dof_start, dof_parent, screws, blocks, H, g):
             f5 = b[5] * j0 + b[10] * j1 + b[14] * j2 + b[17] * j3 + b[19] * j4 + b[20] * j5
             k = 6 + d
             g[k] = b[21] * j0 + b[22] * j1 + b[23] * j2 + b[24] * j3 + b[25] * j4 + b[26] * j5
-            row = H[k]
-            e = k
-            while e >= 6:
-                t = screws[e - 6]
-                row[e] = t[0] * f0 + t[1] * f1 + t[2] * f2 + t[3] * f3 + t[4] * f4 + t[5] * f5
-                e = dof_parent[e]
+            row = C[k]
             row[0], row[1], row[2], row[3], row[4], row[5] = f0, f1, f2, f3, f4, f5
+            for i in range(6, depth[k] + 1):
+                t = screws[chain[k, i] - 6]
+                row[i] = t[0] * f0 + t[1] * f1 + t[2] * f2 + t[3] * f3 + t[4] * f4 + t[5] * f5
         p = parents[s]
         if p >= 0:
             up = blocks[p]
@@ -167,143 +164,29 @@ def project(parents, dof_start, dof_parent, screws, blocks, H, g):
     for r in range(6):
         g[r] = b[21 + r]
         for c in range(r, 6):
-            H[c, r] = b[i]
+            C[c, r] = b[i]
             i += 1
 
 
 @jit
-def factor_tree(H, dof_parent):
-    """H = Lᵀ L in place (lower triangle, the tree's pattern); the diagonal is left inverted. False if not positive."""
-    for k in range(H.shape[0] - 1, -1, -1):
-        row = H[k]
-        if not row[k] > 0.0:
-            return False
-        inverse = 1.0 / math.sqrt(row[k])
-        row[k] = inverse
-        i = dof_parent[k]
-        while i >= 0:
-            row[i] *= inverse
-            i = dof_parent[i]
-        i = dof_parent[k]
-        while i >= 6:
-            h, above = row[i], H[i]
-            j = i
-            while j >= 6:
-                above[j] -= h * row[j]
-                j = dof_parent[j]
-            for j in range(6):
-                above[j] -= h * row[j]
-            i = dof_parent[i]
-        for i in range(min(k, 6)):
-            for j in range(i + 1):
-                H[i, j] -= row[i] * row[j]
-    return True
+def assemble(
+    data, segment, group, count, kind, scale, centre, parents, dof_start, chain, depth, screws, factor, blocks, C, g
+):
+    """Rows -> robust factors, H packed in C, and g; returns the cost Σ ρ."""
+    cost = weigh(data, group, count, kind, scale, factor)
+    blocks[:] = 0.0
+    accumulate(data, segment, factor, count, centre[0], centre[1], centre[2], blocks)
+    project(parents, dof_start, chain, depth, screws, blocks, C, g)
+    return cost
 
 
 @jit
-def solve_tree(L, dof_parent, x):
-    """Solve Lᵀ L x = b in place, with L from `factor_tree`."""
-    n = L.shape[0]
-    for k in range(n - 1, -1, -1):
-        row = L[k]
-        v = x[k] * row[k]
-        x[k] = v
-        i = dof_parent[k]
-        while i >= 0:
-            x[i] -= row[i] * v
-            i = dof_parent[i]
-    for k in range(n):
-        row = L[k]
-        v = x[k]
-        i = dof_parent[k]
-        while i >= 0:
-            v -= row[i] * x[i]
-            i = dof_parent[i]
-        x[k] = v * row[k]
-
-
-@jit
-def hold(angles, lower, upper, locked, H, g):
-    """Take degrees of freedom out of a step: locked ones, and those at a limit that the gradient pushes out of."""
-    n = g.size
-    for k in range(n):
-        stop = locked[k]
-        if k >= 6 and not stop:
-            d = k - 6
-            stop = (angles[d] <= lower[d] and g[k] < 0.0) or (angles[d] >= upper[d] and g[k] > 0.0)
-        if stop:
-            g[k] = 0.0
-            for i in range(k):
-                H[k, i] = 0.0
-            for i in range(k + 1, n):
-                H[i, k] = 0.0
-            H[k, k] = 1.0
-
-
-@jit
-def retract(root, angles, delta, lower, upper, new_root, new_angles):
-    """State moved by δ: root's twist in the world about its origin, then angles, kept within their limits."""
-    wx, wy, wz = delta[3], delta[4], delta[5]
-    t2 = wx * wx + wy * wy + wz * wz
-    if t2 < 1e-8:
-        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
-    else:
-        t = math.sqrt(t2)
-        half = math.sin(0.5 * t)
-        a, b = math.sin(t) / t, 2.0 * half * half / t2
-    for j in range(3):
-        x, y, z = root[0, j], root[1, j], root[2, j]
-        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
-        new_root[0, j] = x + a * cx + b * (wy * cz - wz * cy)
-        new_root[1, j] = y + a * cy + b * (wz * cx - wx * cz)
-        new_root[2, j] = z + a * cz + b * (wx * cy - wy * cx)
-    for i in range(3):
-        new_root[i, 3] = root[i, 3] + delta[i]
-        new_root[3, i] = 0.0
-    new_root[3, 3] = 1.0
-    for d in range(angles.size):
-        q = angles[d] + delta[6 + d]
-        q = lower[d] if q < lower[d] else q
-        new_angles[d] = upper[d] if q > upper[d] else q
-
-
-@jit
-def damped_step(H, g, damping, dof_parent, angles, lower, upper, locked, L, delta):
-    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if H + λ is not positive."""
-    n = g.size
-    for i in range(n):
-        for j in range(i + 1):
-            L[i, j] = H[i, j]
-        delta[i] = g[i]
-    hold(angles, lower, upper, locked, L, delta)
-    for i in range(n):
-        L[i, i] += damping
-    if not factor_tree(L, dof_parent):
-        return -1.0
-    fall = 0.0
-    solve_tree(L, dof_parent, delta)
-    for i in range(n):
-        fall += delta[i] * (g[i] + damping * delta[i])
-    return fall
-
-
-@jit
-def adapt(damping, growth, fall, predicted):
-    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule)."""
-    if not fall > 0.0:
-        return damping * growth, 2.0 * growth
-    gain = 2.0 * fall / predicted - 1.0
-    shrink = 1.0 - gain * gain * gain
-    return damping * (shrink if shrink > 0.1 else 0.1), 2.0
-
-
-@jit
-def add_parameters(index, residual, weight, H, g):
-    """Add rows on degrees of freedom to H and g; returns their cost."""
+def add_parameters(index, residual, weight, depth, C, g):
+    """Add rows on degrees of freedom to a packed H and g; returns their cost."""
     cost = 0.0
     for i in range(index.size):
         k = index[i]
-        H[k, k] += weight[i]
+        C[k, depth[k]] += weight[i]
         g[k] += weight[i] * residual[i]
         cost += weight[i] * residual[i] * residual[i]
     return cost
@@ -346,40 +229,6 @@ def add_pairs(segments, point_a, point_b, normal, residual, weight, centre, scre
 
 
 @jit
-def assemble(
-    data, segment, group, count, kind, scale, centre, parents, dof_start, dof_parent, screws, factor, blocks, H, g
-):
-    """Rows -> robust factors, H (lower triangle) and g; returns the cost Σ ρ."""
-    cost = weigh(data, group, count, kind, scale, factor)
-    blocks[:] = 0.0
-    accumulate(data, segment, factor, count, centre[0], centre[1], centre[2], blocks)
-    project(parents, dof_start, dof_parent, screws, blocks, H, g)
-    return cost
-
-
-@jit
-def invert(H, dof_parent, out):
-    """Inverse of H (lower triangle, destroyed) into out; returns -1, or a degree of freedom without information of its own."""
-    n = H.shape[0]
-    own = np.empty(n)
-    for k in range(n):
-        own[k] = H[k, k]
-        if not own[k] > 0.0:
-            return k
-    if not factor_tree(H, dof_parent):
-        return 0
-    for k in range(n):
-        if 1.0 / (H[k, k] * H[k, k]) < 1e-10 * own[k]:
-            return k
-    for k in range(n):
-        for i in range(n):
-            out[k, i] = 0.0
-        out[k, k] = 1.0
-        solve_tree(H, dof_parent, out[k])
-    return -1
-
-
-@jit
 def joint_moves(frames, screws, rest, root, dof_parent, last_dof, moves):
     """moves (S, 3, n): derivative of every joint centre by every degree of freedom."""
     moves[:] = 0.0
@@ -399,37 +248,3 @@ def joint_moves(frames, screws, rest, root, dof_parent, last_dof, moves):
             m[1, d] = t[1] + t[5] * x - t[3] * z
             m[2, d] = t[2] + t[3] * y - t[4] * x
             d = dof_parent[d]
-
-
-@jit
-def eliminate(H, g, n, damping, dof_parent, S, b, both):
-    """Take n poses out of a joint system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
-
-    Leaves both (p + 1, n) = A⁻¹ [B, g] for the way back. A is damped by its own diagonal. False if not positive.
-    """
-    p = H.shape[0] - n
-    A = np.empty((n, n))
-    mean = 0.0
-    for i in range(n):
-        mean += H[i, i] / n
-    for i in range(n):
-        for j in range(i + 1):
-            A[i, j] = H[i, j]
-        A[i, i] += damping * (H[i, i] + 1e-6 * mean)
-    if not factor_tree(A, dof_parent):
-        return False
-    for q in range(p + 1):
-        for i in range(n):
-            both[q, i] = H[n + q, i] if q < p else g[i]
-        solve_tree(A, dof_parent, both[q])
-    for q in range(p):
-        for r in range(q + 1):
-            v = 0.0
-            for i in range(n):
-                v += H[n + q, i] * both[r, i]
-            S[q, r] -= v
-        v = 0.0
-        for i in range(n):
-            v += H[n + q, i] * both[p, i]
-        b[q] -= v
-    return True

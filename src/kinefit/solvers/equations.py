@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, Rows, sort_out
-from kinefit.solvers import _kernels
+from kinefit.solvers import _kernels, _kernels_linear
 from kinefit.solvers.losses import SQUARED, Loss
 
 
@@ -23,25 +23,33 @@ class Equations:
     body, state : what they are about.
     rows : Rows that went in.
     factor : (N,) robust factor of each row in 0..1.
-    lower : (n, n) lower triangle of H, in the pattern of `pattern`.
+    packed : (n, m) H in the pattern of chain and depth, see `_kernels_linear`.
     gradient : (n,) g = Σ Jᵀ W r.
     cost : float, Σ ρ(w r²) over all rows.
-    pattern : (n,) the next degree of freedom that each one meets in H.
+    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it where pair rows couple them.
     """
 
     body: Body
     state: BodyState
     rows: Rows
     factor: NDArray
-    lower: NDArray
+    packed: NDArray
     gradient: NDArray
     cost: float
-    pattern: NDArray
+    chain: NDArray
+    depth: NDArray
 
     @property
     def matrix(self) -> NDArray:
         """(n, n) H in full."""
-        return self.lower + np.tril(self.lower, -1).T
+        H = np.zeros((len(self.depth), len(self.depth)))
+        _kernels_linear.unpack(self.packed, self.chain, self.depth, H)
+        return H
+
+    @property
+    def diagonal(self) -> NDArray:
+        """(n,) of H."""
+        return self.packed[np.arange(len(self.depth)), self.depth]
 
 
 def normal_equations(
@@ -53,21 +61,25 @@ def normal_equations(
     n = tree.n_dofs
     _, screws = tree.forward(state.T_world_root, state.angles)
     centre = np.ascontiguousarray(state.T_world_root[:3, 3])
+    chain, depth = tree.chain, tree.depth
     factor, blocks = np.empty(len(rows)), np.empty((len(tree.segments), 27))
-    H, g = np.zeros((n, n)), np.empty(n)
+    C, g = np.empty(chain.shape), np.empty(n)
     cost = _kernels.assemble(
         rows.data, rows.segment, rows.group, len(rows), loss.kind, loss.scale, centre,
-        tree.parents, tree.dof_start, tree.dof_parent, screws, factor, blocks, H, g,
+        tree.parents, tree.dof_start, chain, depth, screws, factor, blocks, C, g,
     )  # fmt: skip
     for p in parameters:
-        cost += _kernels.add_parameters(p.index, p.residual, p.weight, H, g)
-    for q in pairs:
-        cost += _kernels.add_pairs(
-            q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
-            centre, screws, tree.dof_parent, tree.last_dof, H, g,
-        )  # fmt: skip
-    pattern = np.arange(-1, n - 1) if pairs else tree.dof_parent
-    return Equations(body, state, rows, factor, H, g, float(cost), pattern)
+        cost += _kernels.add_parameters(p.index, p.residual, p.weight, depth, C, g)
+    if pairs:
+        H = np.zeros((n, n))
+        _kernels_linear.unpack(C, chain, depth, H)
+        for q in pairs:
+            cost += _kernels.add_pairs(
+                q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
+                centre, screws, tree.dof_parent, tree.last_dof, H, g,
+            )  # fmt: skip
+        C, chain, depth = H, np.tile(np.arange(n), (n, 1)), np.arange(n)
+    return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
 def covariance(equations: Equations) -> NDArray:
@@ -75,12 +87,14 @@ def covariance(equations: Equations) -> NDArray:
 
     A degree of freedom counts as unobserved where its information, given all others, is below 1e-10 of its own.
     """
-    H, pattern = np.array(equations.lower), equations.pattern
-    n = len(H)
-    out = np.empty((n, n))
-    lost = np.zeros(n, bool)
-    while True:  # a free direction is found at one of its degrees of freedom, which is then taken out
-        found = _kernels.invert(np.where(lost[:, None] | lost[None, :], np.eye(n), H), pattern, out)
+    n = len(equations.depth)
+    out, lost = np.empty((n, n)), np.zeros(n, bool)
+    while True:  # a free direction is found at one of its degrees of freedom, then all that take part are taken out
+        C = np.array(equations.packed)
+        if lost.any():
+            H = np.where(lost[:, None] | lost[None, :], np.eye(n), equations.matrix)
+            _kernels_linear.pack(H, equations.chain, equations.depth, C)
+        found = _kernels_linear.invert(C, equations.chain, equations.depth, out)
         if found < 0:
             break
         lost |= _free_direction(equations.matrix, lost, found)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows
-from kinefit.solvers import _kernels
+from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Equations, normal_equations
 from kinefit.solvers.losses import SQUARED, Loss
 
@@ -49,16 +49,16 @@ class Step:
 
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
     n = len(eq.gradient)
-    L, delta = np.empty((n, n)), np.empty(n)
-    fall = _kernels.damped_step(
-        eq.lower, eq.gradient, damping, eq.pattern, eq.state.angles, bounds[0], bounds[1], locked, L, delta
-    )
+    L, delta = np.empty(eq.chain.shape), np.empty(n)
+    fall = _kernels_linear.damped_step(
+        eq.packed, eq.gradient, damping, eq.chain, eq.depth, eq.state.angles, bounds[0], bounds[1], locked, L, delta,
+    )  # fmt: skip
     return delta, fall
 
 
 def _moved(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -> BodyState:
     root, angles = np.empty((4, 4)), np.empty(len(state.angles))
-    _kernels.retract(state.T_world_root, state.angles, delta, bounds[0], bounds[1], root, angles)
+    _kernels_linear.retract(state.T_world_root, state.angles, delta, bounds[0], bounds[1], root, angles)
     return BodyState(root, angles)
 
 
@@ -96,7 +96,7 @@ def gauss_newton(
     """
     eq = normal_equations(body, state, rows, loss=loss)
     bounds, held = bounds_of(body, limits), lock(body, locked)
-    floor = 1e-12 * float(np.trace(eq.lower)) / len(eq.gradient) + 1e-300
+    floor = 1e-12 * float(eq.diagonal.mean()) + 1e-300
     damping = max(damping, floor)
     delta, fall = _step(eq, damping, bounds, held)
     while fall < 0:
@@ -135,18 +135,18 @@ def levenberg_marquardt(
     bounds, held = bounds_of(body, limits), lock(body, locked)
     state = _moved(state, np.zeros(body.tree.n_dofs), bounds)
     eq = normal_equations(body, state, make_rows(state), loss=loss)
-    mean = float(np.trace(eq.lower)) / len(eq.gradient) + 1e-300
+    mean = float(eq.diagonal.mean()) + 1e-300
     damping, growth = (1e-3 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
     for iteration in range(1, max_iterations + 1):
         delta, predicted = _step(eq, damping, bounds, held)
         if predicted < 0.0:
-            damping, growth = _kernels.adapt(damping, growth, -1.0, 1.0)
+            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0)
             continue
         if predicted <= tolerance * eq.cost + 1e-30:
             return Fit(state, eq, iteration, True, damping)
         candidate = _moved(state, delta, bounds)
         new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
-        damping, growth = _kernels.adapt(damping, growth, eq.cost - new.cost, predicted)
+        damping, growth = _kernels_linear.adapt(damping, growth, eq.cost - new.cost, predicted)
         if new.cost < eq.cost:
             state, eq = candidate, new
         elif damping > 1e16 * mean:

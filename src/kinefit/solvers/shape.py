@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
-from kinefit.solvers import _kernels, _kernels_shape
+from kinefit.solvers import _kernels_linear, _kernels_shape
 from kinefit.solvers.losses import Loss, geman_mcclure
 
 
@@ -169,7 +169,7 @@ def fit_shape(
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-            if not _kernels.eliminate(H, g, n, damping, tree.dof_parent, S, b, kept[f]):
+            if not _kernels_linear.eliminate(H, g, n, damping, tree.chain, tree.depth, S, b, kept[f]):
                 kept[f] = 0.0
         S += np.tril(S, -1).T - np.triu(S, 1) + damping * np.diag(np.diag(S))
         delta = np.linalg.solve(S, b)

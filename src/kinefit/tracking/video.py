@@ -22,6 +22,20 @@ from kinefit.tracking.tracker import FrameResult, Settings, Tracker
 Progress = Callable[[str, int, int], None]
 
 
+class TrackingInterrupted(KeyboardInterrupt):
+    """Ctrl-C while frames were being tracked; what is done is kept.
+
+    Parameters
+    ----------
+    motion : Motion of the frames done, from the first one on.
+    total : int, how many frames there are.
+    """
+
+    def __init__(self, motion: Motion, total: int) -> None:
+        super().__init__(f"{len(motion)} of {total} frames are tracked")
+        self.motion, self.total = motion, total
+
+
 @dataclass(frozen=True, eq=False)
 class Subject:
     """A body fitted to a person: its lengths, and where on it the detectors' points sit."""
@@ -63,6 +77,8 @@ def track(
     ------
     TrackingError
         Nobody can be found, or no frame shows enough of the person.
+    TrackingInterrupted
+        Ctrl-C after at least one tracked frame.
     """
     if not keypoints:
         raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
@@ -76,7 +92,10 @@ def track(
         subject = fit_subject(body, channels, frames=shape_frames, progress=progress)
     channels = channels.with_points(subject.body)
     results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
-    return _motion(subject.body, channels, results, keypoints[0], up, name)
+    motion = _motion(subject.body, channels, results, keypoints[0], up, name)
+    if len(motion) < len(channels.uv):
+        raise TrackingInterrupted(motion, len(channels.uv))
+    return motion
 
 
 def fit_subject(body: Body, channels: Channels, *, frames: int = 25, progress: Progress | None = None) -> Subject:
@@ -131,12 +150,17 @@ def _swap_free(channels: Channels, body: Body, points: object, states: list, fra
 
 
 def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> list[FrameResult | None]:
+    """Results of all frames; of fewer where Ctrl-C came once the person had been found."""
     total = len(channels.uv)
     results: list[FrameResult | None] = []
-    for f in range(total):
-        results.append(tracker.update(channels.uv[f], channels.confidence[f]))
-        if progress:
-            progress("frames", f + 1, total)
+    try:
+        for f in range(total):
+            results.append(tracker.update(channels.uv[f], channels.confidence[f]))
+            if progress:
+                progress("frames", f + 1, total)
+    except KeyboardInterrupt:
+        if not any(r is not None for r in results):
+            raise
     first = next((f for f, r in enumerate(results) if r is not None), None)
     if first is None:
         raise TrackingError("the body was found in no frame", remedy="Check the calibration and the keypoints.")
@@ -172,7 +196,7 @@ def _motion(
     return Motion(
         body=body,
         rate=record.rate,
-        times=record.times,
+        times=record.times[: len(frames)],
         Ts_world_root=np.stack([r.state.T_world_root for r in frames]),
         angles=np.stack([r.state.angles for r in frames]),
         dof_std=np.stack([r.dof_std for r in frames]),

@@ -1,0 +1,104 @@
+"""Results into a folder: every format, overlay videos, a picture of all cameras."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kinefit.cli._screen import Step
+from kinefit.errors import ExportError
+
+if TYPE_CHECKING:
+    from kinefit.motion import Motion, Residuals
+    from kinefit.readers.load import Observations
+    from kinefit.readers.take import Take
+
+NAMES = {
+    "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
+    "mot": "motion.mot", "osim": "body.osim", "parquet": "tables",
+}  # fmt: skip
+"""What each format is called in a folder of results."""
+
+USUAL = tuple(name for name in NAMES if name != "parquet")
+"""Formats that are written where none are named."""
+
+ABOUT = {
+    "motion": "everything, for kinefit export and kinefit.read_motion",
+    "csv": "tables of angles, joint centres, landmarks, quality, residuals",
+    "parquet": "the same tables as Parquet",
+    "bvh": "animated skeleton for animation programs",
+    "glb": "animated figure for browsers and game engines",
+    "trc": "landmarks over time for OpenSim",
+    "mot": "angles over time for OpenSim",
+    "osim": "the fitted body for OpenSim",
+    "overlays": "videos with the skeleton drawn on them",
+    "montage": "one picture of all cameras",
+}
+"""What each is for."""
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that cannot be written, before anything is computed; make nothing."""
+    there = folder.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise ExportError("a file of that name is in the way", file=there, remedy="Name another folder by --out.")
+    if not os.access(there, os.W_OK):
+        raise ExportError("this folder cannot be written", file=there, remedy="Name another folder by --out.")
+
+
+def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
+    """Write a motion in one of the formats of `NAMES`; options are those of its exporter."""
+    from kinefit import exporters
+
+    writers: dict[str, Callable[..., Any]] = {
+        "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
+        "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
+        "mot": exporters.write_mot, "osim": lambda motion, path: exporters.write_osim(motion.body, path),
+    }  # fmt: skip
+    writers[format](motion, path, **options)
+
+
+def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step) -> dict[str, Path]:
+    """Write a motion in several formats; returns what lies where."""
+    formats = tuple(formats)
+    for number, format in enumerate(formats):
+        step("results", number, len(formats))
+        write_format(motion, format, folder / NAMES[format])
+    step("results", len(formats), len(formats))
+    return {format: folder / NAMES[format] for format in formats}
+
+
+def write_overlays(motion: Motion, take: Take, seen: Observations, folder: Path, step: Step) -> dict[str, Path]:
+    """Write an overlay video of every camera that has a video, and a picture of all; returns what lies where."""
+    from kinefit.exporters import draw_overlay, write_montage, write_overlay
+    from kinefit.exporters.overlay import nearest_frame
+    from kinefit.readers.video import Video
+
+    if not seen.videos or seen.rig is None:
+        return {}
+    pictures, middle = {}, motion.times[len(motion) // 2]
+    for name, path in seen.videos.items():
+        offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+        with Video(path) as video:
+            shown = min(max(round((middle - offset) * video.rate), 0), len(video) - 1)
+            at = nearest_frame(motion, shown / video.rate + offset)
+            pictures[name] = draw_overlay(video.read(shown), motion, at, seen.rig[name], **given)
+            bar, count = f"overlay {name}", len(video)
+            step(bar, 0, count)
+            write_overlay(
+                motion, seen.rig[name], video, folder / "overlays" / f"{name}.mp4", time_offset=offset,
+                progress=lambda done: step(bar, done, count), **given,  # noqa: B023
+            )  # fmt: skip
+    write_montage(pictures, folder / "montage.png")
+    return {"overlays": folder / "overlays", "montage": folder / "montage.png"}
+
+
+def _residuals(motion: Motion, camera: str) -> Residuals | None:
+    """Of a camera; of the first of its detectors where it has several."""
+    labels = [label for label in motion.residuals if label == camera or label.startswith(f"{camera} ")]
+    return motion.residuals[labels[0]] if labels else None

@@ -1,0 +1,114 @@
+"""What the commands show: results on stdout; progress, notes and errors on stderr."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kinefit import __version__
+from kinefit.errors import KinefitError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Step = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
+
+_VERBOSE = "kinefit.verbose"
+
+
+def verbose_option(command: Callable) -> Callable:
+    """Add `-v` to a command."""
+
+    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> bool:
+        ctx.meta[_VERBOSE] = value
+        return value
+
+    text = "Show more: the points of every camera, and where an error arose."
+    return click.option("-v", "--verbose", is_flag=True, callback=remember, help=text)(command)
+
+
+def is_verbose() -> bool:
+    """Whether the command that runs was given `-v`."""
+    ctx = click.get_current_context(silent=True)
+    return bool(ctx and ctx.find_root().meta.get(_VERBOSE))
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Where to print; colours only on a terminal."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, highlight=False)
+
+
+def say(text: str = "", *, style: str = "", stderr: bool = False) -> None:
+    """Print a line as it stands: never wrapped or taken for markup, as it may hold a path."""
+    from rich.text import Text
+
+    console(stderr=stderr).print(Text(text, style=style), soft_wrap=True)
+
+
+def note(text: str) -> None:
+    """Print a line on stderr."""
+    say(text, stderr=True)
+
+
+def _complain(problem: str, **lines: str) -> None:
+    from rich.text import Text
+
+    text = Text.assemble(("error: ", "bold red"), problem)
+    for name, line in lines.items():
+        if line:
+            text.append_text(Text.assemble(f"\n{name:>6} ", (line, "bold" if name == "at" else "")))
+    console(stderr=True).print(text, soft_wrap=True)
+
+
+def _traceback(error: BaseException) -> None:
+    import traceback
+
+    click.echo("".join(traceback.format_exception(error)), err=True)
+
+
+def tell_error(error: KinefitError) -> None:
+    """Say what is wrong with the input, where, and what would work."""
+    where = ", ".join(str(part) for part in (error.file, error.place) if part)
+    _complain(error.problem, **{"at": where, "try": error.remedy or ""})
+    if is_verbose():
+        _traceback(error)
+
+
+def tell_interrupted(told: str) -> None:
+    """Say that Ctrl-C came, and what is there."""
+    note(f"Stopped. {told}" if told else "Stopped before any result was there; nothing was left behind.")
+
+
+def tell_bug(error: Exception) -> None:
+    """Say that something went wrong that is not the user's fault."""
+    import platform
+
+    versions = f"kinefit {__version__}, Python {platform.python_version()}, {platform.platform()}"
+    remedy = "Run the same with -v for the traceback; send it with the take file to those who keep kinefit"
+    if is_verbose():
+        _traceback(error)
+        remedy = "Send this traceback with the take file to those who keep kinefit"
+    _complain(f"a fault of kinefit's own: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
+
+
+@contextmanager
+def bars() -> Iterator[Step]:
+    """Progress bars on stderr, one for each thing that is done."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:<14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks: dict[str, Any] = {}
+    with Progress(*columns, console=console(stderr=True)) as progress:
+
+        def step(what: str, done: int, total: int) -> None:
+            if what not in tasks:
+                tasks[what] = progress.add_task(what, total=total or None)
+            progress.update(tasks[what], completed=done, total=total or None)
+
+        yield step

@@ -1,0 +1,104 @@
+"""The summary of a motion: how well every camera agrees, what was lost, how long the bones are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kinefit.cli._results import ABOUT
+from kinefit.cli._screen import console, say
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.motion import Motion, Residuals
+
+DOUBTFUL = 0.5  # quality below which a frame is named
+OUTLIER = 0.3  # robust weight below which a point counts as left out
+_UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
+
+
+def print_summary(motion: Motion, *, points: bool = False) -> None:
+    """Print it; with `points`, the residual of every point in every camera too."""
+    from rich.table import Table
+
+    seconds = len(motion) / motion.rate
+    say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
+    table = Table("sensor", "median residual", "points left out", "left/right put right", box=None, pad_edge=False)
+    for name, r in motion.residuals.items():
+        table.add_row(name, _median(r), f"{100 * _left_out(r):.1f} %", f"{int(r.swapped.sum())} frames")
+    if motion.residuals:
+        console().print(table)
+    worst = int(np.argmin(motion.quality))
+    say(f"quality: {motion.quality.mean():.2f} of 1 on average, lowest {motion.quality[worst]:.2f} in frame {worst}")
+    doubtful = np.flatnonzero(motion.quality < DOUBTFUL)
+    say(f"doubtful frames: {frame_ranges(doubtful)}" if len(doubtful) else "doubtful frames: none")
+    for name, lost in lost_segments(motion).items():
+        say(f"lost: {name} in frames {frame_ranges(lost)}")
+    lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
+    say("bone lengths [cm]: " + ", ".join(lengths))
+    if points:
+        _print_points(motion)
+
+
+def print_files(files: Mapping[str, Path]) -> None:
+    """Print what lies where."""
+    say("\nWritten:")
+    width = max((len(str(path)) for path in files.values()), default=0)
+    for format, path in files.items():
+        say(f"  {str(path):<{width}}  {ABOUT[format]}")
+
+
+def frame_ranges(frames: NDArray) -> str:
+    """Frames as "3, 7-9"."""
+    parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    told = [f"{p[0]}" if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts if len(p)]
+    return ", ".join(told[:12]) + (f" and {len(told) - 12} more stretches" if len(told) > 12 else "")
+
+
+def lost_segments(motion: Motion) -> dict[str, NDArray]:
+    """Segments that no measurement supports, and in which frames."""
+    lost = {name: np.flatnonzero(motion.segment_quality[:, s] <= 0) for s, name in enumerate(motion.body.tree.segments)}
+    return {name: frames for name, frames in lost.items() if len(frames)}
+
+
+def bone_lengths(motion: Motion) -> dict[str, str]:
+    """Distances [cm] from joint to joint, one for left and right where they are alike."""
+    body, found = motion.body, {}
+    for child, parent in enumerate(body.tree.parents):
+        length = float(np.linalg.norm(body.tree.offsets[child]))
+        if parent >= 0 and length > 1e-6:
+            ends = (body.joints[parent].removeprefix("ground_"), body.joints[child])
+            name = " to ".join(e[:-2] if e.endswith(("_l", "_r")) else e for e in ends)
+            found.setdefault(name, {})[f"{100 * length:.1f}"] = None
+    return {name: "/".join(values) for name, values in found.items()}
+
+
+def _median(r: Residuals) -> str:
+    factor, unit = _UNITS[r.unit]
+    seen = np.isfinite(r.norms)
+    return f"{factor * np.median(r.norms[seen]):.1f} {unit}" if seen.any() else "nothing seen"
+
+
+def _left_out(r: Residuals) -> float:
+    seen = np.isfinite(r.norms)
+    return float(np.mean(np.asarray(r.weights)[seen] < OUTLIER)) if seen.any() else 0.0
+
+
+def _print_points(motion: Motion) -> None:
+    from rich.table import Table
+
+    names = list(dict.fromkeys(name for r in motion.residuals.values() for name in r.names))
+    table = Table("median residual of", *motion.residuals, box=None, pad_edge=False)
+    for name in names:
+        cells = []
+        for r in motion.residuals.values():
+            norms = r.norms[:, r.names.index(name)] if name in r.names else np.zeros(0)
+            seen = norms[np.isfinite(norms)]
+            cells.append(f"{_UNITS[r.unit][0] * np.median(seen):.1f} {_UNITS[r.unit][1]}" if len(seen) else "-")
+        table.add_row(name, *cells)
+    say()
+    console().print(table)

@@ -1,0 +1,44 @@
+"""`kinefit retarget`: a recorded skeleton's motion on the humanoid."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _screen
+
+
+@click.command(short_help="Put a recorded motion (BVH, ASF/AMC) onto the humanoid.")
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton of an .amc file; needed there.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Motion file.  [default: RECORDING with .npz]")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: as recorded]")
+@_screen.verbose_option
+def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
+    """Put a recorded motion onto the humanoid, by the directions of its bones.
+
+    \b
+    Examples:
+      kinefit retarget walk.bvh
+      kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
+      kinefit export walk.npz --to glb
+    """
+    from kinefit.exporters import write_motion
+    from kinefit.readers.amc import read_amc
+    from kinefit.readers.bvh import read_bvh
+    from kinefit.simulation import retarget as retarget_motion
+
+    suffix = recording.suffix.lower()
+    if suffix not in (".bvh", ".amc"):
+        raise click.BadParameter(f"'{recording.name}' ends neither in .bvh nor in .amc.", param_hint="RECORDING")
+    if (asf is not None) != (suffix == ".amc"):
+        raise click.UsageError("An .amc file needs its skeleton, --asf FILE; a .bvh file takes none.")
+    out = out or recording.with_suffix(".npz")
+    skeleton = read_amc(asf, recording) if asf else read_bvh(recording)
+    with _screen.bars() as step:
+        step("retargeting", 0, 0)
+        motion = retarget_motion(skeleton, rate=rate)
+        step("retargeting", len(motion), len(motion))
+        write_motion(motion, out)
+    _screen.say(f"{out}: {len(motion)} frames at {motion.rate:g} Hz of the body {motion.body.name}")

@@ -1,0 +1,75 @@
+"""`kinefit track`: a take file becomes a folder of results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _results, _screen
+
+
+def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    """Formats of a list such as "bvh,csv"."""
+    formats = tuple(dict.fromkeys(part.strip().lower() for part in value.split(",") if part.strip()))
+    for name in formats:
+        if name not in _results.NAMES:
+            raise click.BadParameter(f"there is no format '{name}'; there are: {', '.join(_results.NAMES)}")
+    return formats
+
+
+@click.command(short_help="Track the person of a take file and write all results.")
+@click.argument("take", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results.  [default: TAKE-kinefit]")
+@click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video.")
+@click.option(
+    "--formats", default=",".join(_results.USUAL), show_default=True, callback=chosen_formats, metavar="LIST",
+    help="What to write; parquet is there too.",
+)
+@_screen.verbose_option
+@click.pass_context
+def track(ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], verbose: bool) -> None:
+    """Track the person of a take file and write all results.
+
+    TAKE is one TOML file that names calibration, cameras, videos and keypoints: see docs/take-file.md; `kinefit demo`
+    leaves a complete one to copy. Ctrl-C stops the tracking and writes the frames that are done.
+
+    \b
+    Examples:
+      kinefit track my_take/take.toml
+      kinefit track take.toml --out results --no-overlays --formats bvh,csv
+      kinefit track take.toml -v            also how well every point of every camera fits
+    """
+    out = out or take.with_name(f"{take.stem}-kinefit")
+    ctx.exit(run(take, out, overlays=overlays, formats=formats, verbose=verbose))
+
+
+def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verbose: bool) -> int:
+    """Track a take and write what comes of it; returns the exit code."""
+    from kinefit.cli._summary import print_files, print_summary
+    from kinefit.readers.take import read_take
+    from kinefit.tracking.take import track_take
+    from kinefit.tracking.video import TrackingInterrupted
+
+    take = read_take(path)
+    _results.check_folder(out)
+    try:
+        with _screen.bars() as step:
+            step("reading", 0, 0)
+            motion, seen = track_take(take, progress=lambda *told: (step("reading", 1, 1), step(*told))[1])
+            files = _results.write_results(motion, out, formats, step)
+            if overlays:
+                files |= _results.write_overlays(motion, take, seen, out, step)
+    except TrackingInterrupted as stopped:
+        with _screen.bars() as step:
+            files = _results.write_results(stopped.motion, out, formats, step)
+        print_summary(stopped.motion, points=verbose)
+        print_files(files)
+        _screen.tell_interrupted(
+            f"{len(stopped.motion)} of {stopped.total} frames are done and written; bone lengths are final, "
+            "overlay videos were not begun."
+        )
+        return 130
+    print_summary(motion, points=verbose)
+    print_files(files)
+    return 0

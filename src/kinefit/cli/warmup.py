@@ -1,0 +1,33 @@
+"""`kinefit warmup`: compile the kernels before they are needed."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import click
+
+from kinefit.cli import _screen
+
+
+@click.command(short_help="Compile the kernels now, so that the first track does not wait.")
+@_screen.verbose_option
+def warmup(verbose: bool) -> None:
+    """Compile the kernels now, so that the first track does not wait; they are kept for later runs.
+
+    \b
+    Examples:
+      kinefit warmup
+      KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
+    """
+    begin = perf_counter()
+    with _screen.bars() as step:
+        step("compiling", 0, 1)
+        from kinefit._jit import cache_directory
+        from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+        from kinefit.tracking.video import track
+
+        motion = cut(squat_and_wave(), 0, 4)
+        rig = studio_rig(motion)
+        track(rig, simulate_keypoints(motion, rig, "BODY_25B"), motion.body, up=motion.up)
+        step("compiling", 1, 1)
+    _screen.say(f"ready after {perf_counter() - begin:.1f} s; the kernels lie in {cache_directory() / 'kernels'}")

@@ -1,0 +1,200 @@
+"""Linear algebra of a tree: packing, factors, damped steps, elimination.
+
+The tree makes H sparse: two degrees of freedom meet only when one is above the other. Row k of the packed matrix C holds
+H[k, chain[k, t]] for t = 0..depth[k], from the root down to k itself, where `chain` (n, m) lists what stands above each
+degree of freedom. The factorisation H = Lᵀ L keeps that pattern (Featherstone 2005), and since the chain of an ancestor
+is the start of one's own, every inner loop runs over neighbours in memory. Chains 0..k make the same code dense.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+
+
+@jit
+def pack(H, chain, depth, C):
+    """Lower triangle of H (n, n) into C (n, m)."""
+    for k in range(depth.size):
+        for t in range(depth[k] + 1):
+            C[k, t] = H[k, chain[k, t]]
+
+
+@jit
+def unpack(C, chain, depth, H):
+    """C (n, m) into H (n, n), both triangles; H must be zero where nothing meets."""
+    for k in range(depth.size):
+        for t in range(depth[k] + 1):
+            H[k, chain[k, t]] = C[k, t]
+            H[chain[k, t], k] = C[k, t]
+
+
+@jit
+def factor_tree(C, chain, depth):
+    """H = Lᵀ L in place; the diagonal is left inverted. False if H is not positive."""
+    for k in range(depth.size - 1, -1, -1):
+        row, d = C[k], depth[k]
+        if not row[d] > 0.0:
+            return False
+        inverse = 1.0 / math.sqrt(row[d])
+        row[d] = inverse
+        for t in range(d):
+            row[t] *= inverse
+        for t in range(d):
+            above, h = C[chain[k, t]], row[t]
+            for s in range(t + 1):
+                above[s] -= h * row[s]
+    return True
+
+
+@jit
+def solve_tree(L, chain, depth, x):
+    """Solve Lᵀ L x = b in place, with L from `factor_tree`."""
+    n = depth.size
+    for k in range(n - 1, -1, -1):
+        row, d = L[k], depth[k]
+        v = x[k] * row[d]
+        x[k] = v
+        for t in range(d):
+            x[chain[k, t]] -= row[t] * v
+    for k in range(n):
+        row, d = L[k], depth[k]
+        v = x[k]
+        for t in range(d):
+            v -= row[t] * x[chain[k, t]]
+        x[k] = v * row[d]
+
+
+@jit
+def hold(angles, lower, upper, locked, chain, depth, C, g):
+    """Take degrees of freedom out of a step: locked ones, and those at a limit that the gradient pushes out of."""
+    n = g.size
+    for k in range(n):
+        stop = locked[k]
+        if k >= 6 and not stop:
+            d = k - 6
+            stop = (angles[d] <= lower[d] and g[k] < 0.0) or (angles[d] >= upper[d] and g[k] > 0.0)
+        if stop:
+            t = depth[k]
+            g[k] = 0.0
+            for i in range(t):
+                C[k, i] = 0.0
+            C[k, t] = 1.0
+            for i in range(k + 1, n):
+                if depth[i] > t and chain[i, t] == k:
+                    C[i, t] = 0.0
+
+
+@jit
+def retract(root, angles, delta, lower, upper, new_root, new_angles):
+    """State moved by δ: root's twist in the world about its origin, then angles, kept within their limits."""
+    wx, wy, wz = delta[3], delta[4], delta[5]
+    t2 = wx * wx + wy * wy + wz * wz
+    if t2 < 1e-8:
+        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
+    else:
+        t = math.sqrt(t2)
+        half = math.sin(0.5 * t)
+        a, b = math.sin(t) / t, 2.0 * half * half / t2
+    for j in range(3):
+        x, y, z = root[0, j], root[1, j], root[2, j]
+        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        new_root[0, j] = x + a * cx + b * (wy * cz - wz * cy)
+        new_root[1, j] = y + a * cy + b * (wz * cx - wx * cz)
+        new_root[2, j] = z + a * cz + b * (wx * cy - wy * cx)
+    for i in range(3):
+        new_root[i, 3] = root[i, 3] + delta[i]
+        new_root[3, i] = 0.0
+    new_root[3, 3] = 1.0
+    for d in range(angles.size):
+        q = angles[d] + delta[6 + d]
+        q = lower[d] if q < lower[d] else q
+        new_angles[d] = upper[d] if q > upper[d] else q
+
+
+@jit
+def damped_step(C, g, damping, chain, depth, angles, lower, upper, locked, L, delta):
+    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if H + λ is not positive."""
+    n = g.size
+    for i in range(n):
+        for t in range(depth[i] + 1):
+            L[i, t] = C[i, t]
+        delta[i] = g[i]
+    hold(angles, lower, upper, locked, chain, depth, L, delta)
+    for i in range(n):
+        L[i, depth[i]] += damping
+    if not factor_tree(L, chain, depth):
+        return -1.0
+    solve_tree(L, chain, depth, delta)
+    fall = 0.0
+    for i in range(n):
+        fall += delta[i] * (g[i] + damping * delta[i])
+    return fall
+
+
+@jit
+def adapt(damping, growth, fall, predicted):
+    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule)."""
+    if not fall > 0.0:
+        return damping * growth, 2.0 * growth
+    gain = 2.0 * fall / predicted - 1.0
+    shrink = 1.0 - gain * gain * gain
+    return damping * (shrink if shrink > 0.1 else 0.1), 2.0
+
+
+@jit
+def invert(C, chain, depth, out):
+    """Inverse (n, n) of H (packed, destroyed); returns -1, or a degree of freedom without information of its own."""
+    n = depth.size
+    own = np.empty(n)
+    for k in range(n):
+        own[k] = C[k, depth[k]]
+        if not own[k] > 0.0:
+            return k
+    if not factor_tree(C, chain, depth):
+        return 0
+    for k in range(n):
+        if not 1.0 / (C[k, depth[k]] * C[k, depth[k]]) > 1e-10 * own[k]:
+            return k
+    for k in range(n):
+        for i in range(n):
+            out[k, i] = 0.0
+        out[k, k] = 1.0
+        solve_tree(C, chain, depth, out[k])
+    return -1
+
+
+@jit
+def eliminate(H, g, n, damping, chain, depth, S, b, both):
+    """Take n poses out of a joint system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
+
+    Leaves both (p + 1, n) = A⁻¹ [B, g] for the way back. A is damped by its own diagonal. False if not positive.
+    """
+    p = H.shape[0] - n
+    A = np.empty(chain.shape)
+    pack(H, chain, depth, A)
+    mean = 0.0
+    for i in range(n):
+        mean += H[i, i] / n
+    for i in range(n):
+        A[i, depth[i]] += damping * (H[i, i] + 1e-6 * mean)
+    if not factor_tree(A, chain, depth):
+        return False
+    for q in range(p + 1):
+        for i in range(n):
+            both[q, i] = H[n + q, i] if q < p else g[i]
+        solve_tree(A, chain, depth, both[q])
+    for q in range(p):
+        for r in range(q + 1):
+            v = 0.0
+            for i in range(n):
+                v += H[n + q, i] * both[r, i]
+            S[q, r] -= v
+        v = 0.0
+        for i in range(n):
+            v += H[n + q, i] * both[p, i]
+        b[q] -= v
+    return True

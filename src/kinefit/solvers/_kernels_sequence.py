@@ -1,0 +1,87 @@
+"""A whole sequence of frames in one call: points and planes on a body, Levenberg-Marquardt frame after frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kinefit._jit import jit
+from kinefit.bodies._kernels import forward
+from kinefit.correspondences._kernels import plane_rows, point_rows
+from kinefit.solvers._kernels import assemble
+from kinefit.solvers._kernels_linear import adapt, damped_step, retract
+
+
+@jit
+def fit_sequence(
+    parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
+    owner, rest, target, weight, plane_owner, plane_rest, plane_target, plane_normal, plane_weight,
+    kind, scale, max_iterations, tolerance, damping_share, roots, angles, costs, iterations,
+):  # fmt: skip
+    """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
+
+    owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes likewise with plane_normal (F, P, 3).
+    roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the mean
+    diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than `tolerance` of
+    the cost ends a frame.
+    """
+    n_segments, n_angles = parents.size, axes.shape[0]
+    n = n_angles + 6
+    size = 3 * owner.size + plane_owner.size
+    data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
+    factor, blocks = np.empty(size), np.empty((n_segments, 27))
+    frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
+    H, g, other_H, other_g = np.empty(chain.shape), np.empty(n), np.empty(chain.shape), np.empty(n)
+    L, delta = np.empty(chain.shape), np.empty(n)
+    root, q = roots[0].copy(), angles[0].copy()
+    new_root, new_q = np.empty((4, 4)), np.empty(n_angles)
+    damping, growth = -1.0, 2.0
+    for f in range(roots.shape[0]):
+        delta[:] = 0.0
+        retract(root, q, delta, lower, upper, root, q)
+        cost, predicted, count = 0.0, 0.0, 0
+        used = 0
+        for attempt in range(max_iterations + 1):
+            first = attempt == 0
+            trial_root, trial_q = (root, q) if first else (new_root, new_q)
+            forward(parents, dof_start, prismatic, axes, rest_joints, trial_root, trial_q, frames, screws)
+            count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
+            count = plane_rows(
+                frames, plane_owner, plane_rest, plane_target[f], plane_normal[f], plane_weight[f], owner.size,
+                data, segment, group, count,
+            )  # fmt: skip
+            new_cost = assemble(
+                data, segment, group, count, kind, scale, trial_root[:3, 3], parents, dof_start, chain, depth, screws,
+                factor, blocks, other_H, other_g,
+            )  # fmt: skip
+            if first:
+                cost = new_cost
+                H, other_H, g, other_g = other_H, H, other_g, g
+                if damping < 0.0:
+                    damping = 0.0
+                    for i in range(n):
+                        damping += damping_share * H[i, depth[i]] / n
+            else:
+                damping, growth = adapt(damping, growth, cost - new_cost, predicted)
+                if new_cost < cost:
+                    cost = new_cost
+                    H, other_H, g, other_g = other_H, H, other_g, g
+                    root, new_root, q, new_q = new_root, root, new_q, q
+            used = attempt
+            if attempt == max_iterations:
+                break
+            predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
+            while predicted < 0.0:
+                damping = 10.0 * damping + 1e-12
+                predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
+            retract(root, q, delta, lower, upper, new_root, new_q)
+            if predicted <= tolerance * cost + 1e-30:
+                break  # not worth another look: the model holds this close, so the step is taken as it is
+        if predicted <= tolerance * cost + 1e-30 and predicted > 0.0:
+            root, new_root, q, new_q = new_root, root, new_q, q
+            cost -= predicted
+        for i in range(4):
+            for j in range(4):
+                roots[f, i, j] = root[i, j]
+        for i in range(n_angles):
+            angles[f, i] = q[i]
+        costs[f], iterations[f] = cost, used

@@ -1,0 +1,109 @@
+"""Fast fits of whole sequences: markers and tangent planes, frame after frame, in one compiled call."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.errors import ObservationError
+from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
+from kinefit.solvers.least_squares import bounds_of, lock
+from kinefit.solvers.losses import SQUARED, Loss
+
+_NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """Tangent planes for points of a body: P points over F frames.
+
+    Parameters
+    ----------
+    points : PointSet of P points.
+    x_world : (F, P, 3) [m] a point of each plane; NaN for none.
+    normal : (F, P, 3) unit normals.
+    sigma : float [m]
+    """
+
+    points: PointSet
+    x_world: NDArray
+    normal: NDArray
+    sigma: float = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Fitted frames: roots (F, 4, 4), angles (F, D), cost Σ ρ (F,) and iterations (F,)."""
+
+    Ts_world_root: NDArray
+    angles: NDArray
+    costs: NDArray
+    iterations: NDArray
+
+
+def fit_sequence(
+    body: Body,
+    start: BodyState,
+    points: PointSet = _NO_POINTS,
+    x_world: ArrayLike | None = None,
+    *,
+    sigma: ArrayLike = 0.005,
+    planes: Planes | None = None,
+    loss: Loss = SQUARED,
+    limits: bool = True,
+    locked: NDArray | None = None,
+    damping: float = 1e-3,
+    max_iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> Sequence:
+    """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).
+
+    The same minimum as `levenberg_marquardt` with `point_rows` and `plane_rows`, without its calls from Python.
+
+    Parameters
+    ----------
+    points : PointSet of K points on the body.
+    x_world : (F, K, 3) [m]
+        Where they were measured; NaN for one that was not.
+    sigma : scalar or (K,) [m]
+    planes : Planes
+        Tangent planes for other points, as well or instead.
+    damping : float
+        First λ as a share of H's mean diagonal.
+    tolerance : float
+        A frame ends when its next step is predicted to lower the cost by less than this share.
+    """
+    tree = body.tree
+    count = len(planes.x_world) if x_world is None and planes is not None else len(np.asarray(x_world))
+    x = np.zeros((count, 0, 3)) if x_world is None else np.array(x_world, float, order="C")
+    if x.shape != (count, len(points), 3):
+        raise ObservationError(f"measured points have shape {x.shape}", remedy=f"Give (frames, {len(points)}, 3).")
+    seen = np.isfinite(x).all(axis=2)
+    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    order = np.argsort(points.segments, kind="stable")  # rows of one segment in one run
+    p = planes or Planes(_NO_POINTS, np.zeros((count, 0, 3)), np.zeros((count, 0, 3)))
+    if p.x_world.shape != p.normal.shape or p.x_world.shape != (count, len(p.points), 3):
+        raise ObservationError(
+            f"planes have shapes {p.x_world.shape} and {p.normal.shape}", remedy=f"Give ({count}, {len(p.points)}, 3)."
+        )
+    tangent = np.isfinite(p.x_world).all(axis=2) & np.isfinite(p.normal).all(axis=2)
+    p_order = np.argsort(p.points.segments, kind="stable")
+    lower, upper = bounds_of(body, limits)
+    roots, angles = np.empty((count, 4, 4)), np.empty((count, len(tree.coordinates)))
+    if count:
+        roots[0], angles[0] = start.T_world_root, start.angles
+    costs, iterations = np.empty(count), np.empty(count, np.int64)
+    _fit_sequence(
+        tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest, lower, upper,
+        lock(body, locked), points.segments[order], body.points_rest(points)[order],
+        np.ascontiguousarray(np.nan_to_num(x[:, order])), np.ascontiguousarray(weight[:, order]),
+        p.points.segments[p_order], body.points_rest(p.points)[p_order],
+        np.ascontiguousarray(np.nan_to_num(p.x_world[:, p_order])),
+        np.ascontiguousarray(np.nan_to_num(p.normal[:, p_order])),
+        np.ascontiguousarray(np.where(tangent, 1.0 / p.sigma**2, 0.0)[:, p_order]),
+        loss.kind, loss.scale, max_iterations, tolerance, damping, roots, angles, costs, iterations,
+    )  # fmt: skip
+    return Sequence(roots, angles, costs, iterations)
