@@ -52,12 +52,12 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
             sine = np.sin(q)
             half = np.sin(0.5 * q)
             versine = 2.0 * half * half
-            for j in range(3):  # columns: R c = c + sin (w × c) + (1 − cos) (w (w·c) − c)
-                c0, c1, c2 = f[j], f[3 + j], f[6 + j]
-                dot = wx * c0 + wy * c1 + wz * c2
-                f[j] = c0 + sine * (wy * c2 - wz * c1) + versine * (wx * dot - c0)
-                f[3 + j] = c1 + sine * (wz * c0 - wx * c2) + versine * (wy * dot - c1)
-                f[6 + j] = c2 + sine * (wx * c1 - wy * c0) + versine * (wz * dot - c2)
+            for i in range(0, 9, 3):  # rows of R exp(q â), with a as it is at rest: w's rounding would grow along a chain
+                r0, r1, r2 = f[i], f[i + 1], f[i + 2]
+                dot = r0 * ax + r1 * ay + r2 * az
+                f[i] = r0 + sine * (r1 * az - r2 * ay) + versine * (ax * dot - r0)
+                f[i + 1] = r1 + sine * (r2 * ax - r0 * az) + versine * (ay * dot - r1)
+                f[i + 2] = r2 + sine * (r0 * ay - r1 * ax) + versine * (az * dot - r2)
             f[9] = ox - (f[0] * px + f[1] * py + f[2] * pz)
             f[10] = oy - (f[3] * px + f[4] * py + f[5] * pz)
             f[11] = oz - (f[6] * px + f[7] * py + f[8] * pz)

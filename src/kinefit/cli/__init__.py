@@ -14,7 +14,6 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 COMMANDS = ("demo", "track", "export", "retarget", "warmup")
-INTERRUPTED = 130
 
 
 class _Commands(click.Group):
@@ -41,7 +40,7 @@ class _Commands(click.Group):
             code = error.exit_code
         except KeyboardInterrupt as error:
             _screen.tell_interrupted(str(error))
-            code = INTERRUPTED
+            code = _screen.INTERRUPTED
         except Exception as error:
             _screen.tell_bug(error)
             code = 1
@@ -51,7 +50,7 @@ class _Commands(click.Group):
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(__version__, "-V", "--version")
 def main() -> None:
-    """Fit one articulated body to whatever the sensors saw.
+    r"""Fit one articulated body to whatever the sensors saw.
 
     \b
     Examples:

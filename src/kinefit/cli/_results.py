@@ -62,24 +62,26 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
     writers[format](motion, path, **options)
 
 
-def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step) -> dict[str, Path]:
-    """Write a motion in several formats; returns what lies where."""
+def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:
+    """Write a motion in several formats; enter into `files` what is there, one after the other."""
     formats = tuple(formats)
     for number, format in enumerate(formats):
         step("results", number, len(formats))
         write_format(motion, format, folder / NAMES[format])
+        files[format] = folder / NAMES[format]
     step("results", len(formats), len(formats))
-    return {format: folder / NAMES[format] for format in formats}
 
 
-def write_overlays(motion: Motion, take: Take, seen: Observations, folder: Path, step: Step) -> dict[str, Path]:
-    """Write an overlay video of every camera that has a video, and a picture of all; returns what lies where."""
+def write_overlays(
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
+) -> None:
+    """Write an overlay video of every camera that has one, and a picture of all; enter into `files` what is there."""
     from kinefit.exporters import draw_overlay, write_montage, write_overlay
     from kinefit.exporters.overlay import nearest_frame
     from kinefit.readers.video import Video
 
     if not seen.videos or seen.rig is None:
-        return {}
+        return
     pictures, middle = {}, motion.times[len(motion) // 2]
     for name, path in seen.videos.items():
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
@@ -94,8 +96,9 @@ def write_overlays(motion: Motion, take: Take, seen: Observations, folder: Path,
                 motion, seen.rig[name], video, folder / "overlays" / f"{name}.mp4", time_offset=offset,
                 progress=lambda done: step(bar, done, count), **given,  # noqa: B023
             )  # fmt: skip
+        files["overlays"] = folder / "overlays"
     write_montage(pictures, folder / "montage.png")
-    return {"overlays": folder / "overlays", "montage": folder / "montage.png"}
+    files["montage"] = folder / "montage.png"
 
 
 def _residuals(motion: Motion, camera: str) -> Residuals | None:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 Step = Callable[[str, int, int], None]
 """Called with what is done, how much of it is done, and how much there is (0: unknown)."""
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
+
 _VERBOSE = "kinefit.verbose"
 
 
@@ -82,7 +85,7 @@ def tell_error(error: KinefitError) -> None:
 
 def tell_interrupted(told: str) -> None:
     """Say that Ctrl-C came, and what is there."""
-    note(f"Stopped. {told}" if told else "Stopped before any result was there; nothing was left behind.")
+    note(f"Stopped. {told or 'Nothing half written is left.'}")
 
 
 def tell_bug(error: Exception) -> None:

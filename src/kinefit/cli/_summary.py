@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion, Residuals
 
 DOUBTFUL = 0.5  # quality below which a frame is named
-OUTLIER = 0.3  # robust weight below which a point counts as left out
 _UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 
 
@@ -49,7 +48,7 @@ def print_files(files: Mapping[str, Path]) -> None:
     say("\nWritten:")
     width = max((len(str(path)) for path in files.values()), default=0)
     for format, path in files.items():
-        say(f"  {str(path):<{width}}  {ABOUT[format]}")
+        say(f"  {path!s:<{width}}  {ABOUT[format]}")
 
 
 def frame_ranges(frames: NDArray) -> str:
@@ -67,7 +66,8 @@ def lost_segments(motion: Motion) -> dict[str, NDArray]:
 
 def bone_lengths(motion: Motion) -> dict[str, str]:
     """Distances [cm] from joint to joint, one for left and right where they are alike."""
-    body, found = motion.body, {}
+    body = motion.body
+    found: dict[str, dict[str, None]] = {}
     for child, parent in enumerate(body.tree.parents):
         length = float(np.linalg.norm(body.tree.offsets[child]))
         if parent >= 0 and length > 1e-6:
@@ -84,8 +84,10 @@ def _median(r: Residuals) -> str:
 
 
 def _left_out(r: Residuals) -> float:
+    from kinefit.exporters._drawing import OUTLIER_WEIGHT
+
     seen = np.isfinite(r.norms)
-    return float(np.mean(np.asarray(r.weights)[seen] < OUTLIER)) if seen.any() else 0.0
+    return float(np.mean(np.asarray(r.weights)[seen] < OUTLIER_WEIGHT)) if seen.any() else 0.0
 
 
 def _print_points(motion: Motion) -> None:

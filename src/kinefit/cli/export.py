@@ -22,7 +22,7 @@ _SUFFIXES = {"csv": "-tables", "parquet": "-tables"}
 @click.option("--up", type=click.Choice(["x", "y", "z", "-x", "-y", "-z"]), help="Vertical axis, of bvh (default y).")
 @_screen.verbose_option
 def export(motion: Path, format: str, out: Path | None, unit: str | None, up: str | None, verbose: bool) -> None:
-    """Write a motion file, as `kinefit track` leaves it, in another format.
+    r"""Write a motion file, as `kinefit track` leaves it, in another format.
 
     \b
     Examples:

@@ -16,7 +16,7 @@ from kinefit.cli import _screen
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: as recorded]")
 @_screen.verbose_option
 def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
-    """Put a recorded motion onto the humanoid, by the directions of its bones.
+    r"""Put a recorded motion onto the humanoid, by the directions of its bones.
 
     \b
     Examples:

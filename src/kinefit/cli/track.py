@@ -28,8 +28,10 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 )
 @_screen.verbose_option
 @click.pass_context
-def track(ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], verbose: bool) -> None:
-    """Track the person of a take file and write all results.
+def track(
+    ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], verbose: bool
+) -> None:
+    r"""Track the person of a take file and write all results.
 
     TAKE is one TOML file that names calibration, cameras, videos and keypoints: see docs/take-file.md; `kinefit demo`
     leaves a complete one to copy. Ctrl-C stops the tracking and writes the frames that are done.
@@ -46,30 +48,36 @@ def track(ctx: click.Context, take: Path, out: Path | None, overlays: bool, form
 
 def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verbose: bool) -> int:
     """Track a take and write what comes of it; returns the exit code."""
+    from kinefit.cli._agreement import print_agreement
     from kinefit.cli._summary import print_files, print_summary
+    from kinefit.errors import TrackingError
     from kinefit.readers.take import read_take
     from kinefit.tracking.take import track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     take = read_take(path)
     _results.check_folder(out)
+    files: dict[str, Path] = {}
+    total = 0
     try:
         with _screen.bars() as step:
             step("reading", 0, 0)
-            motion, seen = track_take(take, progress=lambda *told: (step("reading", 1, 1), step(*told))[1])
-            files = _results.write_results(motion, out, formats, step)
+            try:
+                motion, seen = track_take(take, progress=lambda *told: (step("reading", 1, 1), step(*told))[1])
+            except TrackingInterrupted as stopped:
+                motion, total, overlays = stopped.motion, stopped.total, False
+            _results.write_results(motion, out, formats, step, files)
             if overlays:
-                files |= _results.write_overlays(motion, take, seen, out, step)
-    except TrackingInterrupted as stopped:
-        with _screen.bars() as step:
-            files = _results.write_results(stopped.motion, out, formats, step)
-        print_summary(stopped.motion, points=verbose)
-        print_files(files)
-        _screen.tell_interrupted(
-            f"{len(stopped.motion)} of {stopped.total} frames are done and written; bone lengths are final, "
-            "overlay videos were not begun."
-        )
-        return 130
+                _results.write_overlays(motion, take, seen, out, step, files)
+    except BaseException as error:
+        if files:
+            print_files(files)
+        if verbose and isinstance(error, TrackingError):
+            print_agreement(take)
+        raise
     print_summary(motion, points=verbose)
     print_files(files)
+    if total:
+        _screen.tell_interrupted(f"{len(motion)} of {total} frames are done and written; no overlay video was begun.")
+        return _screen.INTERRUPTED
     return 0

@@ -12,7 +12,7 @@ from kinefit.cli import _screen
 @click.command(short_help="Compile the kernels now, so that the first track does not wait.")
 @_screen.verbose_option
 def warmup(verbose: bool) -> None:
-    """Compile the kernels now, so that the first track does not wait; they are kept for later runs.
+    r"""Compile the kernels now, so that the first track does not wait; they are kept for later runs.
 
     \b
     Examples:

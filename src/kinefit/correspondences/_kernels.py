@@ -53,18 +53,36 @@ def point_rows(frames, owner, rest, target, weight, data, segment, group, start)
 
 @jit
 def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, segment, group, start):
-    """One row a point along normal (K, 3) of the plane through target (K, 3) [m], weight (K,) [1/m²]."""
-    i = start
-    for k in range(owner.size):
-        w = weight[k]
-        if w <= 0.0:
-            continue
-        x, y, z = place(frames, owner, rest, k)
-        nx, ny, nz = normal[k, 0], normal[k, 1], normal[k, 2]
-        r = nx * (target[k, 0] - x) + ny * (target[k, 1] - y) + nz * (target[k, 2] - z)
-        _put(data, segment, group, i, owner[k], first_group + k, x, y, z, nx, ny, nz, r, w)
-        i += 1
-    return i
+    """One row a point along the normal of the plane through target; weight (K,) [1/m²].
+
+    For thousands of points: rest, target and normal are (3, K), points of one segment stand together, and a point
+    without weight gets a row without effect.
+    """
+    k = 0
+    while k < owner.size:
+        s, first = owner[k], k
+        while k < owner.size and owner[k] == s:
+            k += 1
+        f = frames[s]
+        f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+        t0, t1, t2 = f[9], f[10], f[11]
+        i, n = start + first, k - first
+        rx, ry, rz = rest[0, first:k], rest[1, first:k], rest[2, first:k]  # slices: so that the loop becomes vector code
+        tx, ty, tz = target[0, first:k], target[1, first:k], target[2, first:k]
+        nx, ny, nz, w = normal[0, first:k], normal[1, first:k], normal[2, first:k], weight[first:k]
+        px, py, pz = data[0, i : i + n], data[1, i : i + n], data[2, i : i + n]
+        ox, oy, oz, r, v = data[3, i : i + n], data[4, i : i + n], data[5, i : i + n], data[6, i : i + n], data[7, i : i + n]
+        for j in range(n):
+            x = f0 * rx[j] + f1 * ry[j] + f2 * rz[j] + t0
+            y = f3 * rx[j] + f4 * ry[j] + f5 * rz[j] + t1
+            z = f6 * rx[j] + f7 * ry[j] + f8 * rz[j] + t2
+            px[j], py[j], pz[j] = x, y, z
+            r[j] = nx[j] * (tx[j] - x) + ny[j] * (ty[j] - y) + nz[j] * (tz[j] - z)
+        for j in range(n):
+            ox[j], oy[j], oz[j], v[j] = nx[j], ny[j], nz[j], w[j]
+        for j in range(n):
+            segment[i + j], group[i + j] = s, first_group + first + j
+    return start + owner.size
 
 
 @jit

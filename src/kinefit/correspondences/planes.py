@@ -27,4 +27,12 @@ def plane_rows(
     x, present = targets.array(x_world, 3, len(points), "points of planes")
     n, directed = targets.array(normal, 3, len(points), "normals")
     w = targets.weights(sigma, present & directed, "planes")
-    return targets.fill(_kernels.plane_rows, 1, body, state, points, np.nan_to_num(x), np.nan_to_num(n), w, 0)
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    order = np.argsort(points.segments, kind="stable")
+    data, segment, group = _kernels.buffers(len(points))
+    _kernels.plane_rows(
+        frames, points.segments[order], *(targets.lines(v[order]) for v in (body.points_rest(points), x, n)), w[order],
+        0, data, segment, group, 0,
+    )  # fmt: skip
+    kept = data[7] > 0
+    return Rows(np.ascontiguousarray(data[:, kept]), segment[kept], group[kept])

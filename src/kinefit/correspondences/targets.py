@@ -36,3 +36,8 @@ def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArr
     if out.shape != (count, columns):
         raise ObservationError(f"{what} have shape {out.shape}", remedy=f"Give ({count}, {columns}).")
     return out, np.isfinite(out).all(axis=1)
+
+
+def lines(vectors: NDArray) -> NDArray:
+    """(3, K) contiguous lines of x, y and z from (K, 3); zeros where not finite."""
+    return np.ascontiguousarray(np.nan_to_num(vectors).T)

@@ -89,10 +89,10 @@ def closest_points(line_a: NDArray, line_b: NDArray) -> tuple[NDArray, NDArray]:
     """Points (..., 3) [m] of two lines that are nearest to each other (for parallel ones: the feet from the origin)."""
     a, b = line_a[..., :3], line_b[..., :3]
     foot_a, foot_b = np.cross(a, line_a[..., 3:]), np.cross(b, line_b[..., 3:])
-    c = np.sum(a * b, -1)
-    gap, det = foot_b - foot_a, 1.0 - c**2
-    safe = np.where(det < 1e-14, 1.0, det)
-    along_a, along_b = np.sum(gap * a, -1), np.sum(gap * b, -1)
-    s = np.where(det < 1e-14, 0.0, (along_a - c * along_b) / safe)
-    t = np.where(det < 1e-14, -along_b, (c * along_a - along_b) / safe)
+    gap, across = foot_b - foot_a, np.cross(a, b)
+    sine2 = np.sum(across**2, -1)  # not 1 − cos², which loses all digits of small angles
+    parallel = sine2 < 1e-24
+    safe = np.where(parallel, 1.0, sine2)
+    s = np.where(parallel, 0.0, np.sum(np.cross(gap, b) * across, -1) / safe)
+    t = np.where(parallel, -np.sum(gap * b, -1), np.sum(np.cross(gap, a) * across, -1) / safe)
     return foot_a + s[..., None] * a, foot_b + t[..., None] * b

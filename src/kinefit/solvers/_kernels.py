@@ -69,12 +69,15 @@ def accumulate(data, segment, factor, count, cx, cy, cz, blocks):
         h00 = h01 = h02 = h03 = h04 = h05 = h11 = h12 = h13 = h14 = h15 = 0.0
         h22 = h23 = h24 = h25 = h33 = h34 = h35 = h44 = h45 = h55 = 0.0
         g0 = g1 = g2 = g3 = g4 = g5 = 0.0
-        for k in range(i, j):
-            x, y, z = data[0, k] - cx, data[1, k] - cy, data[2, k] - cz
-            a0, a1, a2 = data[3, k], data[4, k], data[5, k]
+        px, py, pz = data[0, i:j], data[1, i:j], data[2, i:j]  # slices from zero: so that the loop becomes vector code
+        nx, ny, nz = data[3, i:j], data[4, i:j], data[5, i:j]
+        residual, weight, share = data[6, i:j], data[7, i:j], factor[i:j]
+        for k in range(j - i):
+            x, y, z = px[k] - cx, py[k] - cy, pz[k] - cz
+            a0, a1, a2 = nx[k], ny[k], nz[k]
             a3, a4, a5 = y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0
-            w = data[7, k] * factor[k]
-            r = w * data[6, k]
+            w = weight[k] * share[k]
+            r = w * residual[k]
             g0 += a0 * r
             g1 += a1 * r
             g2 += a2 * r

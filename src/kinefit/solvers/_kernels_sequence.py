@@ -12,14 +12,28 @@ from kinefit.solvers._kernels_linear import adapt, damped_step, retract
 
 
 @jit
+def gather(order, x, n, weight, target, normal, weights):
+    """One frame's planes (P, 3) as lines (3, P) in another order; weight 0 and zeros where not finite."""
+    for i in range(order.size):
+        k = order[i]
+        total = x[k, 0] + x[k, 1] + x[k, 2] + n[k, 0] + n[k, 1] + n[k, 2]
+        known = total - total == 0.0
+        for j in range(3):
+            target[j, i] = x[k, j] if known else 0.0
+            normal[j, i] = n[k, j] if known else 0.0
+        weights[i] = weight if known else 0.0
+
+
+@jit
 def fit_sequence(
     parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
-    owner, rest, target, weight, plane_owner, plane_rest, plane_target, plane_normal, plane_weight,
+    owner, rest, target, weight, plane_owner, plane_rest, plane_order, plane_x, plane_n, plane_w,
     kind, scale, max_iterations, tolerance, damping_share, roots, angles, costs, iterations,
 ):  # fmt: skip
     """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
 
-    owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes likewise with plane_normal (F, P, 3).
+    owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
+    plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the mean
     diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than `tolerance` of
     the cost ends a frame.
@@ -32,6 +46,8 @@ def fit_sequence(
     frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
     H, g, other_H, other_g = np.empty(chain.shape), np.empty(n), np.empty(chain.shape), np.empty(n)
     L, delta = np.empty(chain.shape), np.empty(n)
+    planes = plane_owner.size
+    target_lines, normal_lines, plane_weight = np.empty((3, planes)), np.empty((3, planes)), np.empty(planes)
     root, q = roots[0].copy(), angles[0].copy()
     new_root, new_q = np.empty((4, 4)), np.empty(n_angles)
     damping, growth = -1.0, 2.0
@@ -40,13 +56,14 @@ def fit_sequence(
         retract(root, q, delta, lower, upper, root, q)
         cost, predicted, count = 0.0, 0.0, 0
         used = 0
+        gather(plane_order, plane_x[f], plane_n[f], plane_w, target_lines, normal_lines, plane_weight)
         for attempt in range(max_iterations + 1):
             first = attempt == 0
             trial_root, trial_q = (root, q) if first else (new_root, new_q)
             forward(parents, dof_start, prismatic, axes, rest_joints, trial_root, trial_q, frames, screws)
             count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
             count = plane_rows(
-                frames, plane_owner, plane_rest, plane_target[f], plane_normal[f], plane_weight[f], owner.size,
+                frames, plane_owner, plane_rest, target_lines, normal_lines, plane_weight, owner.size,
                 data, segment, group, count,
             )  # fmt: skip
             new_cost = assemble(

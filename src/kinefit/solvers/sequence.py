@@ -89,7 +89,6 @@ def fit_sequence(
         raise ObservationError(
             f"planes have shapes {p.x_world.shape} and {p.normal.shape}", remedy=f"Give ({count}, {len(p.points)}, 3)."
         )
-    tangent = np.isfinite(p.x_world).all(axis=2) & np.isfinite(p.normal).all(axis=2)
     p_order = np.argsort(p.points.segments, kind="stable")
     lower, upper = bounds_of(body, limits)
     roots, angles = np.empty((count, 4, 4)), np.empty((count, len(tree.coordinates)))
@@ -100,10 +99,9 @@ def fit_sequence(
         tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest, lower, upper,
         lock(body, locked), points.segments[order], body.points_rest(points)[order],
         np.ascontiguousarray(np.nan_to_num(x[:, order])), np.ascontiguousarray(weight[:, order]),
-        p.points.segments[p_order], body.points_rest(p.points)[p_order],
-        np.ascontiguousarray(np.nan_to_num(p.x_world[:, p_order])),
-        np.ascontiguousarray(np.nan_to_num(p.normal[:, p_order])),
-        np.ascontiguousarray(np.where(tangent, 1.0 / p.sigma**2, 0.0)[:, p_order]),
+        p.points.segments[p_order],
+        np.ascontiguousarray(body.points_rest(p.points)[p_order].T),
+        p_order, np.ascontiguousarray(p.x_world), np.ascontiguousarray(p.normal), 1.0 / p.sigma**2,
         loss.kind, loss.scale, max_iterations, tolerance, damping, roots, angles, costs, iterations,
     )  # fmt: skip
     return Sequence(roots, angles, costs, iterations)

@@ -1,0 +1,58 @@
+"""Which cameras agree with each other: shows a wrong calibration, or a stream out of step, at a glance."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from kinefit.cli._screen import console, say
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.geometry.camera import Rig
+    from kinefit.observations import Keypoints
+    from kinefit.readers.take import Take
+
+_FRAMES = 50
+
+
+def print_agreement(take: Take) -> None:
+    """Print, for every two cameras, how far the points that both saw miss each other."""
+    from rich.table import Table
+
+    from kinefit.readers.load import load_observations
+
+    seen = load_observations(take)
+    table = Table("cameras", "points seen by both", "median error of their meeting", box=None, pad_edge=False)
+    for a, b in combinations(seen.keypoints, 2):
+        if seen.rig is not None and a.camera != b.camera and a.names == b.names:
+            errors = pair_errors(seen.rig, a, b)
+            told = f"{np.median(errors):.1f} px" if len(errors) else "-"
+            table.add_row(f"{a.camera} - {b.camera}", str(len(errors)), told)
+    say("\nA pair far worse than the others: its calibration is wrong, it is out of step, or it sees someone else.")
+    console().print(table)
+
+
+def pair_errors(rig: Rig, a: Keypoints, b: Keypoints) -> NDArray:
+    """[px] distances between the points of two cameras and where the points in space that they give are seen."""
+    from kinefit.geometry.triangulation import triangulate
+
+    pair = rig.select((a.camera, b.camera))
+    frames = np.unique(np.linspace(0, min(len(a), len(b)) - 1, _FRAMES).astype(int))
+    uv = np.stack([_surest(a, frames), _surest(b, frames)], axis=1)  # (N, 2, 2)
+    uv = uv[np.isfinite(uv).all(axis=(1, 2))]
+    if not len(uv):
+        return np.zeros(0)
+    x = triangulate(pair, uv)
+    shown = np.stack([camera.project(x) for camera in pair], axis=1)
+    errors = np.linalg.norm(shown - uv, axis=-1).max(axis=1)
+    return errors[np.isfinite(errors)]
+
+
+def _surest(record: Keypoints, frames: NDArray) -> NDArray:
+    """(N, 2) [px] points of the person that the detector was surest of in each frame, one frame after the other."""
+    person = record.confidence[frames].sum(axis=-1).argmax(axis=1)
+    return record.points[frames, person].reshape(-1, 2)
