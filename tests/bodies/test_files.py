@@ -144,7 +144,7 @@ BAD = {
     "unknown key of a joint": (changed("axes = [\"-y\"]", "axis = [\"-y\"]"), ("unknown field `axis`",), "segment[2].joint"),
     "missing key": (changed('name = "flange", ', ""), ("missing required field `name`",), "segment[3].joint"),
     "wrong type of value": (changed("stature = 1.0", 'stature = "tall"'), ("float", "str"), "body.stature"),
-    "no segments": ('[body]\nname = "x"\nsegment = []\n', ("unknown field",), None),
+    "no segments": ('segment = []\n[body]\nname = "x"\n', ("exactly one", "none"), None),
     "root placed": (changed('name = "world", type = "free"', 'name = "world", type = "free", at = [0.0, 1.0, 0.0]'), ("root", "origin"), "joint world"),
 }  # fmt: skip
 

@@ -17,6 +17,7 @@ from kinefit.errors import BodyError, choices
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
+_CHOOSE = "Use one of these, or add it."
 Vector = tuple[float, float, float]
 
 
@@ -85,7 +86,8 @@ def load_body(name_or_file: str | Path) -> Body:
         try:
             text, source = path.read_text(encoding="utf-8"), str(path)
         except (OSError, UnicodeDecodeError) as error:
-            raise BodyError(f"cannot read the body file ({error})", file=path) from error
+            remedy = "Give the path of a text file (UTF-8) in TOML."
+            raise BodyError(f"cannot read the body file ({error})", file=path, remedy=remedy) from error
     else:
         folder = resources.files("kinefit.bodies") / "catalogue"
         entry, source = folder / f"{name_or_file}.toml", f"catalogue body {name_or_file}"
@@ -109,13 +111,17 @@ def parse_body(text: str, source: str = "body") -> Body:
     try:
         record = msgspec.convert(tomllib.loads(text), _File)
     except tomllib.TOMLDecodeError as error:
-        raise BodyError(f"not valid TOML ({error})", file=source) from error
+        raise BodyError(f"not valid TOML ({error})", file=source, remedy="Correct it there; see https://toml.io.") from error
     except msgspec.ValidationError as error:
-        raise BodyError(f"not a body file ({error})", file=source, remedy="See docs/bodies.md for its keys.") from error
+        problem, _, place = str(error).partition(" - at `$")
+        raise BodyError(
+            f"not a body file: {problem}", file=source, place=place.strip(".`") or None, remedy="See docs/bodies.md for its keys."
+        ) from error
     segments = _in_order(_mirrored(record.segment) if record.body.mirror else list(record.segment), source)
     points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
     if record.body.mirror:
-        points |= {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
+        mirrored = {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
+        points |= {n: p for n, p in mirrored.items() if n not in points}
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
@@ -148,10 +154,7 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
         out.append(s)
         if not s.name.endswith("_r"):
             continue
-        axes: list[str | Vector] = []
-        for axis in s.joint.axes:  # a turn about z looks the same in the mirror, about x and y it is reversed
-            x, y, z = _AXES[axis] if isinstance(axis, str) and axis in _AXES else axis
-            axes.append((-float(x), -float(y), float(z)) if s.joint.type != "prismatic" else (x, y, -float(z)))  # type: ignore[arg-type]
+        axes = [_mirrored_axis(axis, slides) for axis, slides in zip(*_axes(s.joint))]
         x, y, z = s.joint.at
         joint = msgspec.structs.replace(
             s.joint,
@@ -169,13 +172,28 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
     return out
 
 
+def _axes(joint: _Joint) -> tuple[list[str | Vector], list[bool]]:
+    """Axes of a joint, and which of them it slides along."""
+    if joint.type == "free":
+        return list(joint.axes) or ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
+    return list(joint.axes), [joint.type == "prismatic"] * len(joint.axes)
+
+
+def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
+    """A turn about z looks the same in the mirror, about x and y it is reversed; a slide the other way round."""
+    if isinstance(axis, str) and axis not in _AXES:
+        return axis
+    x, y, z = _AXES[axis] if isinstance(axis, str) else axis
+    return (x, y, -z) if slides else (-x, -y, z)
+
+
 def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
     """Depth first from the root, so that parents come before children and limbs stay together."""
     names = [s.name for s in segments]
     for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
         twice = {n for n in items if items.count(n) > 1}
         if twice:
-            raise BodyError(f"{what} named twice: {', '.join(sorted(twice))}", file=source)
+            raise BodyError(f"{what} named twice: {', '.join(sorted(twice))}", file=source, remedy="Rename one of them.")
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
@@ -184,7 +202,8 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
         )
     for s in segments:
         if s.parent is not None and s.parent not in names:
-            raise BodyError(choices("segment", s.parent, names), file=source, place=f"parent of segment {s.name}")
+            place = f"parent of segment {s.name}"
+            raise BodyError(choices("segment", s.parent, names), file=source, place=place, remedy=_CHOOSE)
     out: list[_Segment] = []
     stack = [roots[0]]
     while stack:
@@ -203,13 +222,13 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
     for i, s in enumerate(segments):
         j, place = s.joint, f"joint {s.joint.name}"
         if j.type not in JOINT_TYPES:
-            raise BodyError(choices("joint type", j.type, JOINT_TYPES), file=source, place=place)
+            raise BodyError(choices("joint type", j.type, JOINT_TYPES), file=source, place=place, remedy="Use one of these.")
+        if i == 0 and any(j.at):
+            raise BodyError("the root's joint is the origin of the body", file=source, place=place, remedy="Leave out `at`.")
+        _finite(j.at, source, place)
         if j.type == "free" and i == 0:
             continue
-        axes: list[Any] = list(j.axes)
-        slides = [j.type == "prismatic"] * len(axes)
-        if j.type == "free":
-            axes, slides = ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
+        axes, slides = _axes(j)
         count = JOINT_TYPES[j.type]
         coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
         if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.spread)} - {0, count}:
@@ -218,11 +237,12 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
                 f"{len(coordinates)}, {len(j.range)} and {len(j.spread)}",
                 file=source,
                 place=place,
+                remedy="Give each of these lists one entry for each axis.",
             )
         for k in range(count):
             axis = np.array(_AXES.get(axes[k], [np.nan] * 3) if isinstance(axes[k], str) else axes[k], float)
             norm = np.linalg.norm(axis)
-            if not norm > 1e-9:
+            if not 1e-9 < norm < np.inf:
                 raise BodyError(
                     f"axis {axes[k]!r} of {coordinates[k]} is no direction",
                     file=source,
@@ -231,16 +251,19 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
                 )
             low, high = j.range[k] if j.range else (-np.inf, np.inf)
             if not low <= high:
-                raise BodyError(f"range [{low}, {high}] of {coordinates[k]} is empty", file=source, place=place)
+                problem = f"range [{low}, {high}] of {coordinates[k]} is empty"
+                raise BodyError(problem, file=source, place=place, remedy="Give the lower end first.")
             spread = j.spread[k] if j.spread else max(0.5 * (high - low), 1e-3)
             if not spread > 0:
-                raise BodyError(f"spread {spread} of {coordinates[k]} is not positive", file=source, place=place)
+                problem = f"spread {spread} of {coordinates[k]} is not positive"
+                raise BodyError(problem, file=source, place=place, remedy="Give inf for no prior.")
             unit = 1.0 if slides[k] else np.pi / 180.0
             names.append(coordinates[k])
             rows.append((i, axis / norm, slides[k], low * unit, high * unit, spread * unit))
     twice = {n for n in names if names.count(n) > 1}
     if twice:
-        raise BodyError(f"coordinate named twice: {', '.join(sorted(twice))}", file=source)
+        problem = f"coordinate named twice: {', '.join(sorted(twice))}"
+        raise BodyError(problem, file=source, remedy="Rename one of them.")
     return KinematicTree(
         segments=tuple(s.name for s in segments),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
@@ -256,24 +279,37 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
     )
 
 
-def _points(points: dict[str, tuple[str, Vector]], index: dict[str, int], source: str) -> PointSet:
-    for name, (segment, _) in points.items():
+def _finite(at: Vector, source: str, place: str) -> None:
+    if not np.all(np.isfinite(at)):
+        raise BodyError(f"`at` is not finite: {list(at)}", file=source, place=place, remedy="Give three numbers in metres.")
+
+
+def _points(
+    points: dict[str, tuple[str, Vector]], index: dict[str, int], source: str, what: str = "landmark "
+) -> PointSet:
+    for name, (segment, at) in points.items():
         if segment not in index:
-            raise BodyError(choices("segment", segment, index), file=source, place=f"landmark {name}")
+            raise BodyError(choices("segment", segment, index), file=source, place=what + name, remedy=_CHOOSE)
+        _finite(at, source, what + name)
     return PointSet(tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()]))
 
 
 def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
     for name, landmark in entries.items():
         if landmark not in landmarks.names:
-            raise BodyError(choices("landmark", landmark, landmarks.names), file=source, place=f"{place}.{name}")
+            problem = choices("landmark", landmark, landmarks.names)
+            raise BodyError(problem, file=source, place=f"{place}.{name}", remedy=_CHOOSE)
     chosen = landmarks.select(tuple(entries.values()))
     return PointSet(tuple(entries), chosen.segments, chosen.points)
 
 
 def _markers(entry: _MarkerSet, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
     on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
-    placed = _points({n: (p.segment, p.at) for n, p in entry.placed.items()}, index, source)
+    placed = _points({n: (p.segment, p.at) for n, p in entry.placed.items()}, index, source, f"{place}.")
+    twice = sorted(entry.placed.keys() & set(entry.points))
+    if twice:
+        problem = f"marker named twice: {', '.join(twice)}"
+        raise BodyError(problem, file=source, place=place, remedy="Keep it in points or in placed.")
     return PointSet(
         on_landmarks.names + placed.names,
         np.concatenate([on_landmarks.segments, placed.segments]),

@@ -26,7 +26,7 @@ class BodyState:
 
     def __post_init__(self) -> None:
         for name in ("T_world_root", "angles"):
-            array = np.array(getattr(self, name), dtype=float)
+            array = np.array(getattr(self, name), dtype=float, order="C")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 

@@ -141,6 +141,7 @@ class KinematicTree:
 
     def forward(self, T_world_root: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
         """Frames (S, 12) and screws (D, 6) of one pose; see `_kernels.forward`."""
+        self._check_angles(angles.shape[-1])
         frames, screws = np.empty((len(self.segments), 12)), np.empty((len(self.coordinates), 6))
         _kernels.forward(
             self.parents, self.dof_start, self.prismatic, self.axes, self.rest, T_world_root, angles, frames, screws
@@ -152,6 +153,7 @@ class KinematicTree:
         roots = np.ascontiguousarray(Ts_world_root, dtype=float)
         frames = np.empty((len(roots), len(self.segments), 12))
         angles = np.ascontiguousarray(angles, dtype=float)
+        self._check_angles(angles.shape[-1])
         _kernels.forward_many(
             self.parents, self.dof_start, self.prismatic, self.axes, self.rest, roots, angles, frames
         )
@@ -160,6 +162,11 @@ class KinematicTree:
         Ts[..., :3, 3] = frames[..., 9:] + (Ts[..., :3, :3] @ self.rest[:, :, None])[..., 0]
         Ts[..., 3, 3] = 1.0
         return Ts
+
+    def _check_angles(self, count: int) -> None:
+        if count != len(self.coordinates):  # a kernel would read beyond the end
+            problem = f"a state with {count} angles for a body with {len(self.coordinates)}"
+            raise BodyError(problem, remedy="Is the state that of another body?")
 
     def segment_jacobian(self, screws: NDArray, segment: int) -> NDArray:
         """J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin for each degree of freedom."""

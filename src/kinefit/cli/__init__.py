@@ -41,6 +41,11 @@ class _Commands(click.Group):
         except KeyboardInterrupt as error:
             _screen.tell_interrupted(str(error))
             code = _screen.INTERRUPTED
+        except OSError as error:
+            if error.errno not in _screen.REFUSED:
+                raise
+            _screen.tell_refused(error)
+            code = 2
         except Exception as error:
             _screen.tell_bug(error)
             code = 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,9 @@ Step = Callable[[str, int, int], None]
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
+
+REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
+"""Errors of the system for which nobody is to blame but the disk."""
 
 _VERBOSE = "kinefit.verbose"
 
@@ -86,6 +90,17 @@ def tell_error(error: KinefitError) -> None:
 def tell_interrupted(told: str) -> None:
     """Say that Ctrl-C came, and what is there."""
     note(f"Stopped. {told or 'Nothing half written is left.'}")
+
+
+def tell_refused(error: OSError) -> None:
+    """Say that the system let something of the cache not be written: results have messages of their own."""
+    from kinefit._jit import cache_directory
+
+    cache = f"kinefit keeps compiled kernels and fetched recordings in {cache_directory()}"
+    remedy = "Free some space there, or let KINEFIT_CACHE name another folder."
+    _complain(f"the system refuses to write: {error.strerror}", **{"at": str(error.filename or cache), "try": remedy})
+    if is_verbose():
+        _traceback(error)
 
 
 def tell_bug(error: Exception) -> None:

@@ -74,6 +74,8 @@ def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verb
             print_files(files)
         if verbose and isinstance(error, TrackingError):
             print_agreement(take)
+        if files and isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
         raise
     print_summary(motion, points=verbose)
     print_files(files)

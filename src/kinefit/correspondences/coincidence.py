@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import targets
+from kinefit.errors import ObservationError
 from kinefit.rows import PairRows
 
 
@@ -20,9 +22,12 @@ def coincidence_rows(
     sigma : scalar or (K,) [m]
         Softness of the contact; a strong weight makes a closed chain.
     """
+    if len(points_a) != len(points_b):
+        problem = f"{len(points_a)} points should meet {len(points_b)}"
+        raise ObservationError(problem, remedy="Give as many points of one side as of the other.")
     a, b = body.positions(state, points_a), body.positions(state, points_b)
     n = np.tile(np.eye(3), (len(a), 1))
-    w = np.repeat(1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), len(a))), 3)
+    w = np.repeat(targets.weights(sigma, np.ones(len(a), bool), "coincidences"), 3)
     pairs = np.repeat(np.stack([points_a.segments, points_b.segments], axis=1), 3, axis=0)
     gap = (b - a).reshape(-1)
     return PairRows(pairs, np.repeat(a, 3, axis=0), np.repeat(b, 3, axis=0), n, gap, w)

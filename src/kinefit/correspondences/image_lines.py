@@ -26,7 +26,7 @@ def image_line_rows(
     Parameters
     ----------
     points : PointSet of K points on the body.
-    camera : (K,) int, index in the rig.
+    camera : (K,) int, or one for all, index in the rig.
     lines : (K, 3)
         a u + b v + c = 0 in the calibration's image frame, of any scale; NaN for none. A straight edge in the world is
         bent by distortion: then give the tangent near the point.
@@ -34,7 +34,7 @@ def image_line_rows(
     """
     line, present = targets.array(lines, 3, len(points), "image lines")
     present &= np.hypot(np.nan_to_num(line[:, 0]), np.nan_to_num(line[:, 1])) > 0
-    index = np.ascontiguousarray(camera, np.int64)
+    index = targets.cameras(rig, camera, len(points))
     w = targets.weights(sigma, present, "image lines")
     return targets.fill(_kernels.image_line_rows, 1, body, state, points, rig.packed, index, np.nan_to_num(line), w)
 
@@ -57,7 +57,7 @@ def edge_rows(
     Parameters
     ----------
     starts, ends : PointSet of K points each.
-    camera : (K,) int, index in the rig.
+    camera : (K,) int, or one for all, index in the rig.
     lines : (K, 3)
         a u + b v + c = 0, as for `image_line_rows`.
     sigma : scalar or (K,) [px]

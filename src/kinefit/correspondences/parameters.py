@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences import targets
 from kinefit.errors import ObservationError
 from kinefit.rows import ParameterRows
 
@@ -20,7 +21,8 @@ def limit_rows(body: Body, state: BodyState, *, sigma: float = 0.02) -> Paramete
     """
     inside = np.clip(state.angles, body.tree.lower, body.tree.upper)
     beyond = np.flatnonzero(inside != state.angles)
-    return ParameterRows(6 + beyond, (inside - state.angles)[beyond], np.full(len(beyond), 1.0 / sigma**2))
+    w = targets.weights(sigma, np.ones(len(inside), bool), "limits")
+    return ParameterRows(6 + beyond, (inside - state.angles)[beyond], w[beyond])
 
 
 def prior_rows(body: Body, state: BodyState, *, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0) -> ParameterRows:
@@ -33,14 +35,16 @@ def prior_rows(body: Body, state: BodyState, *, mean: ArrayLike = 0.0, sigma: Ar
         Spread of the posture; inf for a coordinate without prior.
     """
     count = len(body.tree.coordinates)
-    sigma = np.broadcast_to(np.asarray(sigma, float), count)
-    held = np.flatnonzero(np.isfinite(sigma))
+    w = targets.weights(sigma, np.ones(count, bool), "priors")
+    held = np.flatnonzero(w > 0.0)
     gap = np.broadcast_to(np.asarray(mean, float), count) - state.angles
-    return ParameterRows(6 + held, gap[held], 1.0 / sigma[held] ** 2)
+    return ParameterRows(6 + held, gap[held], w[held])
 
 
 def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma: NDArray) -> ParameterRows:
     """One row for each degree of freedom, towards a predicted state.
+
+    For the root's turn r ≈ δ holds to first order in r: exact in sum where its three deviations are alike.
 
     Parameters
     ----------
@@ -51,5 +55,6 @@ def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma
     sigma = np.asarray(sigma, float)
     if sigma.shape != (body.tree.n_dofs,):
         raise ObservationError(f"sigma of a prediction has shape {sigma.shape}", remedy=f"Give ({body.tree.n_dofs},).")
-    held = np.flatnonzero(np.isfinite(sigma))
-    return ParameterRows(held, state.difference(predicted)[held], 1.0 / sigma[held] ** 2)
+    w = targets.weights(sigma, np.ones(len(sigma), bool), "predictions")
+    held = np.flatnonzero(w > 0.0)
+    return ParameterRows(held, state.difference(predicted)[held], w[held])

@@ -27,12 +27,12 @@ def pixel_rows(
     ----------
     points : PointSet of K points on the body, one for each pixel (a point seen twice stands twice).
     rig : Rig
-    camera : (K,) int, index in the rig of the camera that saw each.
+    camera : (K,) int, or one for all, index in the rig of the camera that saw each.
     uv : (K, 2) [px]
         In the calibration's image frame; NaN for none.
     sigma : scalar or (K,) [px]
     """
     target, present = targets.array(uv, 2, len(points), "pixels")
-    index = np.ascontiguousarray(camera, np.int64)
+    index = targets.cameras(rig, camera, len(points))
     w = targets.weights(sigma, present, "pixels")
     return targets.fill(_kernels.pixel_rows, 2, body, state, points, rig.packed, index, np.nan_to_num(target), w)

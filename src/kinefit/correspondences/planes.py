@@ -26,6 +26,7 @@ def plane_rows(
     """
     x, present = targets.array(x_world, 3, len(points), "points of planes")
     n, directed = targets.array(normal, 3, len(points), "normals")
+    targets.unit(n, directed, "normals of planes")
     w = targets.weights(sigma, present & directed, "planes")
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     order = np.argsort(points.segments, kind="stable")
@@ -35,4 +36,4 @@ def plane_rows(
         0, data, segment, group, 0,
     )  # fmt: skip
     kept = data[7] > 0
-    return Rows(np.ascontiguousarray(data[:, kept]), segment[kept], group[kept])
+    return Rows(np.ascontiguousarray(data[:, kept]), segment[kept], order[group[kept]])  # ids: which of the points

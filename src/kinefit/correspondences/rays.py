@@ -24,5 +24,6 @@ def ray_rows(
         Standard deviation of the distance. For pixels use `pixel_rows`, which weighs by their true size.
     """
     line, present = targets.array(lines, 6, len(points), "lines")
+    targets.unit(line[:, :3], present, "directions of lines")
     w = targets.weights(sigma, present, "rays")
     return targets.fill(_kernels.ray_rows, 2, body, state, points, np.nan_to_num(line), w)

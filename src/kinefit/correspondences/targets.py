@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
 
 
@@ -17,7 +18,8 @@ def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
     """(K,) weight 1/σ² of each measurement, 0 where it is absent; σ a scalar or (K,)."""
     sigma = np.broadcast_to(np.asarray(sigma, float), present.shape)
     if not np.all(sigma[present] > 0):
-        raise ObservationError(f"the standard deviation of {what} must be positive")
+        remedy = "Leave out what was not measured, or give it a large one."
+        raise ObservationError(f"the standard deviation of {what} must be positive", remedy=remedy)
     safe = np.where(present, sigma, 1.0)
     return np.where(present, 1.0 / safe**2, 0.0)
 
@@ -41,3 +43,20 @@ def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArr
 def lines(vectors: NDArray) -> NDArray:
     """(3, K) contiguous lines of x, y and z from (K, 3); zeros where not finite."""
     return np.ascontiguousarray(np.nan_to_num(vectors).T)
+
+
+def unit(directions: NDArray, present: NDArray, what: str) -> None:
+    """Check that the directions (K, 3) that are present are unit vectors: their length is part of a row's residual."""
+    if np.any(np.abs(np.linalg.norm(directions[present], axis=1) - 1.0) > 1e-6):
+        raise ObservationError(f"{what} are no unit vectors", remedy="Divide them by their lengths.")
+
+
+def cameras(rig: Rig, camera: ArrayLike, count: int) -> NDArray:
+    """(K,) index in the rig of the camera of each measurement, from (K,) or one for all; a kernel trusts it."""
+    index = np.asarray(camera)
+    if index.shape not in ((), (count,)) or index.dtype.kind not in "iu":
+        raise ObservationError(f"camera indices have shape {index.shape}", remedy=f"Give ({count},) integers, or one.")
+    if index.size and not 0 <= index.min() <= index.max() < len(rig):
+        problem = f"a camera index lies outside 0 to {len(rig) - 1}"
+        raise ObservationError(problem, remedy=f"The cameras of the rig are: {', '.join(rig.names)}.")
+    return np.array(np.broadcast_to(index, count), np.int64)

@@ -128,21 +128,22 @@ def levenberg_marquardt(
     locked : (6 + D,) bool
         Degrees of freedom that stay.
     damping : float
-        First λ, absolute (in the units of H); default: a thousandth of H's mean diagonal.
+        First λ, absolute (in the units of H); default: a tenth of H's mean diagonal.
     tolerance : float
-        Stop when the predicted fall of the cost is below this share of it.
+        Stop when the predicted fall of the cost is below this share of it (or nothing is left of the first cost).
     """
     bounds, held = bounds_of(body, limits), lock(body, locked)
     state = _moved(state, np.zeros(body.tree.n_dofs), bounds)
     eq = normal_equations(body, state, make_rows(state), loss=loss)
     mean = float(eq.diagonal.mean()) + 1e-300
-    damping, growth = (1e-3 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    damping, growth = (0.1 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    nothing = 1e-16 * eq.cost
     for iteration in range(1, max_iterations + 1):
         delta, predicted = _step(eq, damping, bounds, held)
         if predicted < 0.0:
             damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0)
             continue
-        if predicted <= tolerance * eq.cost + 1e-30:
+        if predicted <= tolerance * eq.cost + nothing:
             return Fit(state, eq, iteration, True, damping)
         candidate = _moved(state, delta, bounds)
         new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
