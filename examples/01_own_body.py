@@ -60,7 +60,7 @@ def main(seed=0, noise=0.002):
     def make_rows(state):  # called at every state that is tried
         return (
             point_rows(lamp, state, lamp.landmarks, measured, sigma=noise),
-            prior_rows(lamp, state, sigma=3.0),  # a whisper, for what nothing observes
+            prior_rows(lamp, state),  # a whisper, from the width of the ranges, for what nothing observes
         )
 
     fit = levenberg_marquardt(lamp, lamp.rest_state(), make_rows)

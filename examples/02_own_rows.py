@@ -14,13 +14,11 @@ from kinefit.rows import Rows
 from kinefit.simulation import studio_rig
 from kinefit.solvers.equations import joint_std
 
-POSTURE = np.radians(60.0)  # usual departure of an angle from zero
-
 
 def sphere_rows(body, state, points, centre, radius, *, sigma=0.005):
     """One row a point: it should lie at a distance `radius` [m] from `centre` (3,) [m], give or take sigma [m].
 
-    The distance grows by n·δx with n = (x - c) / |x - c|, so n is the row's direction and radius - |x - c| its residual.
+    The distance grows by n·δx with n = (x - c) / |x - c|, so n is the direction, radius - |x - c| the residual.
     """
     x = body.positions(state, points)
     away = x - centre
@@ -51,8 +49,7 @@ def main(seed=0, noise_px=1.0):
     for name, with_rope in (("camera alone", False), ("camera and rope", True)):
 
         def make_rows(state, with_rope=with_rope):
-            rows = [pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px)]
-            rows += [prior_rows(arm, state, sigma=POSTURE)]
+            rows = [pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px), prior_rows(arm, state)]
             return rows + [sphere_rows(arm, state, grip, anchor, length)] * with_rope
 
         fit = levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)

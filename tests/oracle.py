@@ -6,6 +6,7 @@ from scipy.linalg import expm
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.rows import PairRows, ParameterRows
 
 STATES = ("random", "identity", "near identity", "near pi")
 
@@ -103,6 +104,22 @@ def central_differences(function, body, state, step=1e-6):
     for delta in step * np.eye(body.tree.n_dofs):
         columns.append((function(state.retract(delta)) - function(state.retract(-delta))) / (2 * step))
     return np.stack(columns, axis=-1)
+
+
+def design(rows, body, state):
+    """(N, 6 + D) a J of each row: how fast its point moves along its direction."""
+    if isinstance(rows, ParameterRows):
+        return np.eye(body.tree.n_dofs)[rows.index]
+    if isinstance(rows, PairRows):
+        a = speed(body, state, rows.segments[:, 0], rows.point_a, rows.direction)
+        return a - speed(body, state, rows.segments[:, 1], rows.point_b, rows.direction)
+    return speed(body, state, rows.segment, rows.point, rows.direction)
+
+
+def speed(body, state, segment, point, direction):
+    _, screws = body.tree.forward(state.T_world_root, state.angles)
+    a = np.c_[direction, np.cross(point - state.T_world_root[:3, 3], direction)]
+    return np.stack([a[i] @ body.tree.segment_jacobian(screws, s) for i, s in enumerate(segment)])
 
 
 def look_at(name, place, aim, *, distortion=(-0.1, 0.05, 0.001, -0.002), focal=900.0, model="radtan"):

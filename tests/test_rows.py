@@ -84,3 +84,18 @@ def test_rows_must_be_finite(bad):
         some_pairs(point_b=np.full((1, 3), bad))
     with pytest.raises(ObservationError, match="parameter rows"):
         ParameterRows(np.array([0]), np.array([bad]), np.ones(1))
+
+
+def test_rows_of_any_kind_take_lists():
+    pairs = PairRows([[0, 1]], [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [1], [2])
+    parameters = ParameterRows([6], [1], [2])
+    for record, name in ((pairs, "segments"), (parameters, "index")):
+        assert getattr(record, name).dtype == np.int64 and getattr(record, name).flags.c_contiguous
+    assert pairs.point_b.shape == (1, 3) and pairs.residual.dtype == parameters.weight.dtype == float
+
+
+def test_rows_of_unequal_length_are_refused():
+    with pytest.raises(ObservationError, match=r"weight of ParameterRows has shape \(1,\).*Give \(2,\)"):
+        ParameterRows([6, 7], [1.0, 2.0], [1.0])
+    with pytest.raises(ObservationError, match=r"point_b of PairRows has shape \(2, 3\).*Give \(1, 3\)"):
+        some_pairs(point_b=np.ones((2, 3)))

@@ -24,6 +24,18 @@ def _check(what: str, *arrays: NDArray) -> None:
         raise ObservationError(f"{what} hold values that are not finite", remedy="Leave out what was not measured.")
 
 
+def _as_kernels_take_them(record: object, **shapes: tuple[type, tuple[int | None, ...]]) -> None:
+    """Make the named arrays contiguous and of one type, and check their shapes (None: the number of rows)."""
+    count = len(getattr(record, next(iter(shapes))))
+    for name, (dtype, shape) in shapes.items():
+        array = np.ascontiguousarray(getattr(record, name), dtype)
+        wanted = tuple(count if n is None else n for n in shape)
+        if array.shape != wanted:
+            problem = f"{name} of {type(record).__name__} has shape {array.shape}"
+            raise ObservationError(problem, remedy=f"Give {wanted}.")
+        object.__setattr__(record, name, array)
+
+
 @dataclass(frozen=True, eq=False)
 class Rows:
     """Linearised measurements, N rows; make them with `Rows.of`.
@@ -120,6 +132,10 @@ class PairRows:
     weight: NDArray
 
     def __post_init__(self) -> None:
+        point, number = (float, (None, 3)), (float, (None,))
+        _as_kernels_take_them(
+            self, segments=(np.int64, (None, 2)), point_a=point, point_b=point, direction=point, residual=number, weight=number
+        )
         _check("pair rows", self.point_a, self.point_b, self.direction, self.residual, self.weight)
 
     def __len__(self) -> int:
@@ -142,6 +158,7 @@ class ParameterRows:
     weight: NDArray
 
     def __post_init__(self) -> None:
+        _as_kernels_take_them(self, index=(np.int64, (None,)), residual=(float, (None,)), weight=(float, (None,)))
         _check("parameter rows", self.residual, self.weight)
 
     def __len__(self) -> int:

@@ -25,8 +25,7 @@ from kinefit.correspondences import (
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
-from kinefit.rows import PairRows, ParameterRows, Rows
-from tests.oracle import STATES, central_differences, look_at, random_body, random_unit, slow_positions, state_of
+from tests.oracle import STATES, central_differences, design, look_at, random_body, random_unit, slow_positions, state_of
 
 LENSES = (("radtan", (-0.1, 0.05, 0.001, -0.002, 0.01)), ("radtan", ()), ("fisheye", (0.02, -0.01, 0.003, -0.001)))
 
@@ -159,23 +158,6 @@ def test_derivatives_agree_with_central_differences(maker, kind, body):
 
 def whitened(rows):
     return np.sqrt(rows.weight) * rows.residual
-
-
-def design(rows, body, state):
-    """(N, 6 + D) a J of each row: how fast its point moves along its direction."""
-    if isinstance(rows, ParameterRows):
-        return np.eye(body.tree.n_dofs)[rows.index]
-    if isinstance(rows, PairRows):
-        a = speed(body, state, rows.segments[:, 0], rows.point_a, rows.direction)
-        return a - speed(body, state, rows.segments[:, 1], rows.point_b, rows.direction)
-    assert isinstance(rows, Rows)
-    return speed(body, state, rows.segment, rows.point, rows.direction)
-
-
-def speed(body, state, segment, point, direction):
-    _, screws = body.tree.forward(state.T_world_root, state.angles)
-    a = np.c_[direction, np.cross(point - state.T_world_root[:3, 3], direction)]
-    return np.stack([a[i] @ body.tree.segment_jacobian(screws, s) for i, s in enumerate(segment)])
 
 
 @pytest.fixture(params=STATES)

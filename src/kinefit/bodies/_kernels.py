@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kinefit._jit import jit
@@ -104,3 +106,30 @@ def difference(root, other, angles, other_angles, out):
         out[3 + i] = sign * factor * q[1 + i]
     for d in range(angles.size):
         out[6 + d] = other_angles[d] - angles[d]
+
+
+@jit
+def retract(root, angles, delta, lower, upper, new_root, new_angles):
+    """State moved by δ: root's twist in the world about its origin, then angles, kept within their limits."""
+    wx, wy, wz = delta[3], delta[4], delta[5]
+    t2 = wx * wx + wy * wy + wz * wz
+    if t2 < 1e-8:
+        a, b = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0
+    else:
+        t = math.sqrt(t2)
+        half = math.sin(0.5 * t)
+        a, b = math.sin(t) / t, 2.0 * half * half / t2
+    for j in range(3):
+        x, y, z = root[0, j], root[1, j], root[2, j]
+        cx, cy, cz = wy * z - wz * y, wz * x - wx * z, wx * y - wy * x
+        new_root[0, j] = x + a * cx + b * (wy * cz - wz * cy)
+        new_root[1, j] = y + a * cy + b * (wz * cx - wx * cz)
+        new_root[2, j] = z + a * cz + b * (wx * cy - wy * cx)
+    for i in range(3):
+        new_root[i, 3] = root[i, 3] + delta[i]
+        new_root[3, i] = 0.0
+    new_root[3, 3] = 1.0
+    for d in range(angles.size):
+        q = angles[d] + delta[6 + d]
+        q = lower[d] if q < lower[d] else q
+        new_angles[d] = upper[d] if q > upper[d] else q

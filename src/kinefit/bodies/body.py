@@ -94,6 +94,10 @@ class Body:
         """(6 + D,) names of all degrees of freedom."""
         return ROOT_DOFS + self.tree.coordinates
 
+    def usual_state(self, T_world_root: NDArray | None = None) -> BodyState:
+        """A common posture: where a fit with no pose given starts."""
+        return BodyState(np.eye(4) if T_world_root is None else T_world_root, self.tree.usual)
+
     def rest_state(self, T_world_root: NDArray | None = None) -> BodyState:
         """All angles zero, or the nearest value within the limits."""
         angles = np.clip(np.zeros(len(self.tree.coordinates)), self.tree.lower, self.tree.upper)

@@ -32,6 +32,7 @@ class _Joint(_Record):
     axes: list[str | Vector] = []
     coordinates: list[str] = []
     range: list[tuple[float, float]] = []
+    usual: list[float] = []
     spread: list[float] = []
 
 
@@ -218,7 +219,7 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
 
 def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> KinematicTree:
     names: list[str] = []
-    rows: list[tuple[int, Any, bool, float, float, float]] = []
+    rows: list[tuple[int, Any, bool, float, float, float, float]] = []
     for i, s in enumerate(segments):
         j, place = s.joint, f"joint {s.joint.name}"
         if j.type not in JOINT_TYPES:
@@ -231,10 +232,10 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
         axes, slides = _axes(j)
         count = JOINT_TYPES[j.type]
         coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
-        if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.spread)} - {0, count}:
+        if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.usual), len(j.spread)} - {0, count}:
             raise BodyError(
-                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges and spreads; here are {len(axes)}, "
-                f"{len(coordinates)}, {len(j.range)} and {len(j.spread)}",
+                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges, usuals and spreads; here are {len(axes)}, "
+                f"{len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}",
                 file=source,
                 place=place,
                 remedy="Give each of these lists one entry for each axis.",
@@ -257,9 +258,12 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
             if not spread > 0:
                 problem = f"spread {spread} of {coordinates[k]} is not positive"
                 raise BodyError(problem, file=source, place=place, remedy="Give inf for no prior.")
+            usual = j.usual[k] if j.usual else min(max(0.0, low), high)
+            if not low <= usual <= high:
+                raise BodyError(f"usual {usual} of {coordinates[k]} is out of its range", file=source, place=place)
             unit = 1.0 if slides[k] else np.pi / 180.0
             names.append(coordinates[k])
-            rows.append((i, axis / norm, slides[k], low * unit, high * unit, spread * unit))
+            rows.append((i, axis / norm, slides[k], low * unit, high * unit, usual * unit, spread * unit))
     twice = {n for n in names if names.count(n) > 1}
     if twice:
         problem = f"coordinate named twice: {', '.join(sorted(twice))}"
@@ -274,7 +278,8 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
         prismatic=np.array([r[2] for r in rows], bool),
         lower=np.array([r[3] for r in rows]),
         upper=np.array([r[4] for r in rows]),
-        spread=np.array([r[5] for r in rows]),
+        usual=np.array([r[5] for r in rows]),
+        spread=np.array([r[6] for r in rows]),
         root_free=segments[0].joint.type == "free",
     )
 

@@ -8,7 +8,7 @@ radians:
     offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
     prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
-    spread (D,)                                        usual departure from zero [rad] or [m], inf for no prior
+    usual, spread (D,)                                 common posture and usual departure from it [rad] or [m]
     scale_groups (G,)  segment_scale (S,)
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
@@ -31,7 +31,7 @@ from kinefit.bodies.body import Body, Cylinder, PointSet
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
-_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", "spread")
+_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread")
 
 
 def body_to_arrays(body: Body) -> dict[str, NDArray]:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
-from kinefit.geometry import se3
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +29,18 @@ class BodyState:
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
-    def retract(self, delta: NDArray) -> BodyState:
-        """State moved by δ (6 + D,): the root's twist (v, ω) in the world about its own origin, then the angles."""
-        T = np.array(self.T_world_root)
-        T[:3, :3] = se3.exp_so3(delta[3:6]) @ T[:3, :3]
-        T[:3, 3] += delta[:3]
-        return BodyState(T, self.angles + delta[6:])
+    def retract(self, delta: NDArray, bounds: tuple[NDArray, NDArray] | None = None) -> BodyState:
+        """State moved by δ (6 + D,): the root's twist (v, ω) in the world about its own origin, then the angles.
+
+        `bounds` are the lower and upper ends (D,) that the angles are kept within.
+        """
+        root, angles = np.empty((4, 4)), np.empty(len(self.angles))
+        if bounds is None:
+            free = np.full(len(self.angles), np.inf)
+            bounds = -free, free
+        delta = np.ascontiguousarray(delta, dtype=float)
+        _kernels.retract(self.T_world_root, self.angles, delta, bounds[0], bounds[1], root, angles)
+        return BodyState(root, angles)
 
     def difference(self, other: BodyState) -> NDArray:
         """δ (6 + D,) such that `self.retract(δ)` is `other`."""

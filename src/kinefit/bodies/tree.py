@@ -39,8 +39,9 @@ class KinematicTree:
     axes : (D, 3) unit axes in the root-aligned rest frame; a positive angle turns right-handed about it.
     prismatic : (D,) bool, slides along its axis instead of turning.
     lower, upper : (D,) [rad] or [m], limits; ±inf where there are none.
-    spread : (D,) [rad] or [m]
-        Usual departure from zero, one standard deviation: decides what measurements leave open; inf for no prior.
+    usual, spread : (D,) [rad] or [m]
+        A common posture and one standard deviation of departures from it: where a fit starts, and what decides where
+        measurements leave something open; spread inf for no prior.
     root_free : bool, False for a body whose root stays where it is put.
     """
 
@@ -53,13 +54,14 @@ class KinematicTree:
     prismatic: NDArray
     lower: NDArray
     upper: NDArray
+    usual: NDArray
     spread: NDArray
     root_free: bool = True
 
     def __post_init__(self) -> None:
         for name, dtype in (("parents", np.int64), ("owners", np.int64), ("prismatic", bool)):
             object.__setattr__(self, name, _frozen(getattr(self, name), dtype))
-        for name in ("offsets", "axes", "lower", "upper", "spread"):
+        for name in ("offsets", "axes", "lower", "upper", "usual", "spread"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         object.__setattr__(self, "axes", _frozen(self.axes.reshape(-1, 3)))
         if np.any(np.diff(self.owners) < 0) or np.any(self.parents[1:] >= np.arange(1, len(self.parents))):

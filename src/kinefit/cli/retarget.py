@@ -8,22 +8,22 @@ import click
 
 from kinefit.cli import _screen
 
+_EXAMPLES = """\b
+Examples:
+  kinefit retarget walk.bvh
+  kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
+  kinefit export walk.npz --to glb
+"""
 
-@click.command(short_help="Put a recorded motion (BVH, ASF/AMC) onto the humanoid.")
+
+@click.command(short_help="Put a recorded motion (BVH, ASF/AMC) onto the humanoid.", epilog=_EXAMPLES)
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option("--asf", type=click.Path(path_type=Path), help="Skeleton of an .amc file; needed there.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Motion file.  [default: RECORDING with .npz]")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: as recorded]")
 @_screen.verbose_option
 def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
-    r"""Put a recorded motion onto the humanoid, by the directions of its bones.
-
-    \b
-    Examples:
-      kinefit retarget walk.bvh
-      kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
-      kinefit export walk.npz --to glb
-    """
+    """Put a recorded motion onto the humanoid, by the directions of its bones."""
     from kinefit.exporters import write_motion
     from kinefit.readers.amc import read_amc
     from kinefit.readers.bvh import read_bvh

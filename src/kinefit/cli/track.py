@@ -17,8 +17,15 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
             raise click.BadParameter(f"there is no format '{name}'; there are: {', '.join(_results.NAMES)}")
     return formats
 
+_EXAMPLES = """\b
+Examples:
+  kinefit track my_take/take.toml
+  kinefit track take.toml --out results --no-overlays --formats bvh,csv
+  kinefit track take.toml -v            also how well every point of every camera fits
+"""
 
-@click.command(short_help="Track the person of a take file and write all results.")
+
+@click.command(short_help="Track the person of a take file and write all results.", epilog=_EXAMPLES)
 @click.argument("take", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results.  [default: TAKE-kinefit]")
 @click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video.")
@@ -31,16 +38,10 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], verbose: bool
 ) -> None:
-    r"""Track the person of a take file and write all results.
+    """Track the person of a take file and write all results.
 
     TAKE is one TOML file that names calibration, cameras, videos and keypoints: see docs/take-file.md; `kinefit demo`
     leaves a complete one to copy. Ctrl-C stops the tracking and writes the frames that are done.
-
-    \b
-    Examples:
-      kinefit track my_take/take.toml
-      kinefit track take.toml --out results --no-overlays --formats bvh,csv
-      kinefit track take.toml -v            also how well every point of every camera fits
     """
     out = out or take.with_name(f"{take.stem}-kinefit")
     ctx.exit(run(take, out, overlays=overlays, formats=formats, verbose=verbose))

@@ -8,17 +8,17 @@ import click
 
 from kinefit.cli import _screen
 
+_EXAMPLES = """\b
+Examples:
+  kinefit warmup
+  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
+"""
 
-@click.command(short_help="Compile the kernels now, so that the first track does not wait.")
+
+@click.command(short_help="Compile the kernels now, so that the first track does not wait.", epilog=_EXAMPLES)
 @_screen.verbose_option
 def warmup(verbose: bool) -> None:
-    r"""Compile the kernels now, so that the first track does not wait; they are kept for later runs.
-
-    \b
-    Examples:
-      kinefit warmup
-      KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
-    """
+    """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
     begin = perf_counter()
     with _screen.bars() as step:
         step("compiling", 0, 1)
@@ -30,4 +30,6 @@ def warmup(verbose: bool) -> None:
         rig = studio_rig(motion)
         track(rig, simulate_keypoints(motion, rig, "BODY_25B"), motion.body, up=motion.up)
         step("compiling", 1, 1)
-    _screen.say(f"ready after {perf_counter() - begin:.1f} s; the kernels lie in {cache_directory() / 'kernels'}")
+    kept = cache_directory() / "kernels"
+    where = f"the kernels lie in {kept}" if kept.is_dir() else f"none can be kept in {kept}: set KINEFIT_CACHE"
+    _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")

@@ -25,19 +25,22 @@ def limit_rows(body: Body, state: BodyState, *, sigma: float = 0.02) -> Paramete
     return ParameterRows(6 + beyond, (inside - state.angles)[beyond], w[beyond])
 
 
-def prior_rows(body: Body, state: BodyState, *, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0) -> ParameterRows:
+def prior_rows(
+    body: Body, state: BodyState, *, mean: ArrayLike | None = None, sigma: ArrayLike | None = None
+) -> ParameterRows:
     """One row for each coordinate, towards a mean posture.
 
     Parameters
     ----------
     mean : scalar or (D,) [rad or m]
+        Default: the body's usual posture.
     sigma : scalar or (D,) [rad or m]
-        Spread of the posture; inf for a coordinate without prior.
+        Spread of the posture, inf for a coordinate without prior; default: the body's.
     """
     count = len(body.tree.coordinates)
-    w = targets.weights(sigma, np.ones(count, bool), "priors")
+    w = targets.weights(body.tree.spread if sigma is None else sigma, np.ones(count, bool), "priors")
     held = np.flatnonzero(w > 0.0)
-    gap = np.broadcast_to(np.asarray(mean, float), count) - state.angles
+    gap = np.broadcast_to(np.asarray(body.tree.usual if mean is None else mean, float), count) - state.angles
     return ParameterRows(6 + held, gap[held], w[held])
 
 

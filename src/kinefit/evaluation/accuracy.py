@@ -26,12 +26,27 @@ def joint_errors(truth: Motion, result: Motion) -> NDArray:
 def angle_errors(truth: Motion, result: Motion) -> NDArray:
     """Differences (F, D) [deg] of all angles, result minus truth, between -180 and 180; of prismatic joints [m].
 
-    Where a ball joint is near the pose in which two of its axes fall together, large errors of both angles may mean the
-    same turn: see `orientation_errors`.
+    A ball joint with three axes at right angles has two triples (a, b, c) and (a + 180, 180 - b, c + 180) for every turn;
+    the one nearer to the truth counts. Near the pose in which two of its axes fall together, large errors of both may
+    still mean the same turn: see `orientation_errors`.
     """
     result = _comparable(truth, result)
-    turns = np.degrees(np.angle(np.exp(1j * (result.angles - truth.angles))))
-    return np.where(truth.body.tree.prismatic, result.angles - truth.angles, turns)
+    tree = truth.body.tree
+    errors = _wrapped(result.angles - truth.angles)
+    for s in range(len(tree.segments)):
+        d = slice(tree.dof_start[s], tree.dof_start[s + 1])
+        axes = tree.axes[d]
+        if len(axes) == 3 and np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+            other = np.array([np.pi, np.pi, np.pi]) + result.angles[:, d] * (1.0, -1.0, 1.0)
+            twin = _wrapped(other - truth.angles[:, d])
+            nearer = np.abs(twin).sum(axis=1) < np.abs(errors[:, d]).sum(axis=1)
+            errors[nearer, d] = twin[nearer]
+    return np.where(tree.prismatic, result.angles - truth.angles, errors)
+
+
+def _wrapped(radians: NDArray) -> NDArray:
+    """Angles in degrees between -180 and 180."""
+    return np.degrees(np.angle(np.exp(1j * radians)))
 
 
 def orientation_errors(truth: Motion, result: Motion, *, relative: bool = False) -> NDArray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit.bodies._kernels import forward
+from kinefit.bodies._kernels import forward, retract
 from kinefit.correspondences._kernels import plane_rows, point_rows
 from kinefit.solvers._kernels import assemble
-from kinefit.solvers._kernels_linear import adapt, damped_step, retract
+from kinefit.solvers._kernels_linear import adapt, damped_step
 
 
 @jit

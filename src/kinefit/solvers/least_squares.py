@@ -56,12 +56,6 @@ def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked
     return delta, fall
 
 
-def _moved(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -> BodyState:
-    root, angles = np.empty((4, 4)), np.empty(len(state.angles))
-    _kernels_linear.retract(state.T_world_root, state.angles, delta, bounds[0], bounds[1], root, angles)
-    return BodyState(root, angles)
-
-
 def bounds_of(body: Body, limits: bool) -> tuple[NDArray, NDArray]:
     """(D,) lower and upper ends of every coordinate; infinite without limits."""
     if limits:
@@ -102,7 +96,7 @@ def gauss_newton(
     while fall < 0:
         damping *= 100.0
         delta, fall = _step(eq, damping, bounds, held)
-    return Step(_moved(state, delta, bounds), delta, float(np.linalg.norm(delta)), eq.cost)
+    return Step(state.retract(delta, bounds), delta, float(np.linalg.norm(delta)), eq.cost)
 
 
 def levenberg_marquardt(
@@ -133,7 +127,7 @@ def levenberg_marquardt(
         Stop when the predicted fall of the cost is below this share of it (or nothing is left of the first cost).
     """
     bounds, held = bounds_of(body, limits), lock(body, locked)
-    state = _moved(state, np.zeros(body.tree.n_dofs), bounds)
+    state = state.retract(np.zeros(body.tree.n_dofs), bounds)
     eq = normal_equations(body, state, make_rows(state), loss=loss)
     mean = float(eq.diagonal.mean()) + 1e-300
     damping, growth = (0.1 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
@@ -145,7 +139,7 @@ def levenberg_marquardt(
             continue
         if predicted <= tolerance * eq.cost + nothing:
             return Fit(state, eq, iteration, True, damping)
-        candidate = _moved(state, delta, bounds)
+        candidate = state.retract(delta, bounds)
         new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
         damping, growth = _kernels_linear.adapt(damping, growth, eq.cost - new.cost, predicted)
         if new.cost < eq.cost:

@@ -110,7 +110,7 @@ def fit_shape(
     scales: NDArray,
     *,
     scale_sigma: float = 0.1,
-    shift_sigma: float = 0.02,
+    shift_sigma: float = 0.01,
     loss: Loss | None = None,
     max_iterations: int = 12,
     tolerance: float = 1e-3,
@@ -134,7 +134,7 @@ def fit_shape(
     loss = loss or geman_mcclure()
     tree, n = body.tree, body.tree.n_dofs
     model = _parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma)
-    posture = _POSTURE * posture_weights(body)
+    posture = _POSTURE * np.square(1.0 / tree.spread)
     p, groups = len(model.mean), len(body.scale_groups)
     owner, cameras = frames.points.segments, rig.packed
 
@@ -143,7 +143,7 @@ def fit_shape(
         total = float(model.prior @ np.square(theta - model.mean))
         for f, state in enumerate(states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += float(posture @ np.square(state.angles)) + _kernels_shape.frame_cost(
+            total += float(posture @ np.square(state.angles - tree.usual)) + _kernels_shape.frame_cost(
                 owner, rest, cameras, frames.camera, frames.column, frames.uv[f], frames.weight[f], placed,
                 loss.kind, loss.scale,
             )  # fmt: skip
@@ -160,7 +160,7 @@ def fit_shape(
             H, g,
         )  # fmt: skip
         H[range(6, n), range(6, n)] += posture
-        g[6:n] -= posture * state.angles
+        g[6:n] -= posture * (state.angles - tree.usual)
         return H, g
 
     def step(theta: NDArray, states: Sequence[BodyState], damping: float) -> tuple[NDArray, list[BodyState]]:
@@ -176,7 +176,7 @@ def fit_shape(
         moves = kept[:, p] - delta @ kept[:, :p]
         new = theta + delta
         new[:groups] = np.clip(new[:groups], 0.2, 5.0)
-        return new, [_within(body, s.retract(m)) for s, m in zip(states, moves, strict=True)]
+        return new, [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(states, moves, strict=True)]
 
     theta, states = model.mean.copy(), list(states)
     cost, damping = cost_of(theta, states), 1e-3
@@ -194,12 +194,3 @@ def fit_shape(
         if fall < tolerance * cost:
             break
     return Shape(theta[:groups].copy(), model.geometry(theta)[2], tuple(states), cost)
-
-
-def posture_weights(body: Body) -> NDArray:
-    """(D,) [1/rad²] weight of the prior towards zero, from each coordinate's usual spread."""
-    return np.square(1.0 / body.tree.spread)
-
-
-def _within(body: Body, state: BodyState) -> BodyState:
-    return BodyState(state.T_world_root, np.clip(state.angles, body.tree.lower, body.tree.upper))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +13,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import Keypoints
 
+_ENOUGH = 4  # points of a person that must be seen
+_STRIDE = 0.3  # [m] people stay about where they are from frame to frame
 _AGREE = 0.04  # two views of one person differ by less than this share of the person's height in the picture
 
 
@@ -20,7 +23,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
 
     In every frame people of different records are paired when their keypoints meet in space; the largest consistent
     group is the person, by the number of keypoints seen and how sure the detector was of them; among equals the one
-    that most frames agree on, by where it is. A record with one person in it is taken as that person where it agrees.
+    nearest to where the person was.
 
     Raises
     ------
@@ -28,84 +31,91 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         Nobody is seen in any frame.
     """
     frames = min(len(k) for k in keypoints)
+    surety = [_surety(k, frames) for k in keypoints]
     chosen = [np.full(frames, -1) for _ in keypoints]
-    last: NDArray | None = None
-    crowded = any(k.points.shape[1] > 1 for k in keypoints)
-    for f in range(frames):
-        people = [_people(k, f) for k in keypoints]
-        if crowded:
-            pick, last = _best_group(rig, keypoints, people, f, last)
-        else:
-            pick = [p[0] if p else -1 for p in people]
-        for q, person in enumerate(pick):
-            chosen[q][f] = person
+    if all(k.points.shape[1] == 1 for k in keypoints):
+        for c, sure in zip(chosen, surety, strict=True):
+            c[sure[:, 0] > 0] = 0
+    else:
+        meetings = _meetings(rig, keypoints, surety, frames)
+        last: NDArray | None = None
+        for f in range(frames):
+            people = [(q, p) for q, sure in enumerate(surety) for p in np.flatnonzero(sure[f] > 0)]
+            group, last = _best_group(people, meetings, surety, f, last)
+            for q, p in group:
+                chosen[q][f] = p
     if all(np.all(c < 0) for c in chosen):
-        raise TrackingError(
-            "nobody is seen in any frame", remedy="Check that the keypoints belong to this recording."
-        )
+        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
     return chosen
 
 
-def _people(record: Keypoints, frame: int) -> list[int]:
-    seen = np.isfinite(record.points[frame]).all(axis=-1) & (record.confidence[frame] > 0.1)
-    return [int(p) for p in np.flatnonzero(seen.sum(axis=-1) >= 4)]
+Node = tuple[int, int]  # record, person in it
+
+
+def _surety(record: Keypoints, frames: int) -> NDArray:
+    """(F, P) summed confidence of each person's points, 0 for one of whom too few are seen."""
+    seen = np.isfinite(record.points[:frames]).all(axis=-1) & (record.confidence[:frames] > 0.1)
+    total = np.where(seen, record.confidence[:frames], 0.0).sum(axis=-1)
+    return np.where(seen.sum(axis=-1) >= _ENOUGH, total, 0.0)
+
+
+def _meetings(
+    rig: Rig, keypoints: Sequence[Keypoints], surety: Sequence[NDArray], frames: int
+) -> dict[tuple[Node, Node], NDArray]:
+    """Centre (F, 3) [m] in space of two detections where they are of one person, NaN elsewhere."""
+    out = {}
+    for i, a in enumerate(keypoints):
+        for j, b in enumerate(keypoints[i + 1 :], start=i + 1):
+            if a.camera == b.camera or a.names != b.names:
+                continue
+            pair = rig.select((a.camera, b.camera))
+            for pa in range(a.points.shape[1]):
+                for pb in range(b.points.shape[1]):
+                    both = np.flatnonzero((surety[i][:, pa] > 0) & (surety[j][:, pb] > 0))
+                    centre = np.full((frames, 3), np.nan)
+                    if both.size:
+                        centre[both] = _meet(pair, a, pa, b, pb, both)
+                    out[(i, pa), (j, pb)] = centre
+    return out
+
+
+def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArray) -> NDArray:
+    """(F, 3) median point in space where two detections agree in some frames, NaN where they do not."""
+    uv = np.stack([a.points[frames, pa], b.points[frames, pb]], axis=2)
+    sure = np.stack([a.confidence[frames, pa], b.confidence[frames, pb]], axis=2) > 0.1
+    uv = np.where((np.isfinite(uv).all(axis=-1) & sure).all(axis=2)[..., None, None], uv, np.nan)
+    x = triangulate(pair, uv.reshape(-1, 2, 2)).reshape(*uv.shape[:2], 3)
+    error = np.stack([np.linalg.norm(c.project(x) - uv[:, :, k], axis=-1) for k, c in enumerate(pair)], axis=-1)
+    with warnings.catch_warnings():  # frames without a common point are NaN, and meant to be
+        warnings.simplefilter("ignore", RuntimeWarning)
+        size = np.mean(np.nanmax(uv[..., 1], axis=1) - np.nanmin(uv[..., 1], axis=1), axis=1)
+        agree = np.nanmedian(error.reshape(len(frames), -1), axis=1) < _AGREE * size
+        agree &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _ENOUGH
+        return np.where(agree[:, None], np.nanmedian(x, axis=1), np.nan)
 
 
 def _best_group(
-    rig: Rig, keypoints: Sequence[Keypoints], people: list[list[int]], frame: int, last: NDArray | None
-) -> tuple[list[int], NDArray | None]:
-    nodes = [(q, p) for q, ps in enumerate(people) for p in ps]
-    if not nodes:
-        return [-1] * len(keypoints), last
-    links: dict[tuple[int, int], NDArray] = {}
-    for i, (qa, pa) in enumerate(nodes):
-        for j in range(i + 1, len(nodes)):
-            qb, pb = nodes[j]
-            a, b = keypoints[qa], keypoints[qb]
-            if a.camera == b.camera or a.names != b.names:
-                continue
-            centre = _meet(rig, a, pa, b, pb, frame)
-            if centre is not None:
-                links[i, j] = centre
-    best: tuple[float, list[int], NDArray | None] = (-1.0, [], last)
-    seeds = [([i, j], c) for (i, j), c in links.items()] or [([i], None) for i in range(len(nodes))]
-    for seed, centre in seeds:
-        group = list(seed)
-        for k in range(len(nodes)):
-            same_record = any(nodes[k][0] == nodes[m][0] for m in group)
-            if not same_record and all((min(k, m), max(k, m)) in links for m in group):
-                group.append(k)
-        score = sum(_surety(keypoints[nodes[m][0]], nodes[m][1], frame) for m in group)
+    people: list[Node],
+    meetings: dict[tuple[Node, Node], NDArray],
+    surety: Sequence[NDArray],
+    frame: int,
+    last: NDArray | None,
+) -> tuple[list[Node], NDArray | None]:
+    """The surest set of people of different records that all meet, and where; `last` is where the person was."""
+    links = {
+        pair: centre[frame]
+        for pair, centre in meetings.items()
+        if np.isfinite(centre[frame, 0]) and pair[0] in people and pair[1] in people
+    }
+    best: tuple[float, list[Node], NDArray | None] = (-1.0, [], last)
+    seeds = [(list(pair), centre) for pair, centre in links.items()] or [([node], None) for node in people]
+    for group, centre in seeds:
+        for node in people:
+            if all(node[0] != m[0] and ((node, m) in links or (m, node) in links) for m in group):
+                group.append(node)
+        score = sum(surety[q][frame, p] for q, p in group)
         if last is not None and centre is not None:
-            score *= 1.0 + np.exp(-0.5 * (np.linalg.norm(centre - last) / 0.3) ** 2)  # people stay where they are
+            score *= 1.0 + np.exp(-0.5 * (np.linalg.norm(centre - last) / _STRIDE) ** 2)
         if score > best[0]:
-            best = (score, group, centre if centre is not None else last)
-    pick = [-1] * len(keypoints)
-    for m in best[1]:
-        pick[nodes[m][0]] = nodes[m][1]
-    return pick, best[2]
-
-
-def _surety(record: Keypoints, person: int, frame: int) -> float:
-    seen = np.isfinite(record.points[frame, person]).all(axis=-1)
-    return float(np.where(seen, record.confidence[frame, person], 0.0).sum())
-
-
-def _meet(rig: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frame: int) -> NDArray | None:
-    """Median point in space of two detections if they are of one person, left and right exchanged or not; else None."""
-    ua, ub = a.points[frame, pa], b.points[frame, pb]
-    both = np.isfinite(ua).all(-1) & np.isfinite(ub).all(-1)
-    both &= (a.confidence[frame, pa] > 0.1) & (b.confidence[frame, pb] > 0.1)
-    if both.sum() < 4:
-        return None
-    pair = rig.select((a.camera, b.camera))
-    size = 0.5 * (np.ptp(ua[both][:, 1]) + np.ptp(ub[both][:, 1]))
-    uv = np.stack([ua[both], ub[both]], axis=1)
-    x = triangulate(pair, uv)
-    good = np.isfinite(x).all(axis=1)
-    if good.sum() < 4:
-        return None
-    errors = [np.linalg.norm(camera.project(x[good]) - uv[good, c], axis=1) for c, camera in enumerate(pair)]
-    if not np.nanmedian(errors) < _AGREE * size:
-        return None
-    return np.median(x[good], axis=0)
+            best = (score, group, last if centre is None else centre)
+    return best[1], best[2]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
@@ -55,11 +55,6 @@ class Channels:
         """The same measurements of another body's points."""
         parts = [body.keypoints(name).select(self.points.names[span]) for name, span in self.sets.items()]
         return replace(self, points=joined(parts))
-
-    def only(self, cameras: Sequence[int]) -> Channels:
-        """As if only some cameras had seen anything."""
-        kept = np.isin(self.camera, cameras)
-        return replace(self, uv=np.where(kept[None, :, None], self.uv, np.nan))
 
 
 def joined(parts: Sequence[PointSet]) -> PointSet:
@@ -126,6 +121,16 @@ def make_channels(
         rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
         np.array(spread), np.concatenate(uv, axis=1), np.nan_to_num(np.concatenate(confidence, axis=1)),
     )  # fmt: skip
+
+
+def fitted_pixels(body: Body, channels: Channels, state: BodyState) -> NDArray:
+    """(N, 2) [px] where every channel's point of a body is seen at a state; NaN where it cannot be."""
+    x = body.positions(state, channels.points)[channels.column]
+    out = np.empty((len(x), 2))
+    for c, camera in enumerate(channels.rig):
+        mine = channels.camera == c
+        out[mine] = camera.project(x[mine])
+    return out
 
 
 def exchange(channels: Channels, frame: NDArray, swapped: NDArray) -> NDArray:

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.correspondences import point_rows
+from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.rows import ParameterRows
+from kinefit.rows import AnyRows
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.solvers.losses import geman_mcclure
-from kinefit.solvers.shape import posture_weights
 from kinefit.tracking.channels import Channels, exchange
 
 
@@ -85,10 +84,10 @@ def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float
     return out
 
 
-def first_scales(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
+def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: float | None = None) -> NDArray:
     """(G,) scales from the median lengths of bones over frames: x_world (F, K, 3) [m], NaN where unknown.
 
-    Groups without a bone to measure take the median of the others.
+    Groups without a bone to measure follow the person's height [m] where it is given, else the median of the others.
 
     Raises
     ------
@@ -106,7 +105,7 @@ def first_scales(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
             remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
         )
     means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
-    whole = float(np.median(list(means.values())))
+    whole = height / body.stature if height and body.stature else float(np.median(list(means.values())))
     if not 0.2 < whole < 5.0:
         raise TrackingError(
             f"the person would be {whole:.2g} times as large as the body: the calibration's unit is wrong",
@@ -133,32 +132,32 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
     return T
 
 
-def pose_from_points(body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03) -> tuple[BodyState, float]:
-    """State of a body from points (K, 3) [m] with no pose given, and the median distance left [m].
+def pose_from_points(
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None
+) -> tuple[BodyState, float]:
+    """State of a body from points (K, 3) [m], and the median distance left [m].
 
-    Several starts are tried (the aligned rest pose, turned about its long axis too); the cheapest end wins.
+    With no pose given two starts are tried, the usual posture laid on the points and turned about its long axis; the
+    cheaper end wins. `near` is a start that is known to be close, and the only one then.
+
+    Raises
+    ------
+    TrackingError
+        Fewer than six points are known.
     """
     known = np.isfinite(x_world).all(axis=1)
     if known.sum() < 6:
         raise TrackingError("fewer than six points are known in space", remedy="Start where more cameras see the body.")
-    weight = posture_weights(body)
-    count = len(body.tree.coordinates)
 
-    def rows(state: BodyState) -> list:
-        return [
-            point_rows(body, state, points, x_world, sigma=sigma),
-            ParameterRows(6 + np.arange(count), -state.angles, weight),
-        ]
+    def rows(state: BodyState) -> list[AnyRows]:
+        return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
 
-    T = aligned_root(body, points, x_world)
-    best = None
-    for turn in (0.0, np.pi):
-        start = body.rest_state(T @ _turn(turn))
-        fit = levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-6)
-        fit = levenberg_marquardt(body, fit.state, rows, loss=geman_mcclure(), max_iterations=40, tolerance=1e-6)
-        if best is None or fit.equations.cost < best.equations.cost:
-            best = fit
-    assert best is not None
+    starts = [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
+    fits = []
+    for start in starts:
+        rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state
+        fits.append(levenberg_marquardt(body, rough, rows, loss=geman_mcclure(), max_iterations=40, tolerance=1e-4))
+    best = min(fits, key=lambda fit: fit.equations.cost)
     left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
     return best.state, float(np.median(left))
 

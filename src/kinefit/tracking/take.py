@@ -40,6 +40,7 @@ def track_take(
         body,
         accuracy=[entry.accuracy for entry in take.keypoints],
         settings=settings,
+        height=take.height,
         up=take.up,
         name=take.name,
         progress=progress,

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences import _kernels
+from kinefit.correspondences import _kernels, prior_rows
 from kinefit.errors import TrackingError
-from kinefit.rows import ParameterRows, Rows
+from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.solvers.equations import covariance, joint_std, normal_equations
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.solvers.losses import Loss, geman_mcclure
-from kinefit.solvers.shape import posture_weights
-from kinefit.tracking.channels import Channels
+from kinefit.tracking.channels import Channels, fitted_pixels
 from kinefit.tracking.initialise import pose_from_points, triangulated_frame
 from kinefit.tracking.swaps import find_swaps, limb_groups
 
@@ -30,6 +28,8 @@ class Settings:
     loss : Loss of a keypoint, in its standard deviations.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a person moves: one standard deviation; times dt² it is that of the predicted pose.
+    velocity_gain : float in 0..1
+        Share of each frame's own motion in the velocity that predicts the next.
     poor : float in 0..1
         Quality below which a frame is started anew from its own keypoints.
     """
@@ -37,6 +37,7 @@ class Settings:
     loss: Loss = geman_mcclure()
     angle_acceleration: float = 400.0
     root_acceleration: float = 60.0
+    velocity_gain: float = 0.25
     poor: float = 0.5
 
 
@@ -82,19 +83,17 @@ class Tracker:
         self.settings = settings or Settings()
         self._rest = body.points_rest(channels.points)[channels.column]
         self._owner = channels.points.segments[channels.column]
-        self._posture = posture_weights(body)
         self._groups = limb_groups(body, channels)
         self._informs = informing(body, channels)
         n = 2 * len(self._owner)
+        self._dofs = np.arange(body.tree.n_dofs)
+        self._posture = np.square(1.0 / body.tree.spread)
+        still = np.full(body.tree.n_dofs, self.settings.angle_acceleration * self.dt**2)
+        still[:3] = self.settings.root_acceleration * self.dt**2
+        self._stay = np.square(1.0 / still)
         self._buffers = np.empty((8, n)), np.empty(n, np.int64), np.empty(n, np.int64)
         self._state: BodyState | None = None
         self._velocity = np.zeros(body.tree.n_dofs)
-
-    @cached_property
-    def _spread(self) -> NDArray:
-        s = np.full(self.body.tree.n_dofs, self.settings.angle_acceleration * self.dt**2)
-        s[:3] = self.settings.root_acceleration * self.dt**2
-        return np.square(s)
 
     def forget(self) -> None:
         """Start anew with the next frame."""
@@ -122,15 +121,16 @@ class Tracker:
             return None
         if self._state is not None:
             moved = self._state.difference(result.state)
-            keep = 0.5 if result.quality > self.settings.poor else 0.0
-            self._velocity = keep * self._velocity + 0.5 * moved if keep else 0.5 * self._velocity
+            gain = self.settings.velocity_gain
+            trusted = gain * moved if result.quality > self.settings.poor else 0.0
+            self._velocity = (1.0 - gain) * self._velocity + trusted
         else:
             self._velocity = np.zeros_like(self._velocity)
         self._state = result.state
         return result
 
     def _start(self, uv: NDArray, weight: NDArray, confidence: NDArray) -> FrameResult | None:
-        x, exchanged = triangulated_frame(self.channels, uv, confidence)
+        x, _ = triangulated_frame(self.channels, uv, confidence)
         try:
             state, _ = pose_from_points(self.body, self.channels.points, x)
         except TrackingError:
@@ -138,7 +138,7 @@ class Tracker:
         return self._fit(state, None, uv, weight)
 
     def _fit(self, start: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> FrameResult:
-        swapped = find_swaps(self.channels, self._groups, uv, weight, self.fitted(start))
+        swapped = find_swaps(self.channels, self._groups, uv, weight, fitted_pixels(self.body, self.channels, start))
         partner = np.arange(len(swapped))
         for _ in range(3):
             order = np.where(swapped, self.channels.partner, partner)
@@ -147,14 +147,14 @@ class Tracker:
                 self.body, start, lambda s: self._rows(s, predicted, used, used_weight),  # noqa: B023
                 loss=self.settings.loss, max_iterations=40, tolerance=1e-5,
             )  # fmt: skip
-            fitted = self.fitted(fit.state)
+            fitted = fitted_pixels(self.body, self.channels, fit.state)
             again = find_swaps(self.channels, self._groups, uv, weight, fitted)
             if np.array_equal(again, swapped):
                 break
             swapped, start = again, fit.state
         return self._judge(fit, used, used_weight, fitted, swapped)
 
-    def _rows(self, state: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> list:
+    def _rows(self, state: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> list[AnyRows]:
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         data, segment, group = self._buffers[0].copy(), self._buffers[1].copy(), self._buffers[2].copy()
         end = _kernels.pixel_rows(
@@ -162,25 +162,11 @@ class Tracker:
             data, segment, group, 0,
         )  # fmt: skip
         rows = Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
-        parts: list = [rows, self._posture_rows(state)]
+        tree = self.body.tree
+        parts: list[AnyRows] = [rows, ParameterRows(self._dofs[6:], tree.usual - state.angles, self._posture)]
         if predicted is not None:
-            every = np.arange(self.body.tree.n_dofs)
-            parts.append(ParameterRows(every, state.difference(predicted), 1.0 / self._spread))
+            parts.append(ParameterRows(self._dofs, state.difference(predicted), self._stay))
         return parts
-
-    def _posture_rows(self, state: BodyState) -> ParameterRows:
-        return ParameterRows(np.arange(6, self.body.tree.n_dofs), -state.angles, self._posture)
-
-    def fitted(self, state: BodyState) -> NDArray:
-        """(N, 2) [px] where every channel's point is seen."""
-        frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
-        f = frames[self._owner]
-        x = (f[:, :9].reshape(-1, 3, 3) @ self._rest[:, :, None])[..., 0] + f[:, 9:]
-        out = np.empty((len(x), 2))
-        for c, camera in enumerate(self.channels.rig):
-            mine = self.channels.camera == c
-            out[mine] = camera.project(x[mine])
-        return out
 
     def _judge(self, fit: Fit, uv: NDArray, weight: NDArray, fitted: NDArray, swapped: NDArray) -> FrameResult:
         factor = np.zeros(len(weight))
@@ -194,10 +180,10 @@ class Tracker:
         share = support / np.maximum(self._informs @ seen, 1.0)
         quality = share * np.minimum(cameras, 2) / 2.0
         own = normal_equations(
-            self.body, fit.state, [fit.equations.rows, self._posture_rows(fit.state)], loss=self.settings.loss
+            self.body, fit.state, [fit.equations.rows, prior_rows(self.body, fit.state)], loss=self.settings.loss
         )
         cov = covariance(own)
-        blind = 6 + np.flatnonzero(np.diag(cov)[6:] > 0.9 / self._posture)  # known from the prior alone
+        blind = 6 + np.flatnonzero(np.diag(cov)[6:] > 0.9 * np.square(self.body.tree.spread))  # known from the prior alone
         cov[blind, :] = cov[:, blind] = 0.0
         cov[blind, blind] = np.inf
         return FrameResult(

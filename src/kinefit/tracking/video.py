@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, Residuals
 from kinefit.observations import Keypoints
-from kinefit.solvers.shape import PixelFrames, fit_shape
 from kinefit.tracking.association import choose_people
 from kinefit.tracking.channels import Channels, make_channels
-from kinefit.tracking.initialise import first_scales, pose_from_points, triangulated
+from kinefit.tracking.subject import Progress, Subject, fit_subject
 from kinefit.tracking.tracker import FrameResult, Settings, Tracker
-
-Progress = Callable[[str, int, int], None]
-
 
 class TrackingInterrupted(KeyboardInterrupt):
     """Ctrl-C while frames were being tracked; what is done is kept.
@@ -36,14 +30,6 @@ class TrackingInterrupted(KeyboardInterrupt):
         self.motion, self.total = motion, total
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """A body fitted to a person: its lengths, and where on it the detectors' points sit."""
-
-    body: Body
-    scales: NDArray
-
-
 def track(
     rig: Rig,
     keypoints: Sequence[Keypoints],
@@ -51,6 +37,7 @@ def track(
     *,
     accuracy: float | Sequence[float] = 8.0,
     subject: Subject | None = None,
+    height: float | None = None,
     settings: Settings | None = None,
     shape_frames: int = 25,
     up: str = "z",
@@ -70,6 +57,8 @@ def track(
     accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
     subject : Subject
         Known already; default: fitted from this take.
+    height : float [m]
+        Stature, where it is known: the length of bones that nobody sees follows it.
     shape_frames : int, how many frames bone lengths are found from.
     progress : called with (what, done, total).
 
@@ -89,64 +78,13 @@ def track(
     sigma = [float(accuracy)] * len(keypoints) if isinstance(accuracy, int | float) else [float(a) for a in accuracy]
     channels = make_channels(body, rig, keypoints, choose_people(rig, keypoints), sigma)
     if subject is None:
-        subject = fit_subject(body, channels, frames=shape_frames, progress=progress)
+        subject = fit_subject(body, channels, frames=shape_frames, height=height, progress=progress)
     channels = channels.with_points(subject.body)
     results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
     motion = _motion(subject.body, channels, results, keypoints[0], up, name)
     if len(motion) < len(channels.uv):
         raise TrackingInterrupted(motion, len(channels.uv))
     return motion
-
-
-def fit_subject(body: Body, channels: Channels, *, frames: int = 25, progress: Progress | None = None) -> Subject:
-    """Bone lengths and the places of the detectors' points, from frames spread over a take."""
-    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(frames, len(channels.uv))).astype(int))
-    if progress:
-        progress("bone lengths", 0, 1)
-    x = triangulated(channels, chosen)
-    scales = first_scales(body, channels.points, x)
-    sized = body.scaled(scales)
-    points = channels.with_points(sized).points
-    states, used = [], []
-    for i, f in enumerate(chosen):
-        try:
-            state, left = pose_from_points(sized, points, x[i])
-        except TrackingError:
-            continue
-        if left < 0.15:
-            states.append(state)
-            used.append(f)
-    if not states:
-        raise TrackingError(
-            "no frame shows enough of the person in two cameras to start from",
-            remedy="Check the calibration and that the cameras are in step; see which points agree with kinefit track -v.",
-        )
-    picked = np.array(used)
-    weight = _swap_free(channels, sized, points, states, picked)
-    pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[picked], weight)
-    shape = fit_shape(body, channels.rig, pixels, states, scales)
-    fitted = body.scaled(shape.scales)
-    for name, span in channels.sets.items():
-        whole = fitted.keypoints(name)
-        moved = np.array(whole.points)
-        rows = [whole.index(n) for n in channels.points.names[span]]
-        moved[rows] += shape.shifts[span]
-        fitted = fitted.with_keypoints(name, moved)
-    if progress:
-        progress("bone lengths", 1, 1)
-    return Subject(fitted, shape.scales)
-
-
-def _swap_free(channels: Channels, body: Body, points: object, states: list, frames: NDArray) -> NDArray:
-    """(F, N) weights without the channels whose left and right look exchanged."""
-    tracker = Tracker(body, channels.with_points(body), 1.0)
-    weight = channels.weight[frames].copy()
-    from kinefit.tracking.swaps import find_swaps
-
-    for i, f in enumerate(frames):
-        swapped = find_swaps(channels, tracker._groups, channels.uv[f], weight[i], tracker.fitted(states[i]))
-        weight[i, swapped] = 0.0
-    return weight
 
 
 def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> list[FrameResult | None]:

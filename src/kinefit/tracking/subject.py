@@ -1,0 +1,102 @@
+"""Who is seen: bone lengths, and where on the body the detectors' points sit, from frames spread over a take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import TrackingError
+from kinefit.solvers.shape import PixelFrames, fit_shape
+from kinefit.tracking.channels import Channels, fitted_pixels
+from kinefit.tracking.initialise import first_scales, pose_from_points, triangulated
+from kinefit.tracking.swaps import find_swaps, limb_groups
+
+Progress = Callable[[str, int, int], None]
+
+_PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it."""
+
+    body: Body
+    scales: NDArray
+
+
+def fit_subject(
+    body: Body,
+    channels: Channels,
+    *,
+    frames: int = 25,
+    height: float | None = None,
+    progress: Progress | None = None,
+) -> Subject:
+    """Bone lengths and the places of the detectors' points on a body, with no pose given.
+
+    Parameters
+    ----------
+    body : Body, generic.
+    frames : int, how many frames spread over the take are used.
+    height : float [m] of the person: lengths that no two points measure follow it.
+
+    Raises
+    ------
+    TrackingError
+        No frame shows enough of the person in two cameras.
+    """
+    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(frames, len(channels.uv))).astype(int))
+    if progress:
+        progress("bone lengths", 0, 1)
+    x = triangulated(channels, chosen)
+    scales = first_scales(body, channels.points, x, height=height)
+    sized = channels.with_points(body.scaled(scales))
+    states: dict[int, BodyState] = {}
+    for i, f in enumerate(chosen):
+        state = _pose(body.scaled(scales), sized, x[i], next(reversed(states.values()), None))
+        if state is not None:
+            states[int(f)] = state
+        if progress:
+            progress("bone lengths", i + 1, len(chosen) + 1)
+    if not states:
+        raise TrackingError(
+            "no frame shows enough of the person in two cameras to start from",
+            remedy="Check the calibration and that the cameras are in step; kinefit track -v tells which cameras agree.",
+        )
+    weight = _weights(body.scaled(scales), sized, states)
+    pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[list(states)], weight)
+    shape = fit_shape(body, channels.rig, pixels, list(states.values()), scales)
+    fitted = body.scaled(shape.scales)
+    for name, span in channels.sets.items():
+        points = fitted.keypoints(name)
+        moved = np.array(points.points)
+        moved[[points.index(n) for n in channels.points.names[span]]] += shape.shifts[span]
+        fitted = fitted.with_keypoints(name, moved)
+    if progress:
+        progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
+    return Subject(fitted, shape.scales)
+
+
+def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:
+    """State from triangulated points: from a neighbouring frame's if that leads there, else from nowhere."""
+    for start in (near, None) if near else (None,):
+        try:
+            state, left = pose_from_points(body, channels.points, x_world, near=start)
+        except TrackingError:
+            return None
+        if left < (0.5 * _PLAUSIBLE if start else _PLAUSIBLE):
+            return state
+    return None
+
+
+def _weights(body: Body, channels: Channels, states: dict[int, BodyState]) -> NDArray:
+    """(F, N) weights without the channels whose left and right look exchanged."""
+    groups = limb_groups(body, channels)
+    weight = channels.weight[list(states)]
+    for row, (f, state) in zip(weight, states.items(), strict=True):
+        row[find_swaps(channels, groups, channels.uv[f], row, fitted_pixels(body, channels, state))] = 0.0
+    return weight

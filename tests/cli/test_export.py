@@ -1,0 +1,99 @@
+"""`kinefit export` and `kinefit retarget`."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import kinefit
+from kinefit.cli import main
+from kinefit.exporters import write_bvh, write_motion
+from kinefit.simulation import cut, squat_and_wave
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return cut(squat_and_wave(), 0, 5)
+
+
+@pytest.fixture
+def file(motion, tmp_path):
+    write_motion(motion, tmp_path / "squat.npz")
+    return tmp_path / "squat.npz"
+
+
+def run(*args):
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+@pytest.mark.parametrize("format", ["bvh", "glb", "trc", "mot", "osim"])
+def test_a_file_beside_the_motion(format, file):
+    told = run("export", file, "--to", format)
+    assert told.exit_code == 0, told.output
+    assert file.with_suffix(f".{format}").stat().st_size > 1000
+    assert str(file.with_suffix(f".{format}")) in told.stdout
+
+
+def test_tables_are_a_folder(file):
+    assert run("export", file, "--to", "csv").exit_code == 0
+    lines = (file.parent / "squat-tables" / "angles.csv").read_text().splitlines()
+    assert len(lines) == 6
+
+
+def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
+    told = run("export", file, "--to", "bvh", "--unit", "mm", "--up", "z", "--out", tmp_path / "there" / "x.bvh")
+    assert told.exit_code == 0, told.output
+    read = kinefit.read_bvh(tmp_path / "there" / "x.bvh", unit=0.001, up="z")
+    root = read.Ts_world_joint[:, 0, :3, 3]
+    assert np.allclose(root, motion.Ts_world_root[:, :3, 3], atol=1e-6)  # the motion is z up, in metres
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--to", "glb", "--unit", "m"], "--unit is of bvh and trc, not of glb"),
+        (["--to", "trc", "--up", "z"], "--up is of bvh, not of trc"),
+        (["--to", "trc", "--unit", "cm"], "no unit of length 'cm'"),
+        (["--to", "fbx"], "'bvh', 'glb'"),
+        ([], "--to"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, problem, file):
+    told = run("export", file, *options)
+    assert told.exit_code == 2
+    assert problem in told.stderr
+    assert [path.name for path in file.parent.iterdir()] == ["squat.npz"]
+
+
+def test_a_file_that_is_no_motion_is_told(tmp_path):
+    (tmp_path / "x.npz").write_bytes(b"PK\x03\x04 not really")
+    told = run("export", tmp_path / "x.npz", "--to", "bvh")
+    assert told.exit_code == 2
+    assert "x.npz" in told.stderr
+    assert run("export", tmp_path / "none.npz", "--to", "bvh").exit_code == 2
+    assert not (tmp_path / "x.bvh").exists()
+
+
+def test_a_recorded_skeleton_becomes_a_motion_of_the_humanoid(motion, tmp_path, data_dir):
+    folder = data_dir("motion_cmu_amc")
+    options = ("--asf", folder / "02.asf", "--rate", "12", "--out", tmp_path / "w.npz")
+    told = run("retarget", folder / "02_01.amc", *options)
+    assert told.exit_code == 0, told.output
+    walk = kinefit.read_motion(tmp_path / "w.npz")
+    assert (walk.rate, walk.body.name) == (12.0, "humanoid")
+    assert f"{len(walk)} frames at 12 Hz" in told.stdout
+
+
+def test_a_skeleton_of_no_known_family_is_told(motion, tmp_path):
+    write_bvh(motion, tmp_path / "x.bvh")
+    (tmp_path / "x.bvh").write_text((tmp_path / "x.bvh").read_text().replace("UpLeg", "Flipper"))
+    told = run("retarget", tmp_path / "x.bvh")
+    assert told.exit_code == 2
+    assert "error: " in told.stderr
+    assert not (tmp_path / "x.npz").exists()
+
+
+@pytest.mark.parametrize("args", [["x.mp4"], ["x.amc"], ["x.bvh", "--asf", "y.asf"]])
+def test_what_cannot_be_retargeted_is_a_wrong_command_line(args):
+    told = run("retarget", *args)
+    assert told.exit_code == 2
+    assert "Usage:" in told.stderr
