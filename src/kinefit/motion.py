@@ -138,8 +138,7 @@ class Motion:
         """The same motion in a world whose vertical axis is `up`."""
         R = rotation_between_up(self.up, up)
         T = se3.transform(R, np.zeros(3))
-        variance = np.square(self.dof_std[:, :6])
-        spread = np.concatenate([variance[:, :3] @ np.square(R).T, variance[:, 3:] @ np.square(R).T], axis=1)
+        axis = np.argmax(np.abs(R), axis=1)  # R takes axes onto axes; a product with it would make NaN of ∞ · 0
         residuals = {
             name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T) if r.unit == "m" else r
             for name, r in self.residuals.items()
@@ -147,8 +146,8 @@ class Motion:
         return replace(
             self,
             Ts_world_root=T @ self.Ts_world_root,
-            dof_std=np.concatenate([np.sqrt(spread), self.dof_std[:, 6:]], axis=1),
-            joint_std=np.sqrt(np.square(self.joint_std) @ np.square(R).T),
+            dof_std=self.dof_std[:, np.concatenate([axis, 3 + axis, np.arange(6, self.dof_std.shape[1])])],
+            joint_std=self.joint_std[..., axis],
             residuals=residuals,
             up=up,
         )

@@ -30,6 +30,8 @@ def writing(path: str | PathLike[str]) -> Iterator[Path]:
         Where the system refuses (full disk, no permission): names the file and the remedy.
     """
     target = Path(path)
+    if target.exists() and not target.is_file():
+        raise ExportError("a folder or a device of that name is in the way", file=target, remedy="Give another name.")
     temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -255,7 +255,7 @@ def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
                 f"stands {distance:.0f} from the world's origin, which cannot be metres",
                 file=path,
                 place=f"camera {camera.name}",
-                remedy='Pass unit="mm", or write unit = "mm" (under [metadata] in TOML).',
+                remedy='Write unit = "mm" under [calibration] in the take (from Python: unit="mm").',
             )
         return camera
     T = camera.T_camera_world.copy()

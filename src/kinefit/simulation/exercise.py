@@ -32,7 +32,7 @@ def squat_and_wave(body: Body | None = None, *, rate: float = 30.0, duration: fl
     degrees = {
         "lumbar_extension": -12 * depth, "thorax_extension": 3 * look, "thorax_rotation": 8 * look,
         "neck_extension": 20 * depth, "neck_rotation": 30 * look, "neck_bending": 6 * wave * raised,
-        "clav_elev_r": -10 * raised, "arm_flex_r": 15 * raised, "arm_add_r": -8 - 60 * raised,
+        "clav_elev_r": 10 * raised, "arm_flex_r": 15 * raised, "arm_add_r": -8 - 60 * raised,
         "arm_rot_r": -75 * raised,
         "elbow_flex_r": 15 + (65 + 25 * wave) * raised, "pro_sup_r": 80 - 60 * raised,
         "wrist_flex_r": 10 * wave * raised,

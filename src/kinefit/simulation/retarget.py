@@ -19,7 +19,7 @@ from kinefit.simulation.skeletons import BoneDirections, bone_directions, steps
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 
 _ACCURACY = 0.001  # [m] of the target points; small beside a bone, so that the priors only fill in what is free
-_POSTURE = 2.0  # [rad] spread of the angles about rest
+_POSTURE = 0.5  # [rad] spread of the angles about the usual posture: decides the turn of a straight arm
 _CHANGE = 0.2  # [rad] spread of their change from frame to frame
 _LOOSE = 0.004  # [m] the same of hands and feet, which recordings often have bent further than a joint goes
 _POOR = 1000.0  # cost of a frame that is not fitted well

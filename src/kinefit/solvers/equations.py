@@ -82,23 +82,35 @@ def normal_equations(
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
-def covariance(equations: Equations) -> NDArray:
+def lock(body: Body, locked: NDArray | None) -> NDArray:
+    """(6 + D,) bool, degrees of freedom that may not move: those given, and the root of a body that is fixed."""
+    out = np.zeros(body.tree.n_dofs, bool) if locked is None else np.array(locked, bool)
+    out[:6] |= not body.tree.root_free
+    return out
+
+
+def covariance(equations: Equations, *, locked: NDArray | None = None) -> NDArray:
     """(n, n) inverse of the undamped normal matrix; what nothing observes has infinite variance and no covariance.
 
     A degree of freedom counts as unobserved where its information, given all others, is below 1e-10 of its own.
+
+    Parameters
+    ----------
+    locked : (n,) bool, degrees of freedom that are known: their variance is zero. A fixed root always is.
     """
     n = len(equations.depth)
-    out, lost = np.empty((n, n)), np.zeros(n, bool)
+    known, lost = lock(equations.body, locked), np.zeros(n, bool)
+    out, C = np.empty((n, n)), np.array(equations.packed)
     while True:  # a free direction is found at one of its degrees of freedom, then all that take part are taken out
-        C = np.array(equations.packed)
-        if lost.any():
-            H = np.where(lost[:, None] | lost[None, :], np.eye(n), equations.matrix)
+        without = known | lost
+        if without.any():
+            H = np.where(without[:, None] | without[None, :], np.eye(n), equations.matrix)
             _kernels_linear.pack(H, equations.chain, equations.depth, C)
         found = _kernels_linear.invert(C, equations.chain, equations.depth, out)
         if found < 0:
             break
-        lost |= _free_direction(equations.matrix, lost, found)
-    out[lost, :] = out[:, lost] = 0.0
+        lost |= _free_direction(equations.matrix, without, found)
+    out[without, :] = out[:, without] = 0.0
     out[lost, lost] = np.inf
     return out
 

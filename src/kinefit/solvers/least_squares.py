@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
-from kinefit.solvers.equations import Equations, normal_equations
+from kinefit.solvers.equations import Equations, lock, normal_equations
 from kinefit.solvers.losses import SQUARED, Loss
 
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
@@ -62,13 +62,6 @@ def bounds_of(body: Body, limits: bool) -> tuple[NDArray, NDArray]:
         return body.tree.lower, body.tree.upper
     free = np.full(len(body.tree.coordinates), np.inf)
     return -free, free
-
-
-def lock(body: Body, locked: NDArray | None) -> NDArray:
-    """(6 + D,) bool, degrees of freedom that may not move: those given, and the root of a body that is fixed."""
-    out = np.zeros(body.tree.n_dofs, bool) if locked is None else np.array(locked, bool)
-    out[:6] |= not body.tree.root_free
-    return out
 
 
 def gauss_newton(
