@@ -84,9 +84,10 @@ def main() -> None:
     figure("solver_same_residual", spread, "relative", "<= 1e-05", "no peer ran")
     figure("solver_planes", ms_planes, "ms/frame", "<= 0.31")
     solved, at_origin, iterations = from_rest(body, motions, rng)
-    print(f"# from the rest pose: {iterations:.1f} iterations on average; root left at the origin: {100 * at_origin:.1f} %")
+    print(
+        f"# from the rest pose: {iterations:.1f} iterations on average; root at the origin: {100 * at_origin:.1f} %"
+    )
     figure("solver_from_rest", 100.0 * solved, "% solved", "== 100")
-
 
 
 GOALS = (
@@ -174,7 +175,7 @@ def write(folder: Path, motion: Motion, markers: PointSet, x_world: NDArray, pla
 def from_rest(body: Body, motions: dict[str, Motion], rng: np.random.Generator) -> tuple[float, float, float]:
     """Share of 500 frames of all motions that are solved from the rest pose; that without its root laid on; iterations.
 
-    All angles start at zero. The root is laid on the markers as a whole (Kabsch), as every start with no pose given does.
+    All angles start at zero. The root is laid on all markers (Kabsch), as in every start with no pose given.
     """
     markers = body.markers("HANIM_45")
     solved, iterations = np.zeros(2), []

@@ -75,7 +75,9 @@ def held_out(trial: Trial, whole: Motion) -> dict[str, NDArray]:
     out = {}
     for camera, record in zip(trial.rig.names, trial.keypoints, strict=True):
         others = tuple(n for n in trial.rig.names if n != camera)
-        motion = track(trial.rig.select(others), [k for k in trial.keypoints if k.camera != camera], load_body("humanoid"))
+        motion = track(
+            trial.rig.select(others), [k for k in trial.keypoints if k.camera != camera], load_body("humanoid")
+        )
         seen = whole.residuals[camera]
         points = motion.body.keypoints(record.keypoint_set).select(seen.names)
         uv = trial.rig[camera].project(motion.positions(points))
@@ -97,7 +99,7 @@ def real_trial(folder: Path, where: Path) -> None:
         print(f"# {detector}: residual per camera {per_camera} px, swapped frames {swaps}")
         figure(f"video_residual_{detector}", residual, "px", f"<= {GOALS[detector]:g}")
         errors = held_out(trial, motion)
-        print(f"# {detector}: held out {({n: round(float(np.nanmedian(e)), 1) for n, e in errors.items()})} px")
+        print(f"# {detector}: held out { ({n: round(float(np.nanmedian(e)), 1) for n, e in errors.items()}) } px")
         outside = float(np.nanmedian(np.concatenate([e.ravel() for e in errors.values()])))
         figure(f"video_held_out_{detector}", outside, "px", f"<= {1.5 * GOALS[detector]:g}")
         figure(f"video_held_out_ratio_{detector}", outside / residual, "x", "<= 1.5")

@@ -35,6 +35,7 @@ def random_body(seed=0, segments=9, *, root_free=True, prismatic=0.3):
         prismatic=random.random(dofs) < prismatic,
         lower=np.full(dofs, -4.0),
         upper=np.full(dofs, 4.0),
+        usual=np.zeros(dofs),
         spread=np.full(dofs, 1.0),
         root_free=root_free,
     )
@@ -62,11 +63,11 @@ def state_of(body, kind, seed=0):
 
 
 def posture(body, seed=0, share=0.5):
-    """A state like those that people take: angles of half their usual spread, anywhere, any heading, little tilt (y up)."""
+    """A state like those that people take: near the usual one, anywhere, any heading, little tilt (y up)."""
     random = np.random.default_rng(seed)
     tree = body.tree
     spread = np.minimum(tree.spread, 1.5)
-    angles = np.clip(share * spread * random.normal(size=len(spread)), 0.9 * tree.lower, 0.9 * tree.upper)
+    angles = np.clip(tree.usual + share * spread * random.normal(size=len(spread)), 0.9 * tree.lower, 0.9 * tree.upper)
     turn = se3.exp_so3([0, random.uniform(-np.pi, np.pi), 0]) @ se3.exp_so3(0.25 * random.normal(size=3))
     return BodyState(se3.transform(turn, random.normal(scale=(1.0, 0.2, 1.0))), angles)
 

@@ -10,6 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from pymomentum import geometry, solver2
+from scipy.spatial.transform import Rotation
+
 from benchmarks.peers import (
     Problem,
     axes_frame,
@@ -19,8 +22,6 @@ from benchmarks.peers import (
     read_problem,
     root_frame,
 )
-from pymomentum import geometry, solver2
-from scipy.spatial.transform import Rotation
 
 CENTIMETRES = 100.0
 THRESHOLDS = (1e7, 3e6, 1e6, 3e5, 1e5, 3e4, 1e4, 1e3, 1e2)  # in units of single precision's epsilon

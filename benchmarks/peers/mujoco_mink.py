@@ -14,6 +14,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+
 from benchmarks.peers import Problem, marker_residuals, measure, read_problem
 from benchmarks.peers._gauss_newton import THRESHOLDS, solve_sequence
 

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import opensim
-from benchmarks.peers import Problem, axes_frame, marker_residuals, measure, read_problem, root_frame
 from scipy.spatial.transform import Rotation
+
+from benchmarks.peers import Problem, axes_frame, marker_residuals, measure, read_problem, root_frame
 
 ACCURACIES = (1e-5, 1e-6, 5e-7, 3e-7, 1e-7, 1e-8)  # relative; the first is OpenSim's default
 RATE = 100.0  # frames a second, only to tell them apart

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+
 from benchmarks.peers import Problem, marker_residuals, measure, read_problem
 from benchmarks.peers._gauss_newton import THRESHOLDS, solve_sequence
 

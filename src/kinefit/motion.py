@@ -116,7 +116,9 @@ class Motion:
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if not np.all(np.isfinite(self.Ts_world_root)) or not np.all(np.isfinite(self.angles)):
-            raise ObservationError("a motion holds poses that are not finite", remedy="Leave out frames without a pose.")
+            raise ObservationError(
+                "a motion holds poses that are not finite", remedy="Leave out frames without a pose."
+            )
 
     def __len__(self) -> int:
         return len(self.times)

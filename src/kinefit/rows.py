@@ -28,7 +28,7 @@ def _as_kernels_take_them(record: object, **shapes: tuple[type, tuple[int | None
     """Make the named arrays contiguous and of one type, and check their shapes (None: the number of rows)."""
     count = len(getattr(record, next(iter(shapes))))
     for name, (dtype, shape) in shapes.items():
-        array = np.ascontiguousarray(getattr(record, name), dtype)
+        array: NDArray = np.ascontiguousarray(getattr(record, name), dtype)
         wanted = tuple(count if n is None else n for n in shape)
         if array.shape != wanted:
             problem = f"{name} of {type(record).__name__} has shape {array.shape}"
@@ -134,7 +134,13 @@ class PairRows:
     def __post_init__(self) -> None:
         point, number = (float, (None, 3)), (float, (None,))
         _as_kernels_take_them(
-            self, segments=(np.int64, (None, 2)), point_a=point, point_b=point, direction=point, residual=number, weight=number
+            self,
+            segments=(np.int64, (None, 2)),
+            point_a=point,
+            point_b=point,
+            direction=point,
+            residual=number,
+            weight=number,
         )
         _check("pair rows", self.point_a, self.point_b, self.direction, self.residual, self.weight)
 

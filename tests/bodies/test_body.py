@@ -119,7 +119,7 @@ def test_a_body_as_arrays_comes_back_the_same(body):
     np.testing.assert_array_equal(back.positions(state, back.landmarks), body.positions(state, body.landmarks))
     for name in ("segments", "coordinates", "root_free"):
         assert getattr(back.tree, name) == getattr(body.tree, name)
-    for name in ("parents", "owners", "axes", "prismatic", "lower", "upper", "spread", "offsets"):
+    for name in ("parents", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread", "offsets"):
         np.testing.assert_array_equal(getattr(back.tree, name), getattr(body.tree, name))
     assert (back.name, back.joints, back.scale_groups, back.stature) == (body.name, body.joints, body.scale_groups, body.stature)
     assert set(back.keypoint_sets) == set(body.keypoint_sets) and back.surfaces == body.surfaces

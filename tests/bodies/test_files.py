@@ -61,9 +61,17 @@ def test_a_file_becomes_a_body(tmp_path):
     np.testing.assert_allclose(tree.upper, [np.pi / 4, np.radians(20), 0.2])
     np.testing.assert_allclose(tree.spread, [np.radians(30), np.radians(5), 0.1])
     np.testing.assert_allclose(tree.rest[-1], [0.1, 0.8, 0.1])
+    np.testing.assert_array_equal(tree.usual, 0.0)
     assert body.scale_groups == ("base", "limb", "slide", "tool")
     assert body.markers("SET").names == ("tip", "m1") and body.keypoints("CAM").names == ("Tip",)
     assert body.alias("bvh", "arm") == "Arm" and body.surfaces[0].segment == 1
+
+
+def test_the_usual_posture():
+    given = ROBOT.replace("spread = [30, 5]", "usual = [-30, 10]").replace("[[0.0, 0.2]]", "[[0.1, 0.2]]")
+    body = parse_body(given)
+    np.testing.assert_allclose(body.tree.usual, [np.radians(-30), np.radians(10), 0.1])  # zero, or what is nearest to it
+    np.testing.assert_array_equal(body.usual_state().angles, body.tree.usual)
 
 
 def test_joints_move_as_their_axes_say():
@@ -129,11 +137,13 @@ BAD = {
     "marker twice": (changed("m1 =", "tip ="), ("marker named twice: tip",), "markers.SET"),
     "too few axes": (changed('axes = ["-y"], ', ""), ("prismatic joint has 1", "here are 0"), "joint rail"),
     "too many axes": (changed('axes = ["-y"]', 'axes = ["-y", "x"]'), ("prismatic joint has 1", "here are 2"), "joint rail"),
-    "too few coordinates": (changed('["lift", "turn"]', '["lift"]'), ("universal joint has 2", "2, 1, 2 and 2"), "joint shoulder"),
-    "too few ranges": (changed("range = [[-90, 45], [-10, 20]]", "range = [[-90, 45]]"), ("universal", "2, 2, 1 and 2"), "joint shoulder"),
-    "too many spreads": (changed("spread = [30, 5]", "spread = [30, 5, 1]"), ("universal", "2, 2, 2 and 3"), "joint shoulder"),
+    "too few coordinates": (changed('["lift", "turn"]', '["lift"]'), ("universal joint has 2", "2, 1, 2, 0 and 2"), "joint shoulder"),
+    "too few ranges": (changed("range = [[-90, 45], [-10, 20]]", "range = [[-90, 45]]"), ("universal", "2, 2, 1, 0 and 2"), "joint shoulder"),
+    "too many spreads": (changed("spread = [30, 5]", "spread = [30, 5, 1]"), ("universal", "2, 2, 2, 0 and 3"), "joint shoulder"),
     "empty range": (changed("[-10, 20]", "[20, -10]"), ("range", "turn", "empty"), "joint shoulder"),
     "spread of zero": (changed("spread = [30, 5]", "spread = [30, 0]"), ("spread", "turn", "not positive"), "joint shoulder"),
+    "usual beyond the range": (changed("spread = [30, 5]", "usual = [0, 25]"), ("usual 25", "turn", "-10.0 to 20.0"), "joint shoulder"),
+    "usual not finite": (changed('axes = ["-y"], range = [[0.0, 0.2]]', 'axes = ["-y"], usual = [inf]'), ("usual inf", "rail"), "joint rail"),
     "unknown type": (changed('"prismatic"', '"slider"'), ("no joint type 'slider'", "prismatic"), "joint rail"),
     "landmark without segment": (changed('tip = { segment = "tool"', 'tip = { segment = "tol"'), ("no segment 'tol'", "tool"), "landmark tip"),
     "keypoint without landmark": (changed('Tip = "tip"', 'Tip = "top"'), ("no landmark 'top'", "tip, elbow"), "keypoints.CAM.Tip"),

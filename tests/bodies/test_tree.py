@@ -177,7 +177,7 @@ def test_arrays_are_read_only():
 
 def test_a_tree_without_joints_is_a_rigid_body():
     empty = np.empty(0)
-    tree = KinematicTree(("thing",), np.array([-1]), np.zeros((1, 3)), (), empty, empty, empty, empty, empty, empty)
+    tree = KinematicTree(("thing",), np.array([-1]), np.zeros((1, 3)), (), *[empty] * 7)
     T = se3.exp(np.arange(6.0) / 3)
     frames, screws = tree.forward(T, empty)
     assert tree.n_dofs == 6 and screws.shape == (0, 6)

@@ -143,7 +143,8 @@ def test_the_gradient_is_that_of_the_robust_cost(body):
 def test_no_rows_are_nothing(body):
     found = normal_equations(body, state_of(body, "random"), [])
     assert found.cost == 0 and not found.matrix.any() and not found.gradient.any()
-    assert np.all(np.isinf(np.diag(covariance(found))))
+    unknown = np.isinf(np.diag(covariance(found)))
+    assert np.all(unknown[6:]) and np.all(unknown[:6] == body.tree.root_free)
 
 
 def test_the_far_origin_of_the_world_costs_no_digits():
@@ -212,7 +213,21 @@ def test_covariance_is_the_inverse(body, pairs):
     parts = [random_rows(body, state, 600), ParameterRows(np.arange(n), np.zeros(n), np.ones(n))]
     parts += [random_pairs(body, state)] if pairs else []
     equations = normal_equations(body, state, parts)
-    np.testing.assert_allclose(covariance(equations), np.linalg.inv(equations.matrix), rtol=1e-7, atol=1e-11)
+    free = slice(0 if body.tree.root_free else 6, n)
+    cov = covariance(equations)
+    np.testing.assert_allclose(cov[free, free], np.linalg.inv(equations.matrix[free, free]), rtol=1e-7, atol=1e-11)
+    assert not cov[: free.start].any()
+
+
+def test_what_is_locked_is_known():
+    body = random_body(0)
+    state, n = state_of(body, "random"), body.tree.n_dofs
+    equations = normal_equations(body, state, random_rows(body, state, 600))
+    locked = np.isin(np.arange(n), [1, 4, 8])
+    cov = covariance(equations, locked=locked)
+    assert not cov[locked].any() and not cov[:, locked].any()
+    free = np.flatnonzero(~locked)
+    np.testing.assert_allclose(cov[np.ix_(free, free)], np.linalg.inv(equations.matrix[np.ix_(free, free)]), rtol=1e-7, atol=1e-11)
 
 
 def arm_scene(seed=0):
@@ -241,7 +256,6 @@ def test_covariance_agrees_with_sampled_noise():
     np.testing.assert_allclose(centres[..., :3, 3].std(axis=0), joint_std(body, truth, cov), rtol=0.12)
 
 
-@pytest.mark.xfail(reason="the covariance of a body with a fixed root counts the root as unknown")
 def test_a_fixed_root_is_known():
     """The arm's shoulder stays where it is put, so seven angles are all that is unknown."""
     body, truth, points = arm_scene()
@@ -301,7 +315,7 @@ def test_angles_that_only_count_together():
     tree = KinematicTree(
         base.tree.segments, np.array([-1, 0, 1, 2]), np.array([[0, 0, 0], [0.2, 0, 0], [0, 0, 0.3], [0, 0.4, 0.0]]),
         ("a", "b", "c"), np.array([1, 2, 3]), np.array([[0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]]), np.zeros(3, bool),
-        np.full(3, -3.0), np.full(3, 3.0), np.ones(3),
+        np.full(3, -3.0), np.full(3, 3.0), np.zeros(3), np.ones(3),
     )  # fmt: skip
     body = replace(base, tree=tree)
     keep = tuple(n for n, s in zip(body.landmarks.names, body.landmarks.segments, strict=True) if s != 1)

@@ -47,9 +47,9 @@ def measured(kind, truth, seed=0):
 
 @pytest.mark.parametrize("kind", ["points", "pixels", "rays", "planes"])
 @pytest.mark.parametrize("seed", range(8))
-def test_a_posture_is_found_from_the_rest_pose(kind, seed):
+def test_a_posture_is_found_from_the_usual_one(kind, seed):
     truth = posture(HUMANOID, seed, 0.35)
-    start = HUMANOID.rest_state() if kind == "points" else HUMANOID.rest_state(truth.T_world_root)
+    start = HUMANOID.usual_state() if kind == "points" else HUMANOID.usual_state(truth.T_world_root)
     fit = levenberg_marquardt(HUMANOID, start, measured(kind, truth))
     assert fit.converged and fit.iterations < 40
     np.testing.assert_allclose(HUMANOID.positions(fit.state, POINTS), HUMANOID.positions(truth, POINTS), atol=1e-5)
@@ -241,7 +241,7 @@ def test_a_planar_chain_of_two_closes_as_its_formula_says():
     l1, l2, reach = 0.4, 0.3, 0.5
     tree = KinematicTree(
         ("ground", "crank", "rod"), [-1, 0, 1], [[0, 0, 0], [0, 0, 0], [l1, 0, 0]], ("a", "b"), [1, 2], [[0, 0, 1]] * 2,
-        [False] * 2, [-3.0] * 2, [3.0] * 2, [np.inf] * 2, root_free=False,
+        [False] * 2, [-3.0] * 2, [3.0] * 2, [0.0] * 2, [np.inf] * 2, root_free=False,
     )  # fmt: skip
     nothing = PointSet((), np.empty(0), np.empty((0, 3)))
     body = Body("crank", tree, ("p", "q", "r"), ("all",), np.zeros(3, int), nothing)
@@ -269,8 +269,7 @@ def test_prediction_and_measurement_share_by_their_variances():
 def rigid_body():
     random = np.random.default_rng(4)
     points = PointSet(tuple("abcdefghij"), np.zeros(10, int), random.uniform(-0.4, 0.4, (10, 3)))
-    empty = np.empty(0)
-    tree = KinematicTree(("car",), [-1], np.zeros((1, 3)), (), empty, empty, empty, empty, empty, empty)
+    tree = KinematicTree(("car",), [-1], np.zeros((1, 3)), (), *[np.empty(0)] * 7)
     return Body("car", tree, ("root",), ("car",), [0], points)
 
 

@@ -14,8 +14,8 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
     """Segment frames and joint screws of one pose (product of exponentials; P1 3.1, P3 eq. 6).
 
     Parameters: parents (S,), dof_start (S+1,), prismatic (D,) bool, axes (D, 3), rest (S, 3): joint centres in the root
-    frame at rest; root (4, 4), angles (D,). Out: frames (S, 12) = rotation row-major and t, so that a point given in the
-    root frame at rest moves to R x + t; screws (D, 6) = (v, ω) in the world about the root's origin.
+    frame at rest; root (4, 4), angles (D,). Out: frames (S, 12) = rotation row-major and t, so that a point given in
+    the root frame at rest moves to R x + t; screws (D, 6) = (v, ω) in the world about the root's origin.
     """
     cx, cy, cz = root[0, 3], root[1, 3], root[2, 3]
     for s in range(parents.size):
@@ -54,7 +54,9 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
             sine = np.sin(q)
             half = np.sin(0.5 * q)
             versine = 2.0 * half * half
-            for i in range(0, 9, 3):  # rows of R exp(q â), with a as it is at rest: w's rounding would grow along a chain
+            for i in range(
+                0, 9, 3
+            ):  # rows of R exp(q â), with a as it is at rest: w's rounding would grow along a chain
                 r0, r1, r2 = f[i], f[i + 1], f[i + 2]
                 dot = r0 * ax + r1 * ay + r2 * az
                 f[i] = r0 + sine * (r1 * az - r2 * ay) + versine * (ax * dot - r0)

@@ -25,7 +25,7 @@ class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     pass
 
 
-class _Joint(_Record):
+class _Joint(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     type: str
     at: Vector = (0.0, 0.0, 0.0)
@@ -36,12 +36,12 @@ class _Joint(_Record):
     spread: list[float] = []
 
 
-class _Surface(_Record):
+class _Surface(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     end: Vector
     radii: tuple[float, float]
 
 
-class _Segment(_Record):
+class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     joint: _Joint
     parent: str | None = None
@@ -50,23 +50,23 @@ class _Segment(_Record):
     names: dict[str, str] = {}
 
 
-class _Point(_Record):
+class _Point(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     segment: str
     at: Vector
 
 
-class _Head(_Record):
+class _Head(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     stature: float = 0.0
     mirror: bool = False
 
 
-class _MarkerSet(_Record):
+class _MarkerSet(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     points: list[str] = []
     placed: dict[str, _Point] = {}
 
 
-class _File(_Record):
+class _File(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     body: _Head
     segment: list[_Segment]
     landmarks: dict[str, _Point] = {}
@@ -112,11 +112,16 @@ def parse_body(text: str, source: str = "body") -> Body:
     try:
         record = msgspec.convert(tomllib.loads(text), _File)
     except tomllib.TOMLDecodeError as error:
-        raise BodyError(f"not valid TOML ({error})", file=source, remedy="Correct it there; see https://toml.io.") from error
+        raise BodyError(
+            f"not valid TOML ({error})", file=source, remedy="Correct it there; see https://toml.io."
+        ) from error
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         raise BodyError(
-            f"not a body file: {problem}", file=source, place=place.strip(".`") or None, remedy="See docs/bodies.md for its keys."
+            f"not a body file: {problem}",
+            file=source,
+            place=place.strip(".`") or None,
+            remedy="See docs/bodies.md for its keys.",
         ) from error
     segments = _in_order(_mirrored(record.segment) if record.body.mirror else list(record.segment), source)
     points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
@@ -164,7 +169,9 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
             axes=axes,
             coordinates=[_left(c) for c in s.joint.coordinates],
         )
-        surface = s.surface and _Surface(end=(s.surface.end[0], s.surface.end[1], -s.surface.end[2]), radii=s.surface.radii)
+        surface = s.surface and _Surface(
+            end=(s.surface.end[0], s.surface.end[1], -s.surface.end[2]), radii=s.surface.radii
+        )
         names = {convention: _left(name) for convention, name in s.names.items()}
         parent = _left(s.parent) if s.parent else None
         out.append(
@@ -194,12 +201,16 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
     for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
         twice = {n for n in items if items.count(n) > 1}
         if twice:
-            raise BodyError(f"{what} named twice: {', '.join(sorted(twice))}", file=source, remedy="Rename one of them.")
+            raise BodyError(
+                f"{what} named twice: {', '.join(sorted(twice))}", file=source, remedy="Rename one of them."
+            )
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
         raise BodyError(
-            f"a body has exactly one segment without a parent, here: {found}", file=source, remedy="Give the others a parent."
+            f"a body has exactly one segment without a parent, here: {found}",
+            file=source,
+            remedy="Give the others a parent.",
         )
     for s in segments:
         if s.parent is not None and s.parent not in names:
@@ -213,7 +224,9 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
         stack += reversed([c for c in segments if c.parent == s.name])
     if len(out) != len(segments):
         lost = ", ".join(n for n in names if n not in {s.name for s in out})
-        raise BodyError(f"the segments {lost} form a cycle", file=source, remedy="Every chain of parents must end at the root.")
+        raise BodyError(
+            f"the segments {lost} form a cycle", file=source, remedy="Every chain of parents must end at the root."
+        )
     return out
 
 
@@ -223,9 +236,13 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
     for i, s in enumerate(segments):
         j, place = s.joint, f"joint {s.joint.name}"
         if j.type not in JOINT_TYPES:
-            raise BodyError(choices("joint type", j.type, JOINT_TYPES), file=source, place=place, remedy="Use one of these.")
+            raise BodyError(
+                choices("joint type", j.type, JOINT_TYPES), file=source, place=place, remedy="Use one of these."
+            )
         if i == 0 and any(j.at):
-            raise BodyError("the root's joint is the origin of the body", file=source, place=place, remedy="Leave out `at`.")
+            raise BodyError(
+                "the root's joint is the origin of the body", file=source, place=place, remedy="Leave out `at`."
+            )
         _finite(j.at, source, place)
         if j.type == "free" and i == 0:
             continue
@@ -234,14 +251,15 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
         coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
         if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.usual), len(j.spread)} - {0, count}:
             raise BodyError(
-                f"a {j.type} joint has {count} axes, coordinates and (if any) ranges, usuals and spreads; here are {len(axes)}, "
-                f"{len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}",
+                f"a {j.type} joint has {count} axes, coordinates and, if any, ranges, usuals and spreads; "
+                f"here {len(axes)}, {len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}",
                 file=source,
                 place=place,
                 remedy="Give each of these lists one entry for each axis.",
             )
         for k in range(count):
-            axis = np.array(_AXES.get(axes[k], [np.nan] * 3) if isinstance(axes[k], str) else axes[k], float)
+            named = axes[k]
+            axis = np.array(_AXES.get(named, [np.nan] * 3) if isinstance(named, str) else named, float)
             norm = np.linalg.norm(axis)
             if not 1e-9 < norm < np.inf:
                 raise BodyError(
@@ -259,8 +277,9 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
                 problem = f"spread {spread} of {coordinates[k]} is not positive"
                 raise BodyError(problem, file=source, place=place, remedy="Give inf for no prior.")
             usual = j.usual[k] if j.usual else min(max(0.0, low), high)
-            if not low <= usual <= high:
-                raise BodyError(f"usual {usual} of {coordinates[k]} is out of its range", file=source, place=place)
+            if not (low <= usual <= high and np.isfinite(usual)):
+                problem = f"usual {usual} of {coordinates[k]} is out of its range"
+                raise BodyError(problem, file=source, place=place, remedy=f"Give a number from {low} to {high}.")
             unit = 1.0 if slides[k] else np.pi / 180.0
             names.append(coordinates[k])
             rows.append((i, axis / norm, slides[k], low * unit, high * unit, usual * unit, spread * unit))
@@ -286,7 +305,9 @@ def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> Kinem
 
 def _finite(at: Vector, source: str, place: str) -> None:
     if not np.all(np.isfinite(at)):
-        raise BodyError(f"`at` is not finite: {list(at)}", file=source, place=place, remedy="Give three numbers in metres.")
+        raise BodyError(
+            f"`at` is not finite: {list(at)}", file=source, place=place, remedy="Give three numbers in metres."
+        )
 
 
 def _points(
@@ -296,7 +317,9 @@ def _points(
         if segment not in index:
             raise BodyError(choices("segment", segment, index), file=source, place=what + name, remedy=_CHOOSE)
         _finite(at, source, what + name)
-    return PointSet(tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()]))
+    return PointSet(
+        tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()])
+    )
 
 
 def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:

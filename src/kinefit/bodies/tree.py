@@ -20,7 +20,7 @@ ROOT_DOFS = ("root_tx", "root_ty", "root_tz", "root_rx", "root_ry", "root_rz")
 
 
 def _frozen(array: object, dtype: type = float) -> NDArray:
-    out = np.array(array, dtype=dtype)
+    out: NDArray = np.array(array, dtype=dtype)
     out.flags.writeable = False
     return out
 
@@ -117,7 +117,7 @@ class KinematicTree:
 
     @cached_property
     def chain(self) -> NDArray:
-        """(n, m) degrees of freedom from the root down to each one itself: the pattern of the normal matrix; then -1."""
+        """(n, m) degrees of freedom from the root down to each one: the pattern of the normal matrix; then -1."""
         out = np.full((self.n_dofs, int(self.depth.max()) + 1), -1)
         for k in range(self.n_dofs):
             if k:
@@ -156,9 +156,7 @@ class KinematicTree:
         frames = np.empty((len(roots), len(self.segments), 12))
         angles = np.ascontiguousarray(angles, dtype=float)
         self._check_angles(angles.shape[-1])
-        _kernels.forward_many(
-            self.parents, self.dof_start, self.prismatic, self.axes, self.rest, roots, angles, frames
-        )
+        _kernels.forward_many(self.parents, self.dof_start, self.prismatic, self.axes, self.rest, roots, angles, frames)
         Ts = np.zeros((*frames.shape[:2], 4, 4))
         Ts[..., :3, :3] = frames[..., :9].reshape(*frames.shape[:2], 3, 3)
         Ts[..., :3, 3] = frames[..., 9:] + (Ts[..., :3, :3] @ self.rest[:, :, None])[..., 0]

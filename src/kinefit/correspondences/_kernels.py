@@ -1,7 +1,7 @@
 """Row makers as kernels: they fill lines `start..` of the row buffers and return the next free line.
 
-Common parameters: frames (S, 12) from forward kinematics; owner (K,) segments and rest (K, 3) points in the root frame at
-rest; buffers data (8, N) = x, n, r, w; segment (N,); group (N,).
+Common parameters: frames (S, 12) from forward kinematics; owner (K,) segments and rest (K, 3) points in the root frame
+at rest; buffers data (8, N) = x, n, r, w; segment (N,); group (N,).
 """
 
 from __future__ import annotations
@@ -67,11 +67,21 @@ def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, s
         f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
         t0, t1, t2 = f[9], f[10], f[11]
         i, n = start + first, k - first
-        rx, ry, rz = rest[0, first:k], rest[1, first:k], rest[2, first:k]  # slices: so that the loop becomes vector code
+        rx, ry, rz = (
+            rest[0, first:k],
+            rest[1, first:k],
+            rest[2, first:k],
+        )  # slices: so that the loop becomes vector code
         tx, ty, tz = target[0, first:k], target[1, first:k], target[2, first:k]
         nx, ny, nz, w = normal[0, first:k], normal[1, first:k], normal[2, first:k], weight[first:k]
         px, py, pz = data[0, i : i + n], data[1, i : i + n], data[2, i : i + n]
-        ox, oy, oz, r, v = data[3, i : i + n], data[4, i : i + n], data[5, i : i + n], data[6, i : i + n], data[7, i : i + n]
+        ox, oy, oz, r, v = (
+            data[3, i : i + n],
+            data[4, i : i + n],
+            data[5, i : i + n],
+            data[6, i : i + n],
+            data[7, i : i + n],
+        )
         for j in range(n):
             x = f0 * rx[j] + f1 * ry[j] + f2 * rz[j] + t0
             y = f3 * rx[j] + f4 * ry[j] + f5 * rz[j] + t1
@@ -146,7 +156,11 @@ def ray_rows(frames, owner, rest, line, weight, data, segment, group, start):
             continue
         x, y, z = place(frames, owner, rest, k)
         n0, n1, n2 = line[k, 0], line[k, 1], line[k, 2]
-        fx, fy, fz = n1 * line[k, 5] - n2 * line[k, 4], n2 * line[k, 3] - n0 * line[k, 5], n0 * line[k, 4] - n1 * line[k, 3]
+        fx, fy, fz = (
+            n1 * line[k, 5] - n2 * line[k, 4],
+            n2 * line[k, 3] - n0 * line[k, 5],
+            n0 * line[k, 4] - n1 * line[k, 3],
+        )
         # a branch-free frame about n (Duff et al. 2017)
         sign = math.copysign(1.0, n2)
         p = -1.0 / (sign + n2)

@@ -1,4 +1,4 @@
-"""Point to pixel: a keypoint seen by a camera, as the exact linearisation of reprojection (P1-2, 3D point - 2D point)."""
+"""Point to pixel: a camera's keypoint, as the exact linearisation of reprojection (P1-2, 3D point - 2D point)."""
 
 from __future__ import annotations
 

@@ -9,9 +9,7 @@ from kinefit.correspondences import _kernels, targets
 from kinefit.rows import Rows
 
 
-def point_rows(
-    body: Body, state: BodyState, points: PointSet, x_world: ArrayLike, *, sigma: ArrayLike = 0.01
-) -> Rows:
+def point_rows(body: Body, state: BodyState, points: PointSet, x_world: ArrayLike, *, sigma: ArrayLike = 0.01) -> Rows:
     """Three rows a point: n = the world's axes, r = target − x (P2 3.2, "3D point to point").
 
     Parameters

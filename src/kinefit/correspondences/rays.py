@@ -10,9 +10,7 @@ from kinefit.correspondences import _kernels, targets
 from kinefit.rows import Rows
 
 
-def ray_rows(
-    body: Body, state: BodyState, points: PointSet, lines: ArrayLike, *, sigma: ArrayLike = 0.01
-) -> Rows:
+def ray_rows(body: Body, state: BodyState, points: PointSet, lines: ArrayLike, *, sigma: ArrayLike = 0.01) -> Rows:
     """Two rows a point: its offset to the line along two directions at right angles (x × n − m, P3 eq. 4).
 
     Parameters

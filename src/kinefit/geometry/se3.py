@@ -1,7 +1,7 @@
 """Rigid motions and twists: exp, log, adjoint, left Jacobian; batched, exact near identity and near π.
 
-A twist is ξ = (v, ω), spatial, in metres and radians: a point x moves by v + ω × x (P3, eqs. 1-4). All functions take any
-leading shape. The coefficients are series where closed forms cancel, so that nothing is lost for small angles.
+A twist is ξ = (v, ω), spatial, in metres and radians: a point x moves by v + ω × x (P3, eqs. 1-4). All functions take
+any leading shape. The coefficients are series where closed forms cancel, so that nothing is lost for small angles.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def exp_so3(omega: NDArray) -> NDArray:
 
 
 def quaternion(rotation: NDArray) -> NDArray:
-    """Unit quaternion (..., 4) as (w, x, y, z), w ≥ 0, of a rotation matrix (..., 3, 3); stable everywhere (Shepperd)."""
+    """Unit quaternion (..., 4) as (w, x, y, z), w ≥ 0, of a rotation matrix (..., 3, 3); always stable (Shepperd)."""
     r = np.asarray(rotation, float)
     m00, m11, m22 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
@@ -137,8 +137,8 @@ def left_jacobian_so3(omega: NDArray) -> NDArray:
 
 def _left_so3_inverse(omega: NDArray) -> NDArray:
     theta = np.linalg.norm(omega, axis=-1)
-    a, b, c = _coefficients(theta)
-    # 1/θ² − A/(2Bθ²) = (2B − A) / (2Bθ²), and 2B − A = θ² (c − e) with e = (½ − B) / θ²
+    _, b, c = _coefficients(theta)
+    # 1/θ² − A/(2Bθ²) = (2B − A) / (2Bθ²), and 2B − A = θ² (c − 2e) with e = (½ − B) / θ²
     e = np.where(theta < _SMALL, _series(theta**2, 4), (0.5 - b) / np.where(theta < _SMALL, 1.0, theta) ** 2)
     d = (c - 2.0 * e) / (2.0 * b)
     w = hat(omega)

@@ -59,7 +59,7 @@ def weigh(data, group, count, kind, scale, factor):
 
 @jit
 def accumulate(data, segment, factor, count, cx, cy, cz, blocks):
-    """Add all rows into blocks (S, 27): the upper triangle of Σ w a aᵀ row by row, then Σ w a r; a = (n, (x − c) × n)."""
+    """Add all rows into blocks (S, 27): upper triangle of Σ w a aᵀ row by row, then Σ w a r; a = (n, (x − c) × n)."""
     i = 0
     while i < count:
         s = segment[i]

@@ -1,9 +1,10 @@
 """Linear algebra of a tree: packing, factors, damped steps, elimination.
 
-The tree makes H sparse: two degrees of freedom meet only when one is above the other. Row k of the packed matrix C holds
-H[k, chain[k, t]] for t = 0..depth[k], from the root down to k itself, where `chain` (n, m) lists what stands above each
-degree of freedom. The factorisation H = Lᵀ L keeps that pattern (Featherstone 2005), and since the chain of an ancestor
-is the start of one's own, every inner loop runs over neighbours in memory. Chains 0..k make the same code dense.
+The tree makes H sparse: two degrees of freedom meet only when one is above the other. Row k of the packed matrix C
+holds H[k, chain[k, t]] for t = 0..depth[k], from the root down to k itself, where `chain` (n, m) lists what stands
+above each degree of freedom. The factorisation H = Lᵀ L keeps that pattern (Featherstone 2005), and since the chain
+of an ancestor is the start of one's own, every inner loop runs over neighbours in memory. Chains 0..k make the same
+code dense.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ def hold(angles, lower, upper, locked, chain, depth, C, g):
 
 @jit
 def damped_step(C, g, damping, chain, depth, angles, lower, upper, locked, L, delta):
-    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if H + λ is not positive."""
+    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if that failed."""
     n = g.size
     for i in range(n):
         for t in range(depth[i] + 1):

@@ -26,7 +26,7 @@ class Equations:
     packed : (n, m) H in the pattern of chain and depth, see `_kernels_linear`.
     gradient : (n,) g = Σ Jᵀ W r.
     cost : float, Σ ρ(w r²) over all rows.
-    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it where pair rows couple them.
+    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it with pair rows.
     """
 
     body: Body
@@ -78,7 +78,8 @@ def normal_equations(
                 q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
                 centre, screws, tree.dof_parent, tree.last_dof, H, g,
             )  # fmt: skip
-        C, chain, depth = H, np.tile(np.arange(n), (n, 1)), np.arange(n)
+        chain, depth = np.tile(np.arange(n), (n, 1)), np.arange(n)
+        return Equations(body, state, rows, factor, H, g, float(cost), chain, depth)
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
@@ -127,7 +128,7 @@ def _free_direction(H: NDArray, lost: NDArray, found: int) -> NDArray:
 
 
 def joint_std(body: Body, state: BodyState, cov: NDArray) -> NDArray:
-    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where it depends on the unobserved."""
+    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is unobserved."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     lost = ~np.isfinite(np.diag(cov))

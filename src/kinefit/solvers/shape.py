@@ -16,7 +16,6 @@ from kinefit.geometry.camera import Rig
 from kinefit.solvers import _kernels_linear, _kernels_shape
 from kinefit.solvers.losses import Loss, geman_mcclure
 
-
 _MIDDLE = 0.002  # [m] spread of a point in the middle to either side
 _POSTURE = 0.01  # share of the posture prior: here lengths matter, and it would bend them
 
@@ -61,7 +60,9 @@ def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, N
     for k in range(len(points)):
         flipped = points.points[k] * (1.0, 1.0, -1.0)
         other = names[k][:-2] + "_r" if names[k].endswith("_l") else names[k]
-        same = [j for j in range(len(points)) if names[j] == other and np.allclose(points.points[j], flipped, atol=1e-6)]
+        same = [
+            j for j in range(len(points)) if names[j] == other and np.allclose(points.points[j], flipped, atol=1e-6)
+        ]
         if same and abs(points.points[k, 2]) < 1e-9 and names[k] == other and not names[k].endswith("_r"):
             sign[k] = 0.0
         elif same and (names[k].endswith("_l") or points.points[k, 2] < -1e-9) and not names[k].endswith("_r"):

@@ -40,7 +40,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         meetings = _meetings(rig, keypoints, surety, frames)
         last: NDArray | None = None
         for f in range(frames):
-            people = [(q, p) for q, sure in enumerate(surety) for p in np.flatnonzero(sure[f] > 0)]
+            people = [(q, int(p)) for q, sure in enumerate(surety) for p in np.flatnonzero(sure[f] > 0)]
             group, last = _best_group(people, meetings, surety, f, last)
             for q, p in group:
                 chosen[q][f] = p

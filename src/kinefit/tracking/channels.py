@@ -100,7 +100,12 @@ def make_channels(
             raise ObservationError(f"body '{body.name}' has none of the points of {name}")
         parts.append(body.keypoints(name).select(tuple(chosen)))
         sets[name] = slice(start, start := start + len(chosen))
-    source, camera, column, partner, spread, uv, confidence = [], [], [], [], [], [], []
+    source: list[int] = []
+    camera: list[int] = []
+    column: list[int] = []
+    partner: list[int] = []
+    spread: list[float] = []
+    uv, confidence = [], []
     for q, (record, person) in enumerate(zip(keypoints, people, strict=True)):
         span, chosen = sets[record.keypoint_set], names[record.keypoint_set]
         first = len(source)

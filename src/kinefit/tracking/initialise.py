@@ -16,7 +16,7 @@ from kinefit.tracking.channels import Channels, exchange
 
 
 def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float = 30.0) -> NDArray:
-    """(F, K, 3) [m] points of some frames on which two or more cameras agree, NaN elsewhere; see `triangulated_frame`."""
+    """(F, K, 3) [m] points of some frames on which two cameras agree, NaN elsewhere; see `triangulated_frame`."""
     return np.stack(
         [
             triangulated_frame(channels, channels.uv[f], channels.confidence[f], max_residual_px=max_residual_px)[0]
@@ -28,7 +28,7 @@ def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float 
 def triangulated_frame(
     channels: Channels, uv: NDArray, confidence: NDArray, *, max_residual_px: float = 30.0
 ) -> tuple[NDArray, NDArray]:
-    """Points (K, 3) [m] of one frame on which two or more cameras agree, NaN elsewhere; and which sources were exchanged.
+    """Points (K, 3) [m] of one frame on which two cameras agree, NaN elsewhere; and which sources were exchanged.
 
     Where exchanging left and right in some sources makes more of them agree, it is done: one source after the other,
     the best first. (Q,) bool tells which.
@@ -152,7 +152,9 @@ def pose_from_points(
     def rows(state: BodyState) -> list[AnyRows]:
         return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
 
-    starts = [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
+    starts = (
+        [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
+    )
     fits = []
     for start in starts:
         rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state

@@ -48,9 +48,8 @@ def fit_markers(
     x = markers.positions[:, columns]
     first, state = _start(body, points, x)
     loss = loss or geman_mcclure()
-    run = {"sigma": sigma, "loss": loss, "limits": limits}
-    after = fit_sequence(body, state, points, x[first:], **run)
-    before = fit_sequence(body, state, points, x[:first][::-1], **run)
+    after = fit_sequence(body, state, points, x[first:], sigma=sigma, loss=loss, limits=limits)
+    before = fit_sequence(body, state, points, x[:first][::-1], sigma=sigma, loss=loss, limits=limits)
     roots = np.concatenate([before.Ts_world_root[::-1], after.Ts_world_root])
     angles = np.concatenate([before.angles[::-1], after.angles])
     return _motion(body, markers, points, x, roots, angles, sigma, loss)
@@ -59,7 +58,8 @@ def fit_markers(
 def _matched(body: Body, markers: Markers, marker_set: str | None) -> tuple[PointSet, list[int]]:
     labels = [name.rpartition(":")[2] for name in markers.names]
     sets = {marker_set: body.markers(marker_set)} if marker_set else body.marker_sets
-    best, columns = None, []
+    best: PointSet | None = None
+    columns: list[int] = []
     for points in sets.values():
         known = [n for n in points.names if n in labels]
         if len(known) > len(columns):
@@ -86,7 +86,14 @@ def _start(body: Body, points: PointSet, x: NDArray) -> tuple[int, BodyState]:
 
 
 def _motion(
-    body: Body, markers: Markers, points: PointSet, x: NDArray, roots: NDArray, angles: NDArray, sigma: ArrayLike, loss: Loss
+    body: Body,
+    markers: Markers,
+    points: PointSet,
+    x: NDArray,
+    roots: NDArray,
+    angles: NDArray,
+    sigma: ArrayLike,
+    loss: Loss,
 ) -> Motion:
     frames, dofs, segments = len(x), body.tree.n_dofs, len(body.tree.segments)
     dof_std, joints = np.empty((frames, dofs)), np.empty((frames, segments, 3))

@@ -65,7 +65,7 @@ def fit_subject(
     if not states:
         raise TrackingError(
             "no frame shows enough of the person in two cameras to start from",
-            remedy="Check the calibration and that the cameras are in step; kinefit track -v tells which cameras agree.",
+            remedy="Check the calibration and that the cameras are in step (kinefit track -v).",
         )
     weight = _weights(body.scaled(scales), sized, states)
     pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[list(states)], weight)

@@ -32,7 +32,9 @@ def track_take(
     observations = load_observations(take)
     if not observations.keypoints or observations.rig is None:
         raise TakeError(
-            "the take has no [[keypoints]]", file=take.path, remedy="Tracking needs 2D keypoints of two or more cameras."
+            "the take has no [[keypoints]]",
+            file=take.path,
+            remedy="Tracking needs 2D keypoints of two or more cameras.",
         )
     motion = track(
         observations.rig,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ class Settings:
         Quality below which a frame is started anew from its own keypoints.
     """
 
-    loss: Loss = geman_mcclure()
+    loss: Loss = field(default_factory=geman_mcclure)
     angle_acceleration: float = 400.0
     root_acceleration: float = 60.0
     velocity_gain: float = 0.25
@@ -104,7 +104,7 @@ class Tracker:
         self._state, self._velocity = state, np.zeros_like(self._velocity)
 
     def update(self, uv: NDArray, confidence: NDArray) -> FrameResult | None:
-        """Track one frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None while there is nothing to start from."""
+        """Track a frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None until there is a start."""
         seen = np.isfinite(uv).all(axis=1)
         weight = np.where(seen, confidence / np.square(self.channels.sigma), 0.0)
         uv = np.where(seen[:, None], uv, np.nan)
@@ -183,7 +183,9 @@ class Tracker:
             self.body, fit.state, [fit.equations.rows, prior_rows(self.body, fit.state)], loss=self.settings.loss
         )
         cov = covariance(own)
-        blind = 6 + np.flatnonzero(np.diag(cov)[6:] > 0.9 * np.square(self.body.tree.spread))  # known from the prior alone
+        blind = 6 + np.flatnonzero(
+            np.diag(cov)[6:] > 0.9 * np.square(self.body.tree.spread)
+        )  # known from the prior alone
         cov[blind, :] = cov[:, blind] = 0.0
         cov[blind, blind] = np.inf
         return FrameResult(

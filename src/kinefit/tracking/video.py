@@ -16,6 +16,7 @@ from kinefit.tracking.channels import Channels, make_channels
 from kinefit.tracking.subject import Progress, Subject, fit_subject
 from kinefit.tracking.tracker import FrameResult, Settings, Tracker
 
+
 class TrackingInterrupted(KeyboardInterrupt):
     """Ctrl-C while frames were being tracked; what is done is kept.
 
@@ -46,8 +47,8 @@ def track(
 ) -> Motion:
     """Motion of one person from keypoints of several calibrated cameras, with no pose given.
 
-    The person is chosen among all detected, bone lengths are found from frames spread over the take, then every frame is
-    fitted straight to the pixels, with outliers and exchanged sides set right and error bars from the normal matrix.
+    The person is chosen among all detected, bone lengths are found from frames spread over the take, then every frame
+    is fitted straight to the pixels, with outliers and exchanged sides set right and error bars from the normal matrix.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ def _motion(
             weights=factor[:, mine],
             unit="px",
             measured=uv[:, mine],
-            swapped=swapped[:, mine].any(axis=1),
+            swapped=np.any(swapped[:, mine], axis=1),
         )
     return Motion(
         body=body,
