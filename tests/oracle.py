@@ -73,22 +73,23 @@ def posture(body, seed=0, share=0.5):
 
 
 def slow_motions(tree, state):
-    """(S, 4, 4): what moves points from the root frame at rest to the world; matrix exponentials of screws, one by one."""
+    """(S, 4, 4): what moves points from the root frame at rest to the world: matrix exponentials, one by one."""
     rest = np.zeros((len(tree.segments), 3))
+    for s, parent in enumerate(tree.parents):
+        rest[s] = rest[parent] + tree.offsets[s] if parent >= 0 else 0.0
+    twists = np.zeros((len(tree.coordinates), 4, 4))
+    for d, (x, y, z) in enumerate(tree.axes):
+        if tree.prismatic[d]:
+            twists[d, :3, 3] = (x, y, z)
+        else:
+            twists[d, :3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+            twists[d, :3, 3] = -twists[d, :3, :3] @ rest[tree.owners[d]]
+    moves = expm(twists * state.angles[:, None, None])
     out = []
     for s, parent in enumerate(tree.parents):
         T = np.array(state.T_world_root) if parent < 0 else out[parent].copy()
-        if parent >= 0:
-            rest[s] = rest[parent] + tree.offsets[s]
         for d in np.flatnonzero(tree.owners == s):
-            twist = np.zeros((4, 4))
-            if tree.prismatic[d]:
-                twist[:3, 3] = tree.axes[d]
-            else:
-                x, y, z = tree.axes[d]
-                twist[:3, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-                twist[:3, 3] = -twist[:3, :3] @ rest[s]
-            T = T @ expm(twist * state.angles[d])
+            T = T @ moves[d]
         out.append(T)
     return np.array(out)
 
@@ -137,5 +138,7 @@ def look_at(name, place, aim, *, distortion=(-0.1, 0.05, 0.001, -0.002), focal=9
 def rig_around(aim, *, cameras=4, distance=4.0, height=0.4):
     """Cameras on a circle around a point [m], y up."""
     azimuths = 2 * np.pi * (np.arange(cameras) + 0.3) / cameras + 0.2 * (np.arange(cameras) % 2)
-    places = [np.asarray(aim) + (distance * np.cos(a), height * (i % 3), distance * np.sin(a)) for i, a in enumerate(azimuths)]
+    places = [
+        np.asarray(aim) + (distance * np.cos(a), height * (i % 3), distance * np.sin(a)) for i, a in enumerate(azimuths)
+    ]
     return Rig(tuple(look_at(f"cam{i + 1}", place, aim) for i, place in enumerate(places)))

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.oracle import posture
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.motion import UP_AXES, Motion, Residuals, rotation_between_up
-from tests.oracle import posture
 
 BODY = load_body("humanoid10")
 
@@ -19,10 +19,13 @@ def a_motion(frames=4, seed=0):
     states = [posture(BODY, k, 0.3) for k in range(frames)]
     segments, dofs = len(BODY.tree.segments), BODY.tree.n_dofs
     values = random.normal(size=(frames, 2, 3))
-    markers = Residuals(("a", "b"), np.array([0, 1]), values, np.ones((frames, 2)), "m", values + 1, np.zeros(frames, bool))
+    markers = Residuals(
+        ("a", "b"), np.array([0, 1]), values, np.ones((frames, 2)), "m", values + 1, np.zeros(frames, bool)
+    )
     pixels = replace(markers, values=values[..., :2], measured=values[..., :2] + 1, unit="px")
     return Motion(
-        BODY, 50.0, np.arange(frames) / 50, np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states]),
+        BODY, 50.0, np.arange(frames) / 50,
+        np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states]),
         random.uniform(0.01, 0.1, (frames, dofs)), random.uniform(0.01, 0.1, (frames, segments, 3)), np.ones(frames),
         np.ones((frames, segments)), {"lab": markers, "cam": pixels}, up="y",
     )  # fmt: skip

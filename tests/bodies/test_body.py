@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from tests.oracle import posture, random_body
 
 from kinefit.bodies import BodyState, PointSet, load_body
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
-from tests.oracle import posture, random_body
 
 HUMANOID = load_body("humanoid")
 
@@ -33,7 +33,15 @@ def test_select_keeps_the_order_asked_for():
 
 
 def test_degrees_of_freedom_have_names():
-    assert HUMANOID.dof_names[:7] == ("root_tx", "root_ty", "root_tz", "root_rx", "root_ry", "root_rz", "lumbar_extension")
+    assert HUMANOID.dof_names[:7] == (
+        "root_tx",
+        "root_ty",
+        "root_tz",
+        "root_rx",
+        "root_ry",
+        "root_rz",
+        "lumbar_extension",
+    )
     assert len(set(HUMANOID.dof_names)) == HUMANOID.tree.n_dofs
 
 
@@ -121,7 +129,12 @@ def test_a_body_as_arrays_comes_back_the_same(body):
         assert getattr(back.tree, name) == getattr(body.tree, name)
     for name in ("parents", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread", "offsets"):
         np.testing.assert_array_equal(getattr(back.tree, name), getattr(body.tree, name))
-    assert (back.name, back.joints, back.scale_groups, back.stature) == (body.name, body.joints, body.scale_groups, body.stature)
+    assert (back.name, back.joints, back.scale_groups, back.stature) == (
+        body.name,
+        body.joints,
+        body.scale_groups,
+        body.stature,
+    )
     assert set(back.keypoint_sets) == set(body.keypoint_sets) and back.surfaces == body.surfaces
     assert {c: dict(n) for c, n in back.aliases.items()} == {c: dict(n) for c, n in body.aliases.items()}
 

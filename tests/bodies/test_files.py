@@ -1,5 +1,7 @@
 """Body files: what they say becomes a body, and what is wrong in them is told with file, place and remedy."""
 
+# ruff: noqa: E501  (joints are told in one line)
+
 import numpy as np
 import pytest
 
@@ -70,7 +72,9 @@ def test_a_file_becomes_a_body(tmp_path):
 def test_the_usual_posture():
     given = ROBOT.replace("spread = [30, 5]", "usual = [-30, 10]").replace("[[0.0, 0.2]]", "[[0.1, 0.2]]")
     body = parse_body(given)
-    np.testing.assert_allclose(body.tree.usual, [np.radians(-30), np.radians(10), 0.1])  # zero, or what is nearest to it
+    np.testing.assert_allclose(
+        body.tree.usual, [np.radians(-30), np.radians(10), 0.1]
+    )  # zero, or what is nearest to it
     np.testing.assert_array_equal(body.usual_state().angles, body.tree.usual)
 
 
@@ -86,7 +90,7 @@ def test_joints_move_as_their_axes_say():
 def test_every_type_of_joint():
     types = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
     for kind, count in types.items():
-        axes = "" if kind == "free" else f', axes = {["x", "y", "z"][: min(count, 3)]}'.replace("'", '"')
+        axes = "" if kind == "free" else f", axes = {['x', 'y', 'z'][: min(count, 3)]}".replace("'", '"')
         text = f"""
         [body]
         name = "two"
@@ -135,8 +139,8 @@ BAD = {
     "joint twice": (changed('name = "flange"', 'name = "rail"'), ("joint named twice: rail",), None),
     "coordinate twice": (changed('"lift", "turn"', '"lift", "lift"'), ("coordinate named twice: lift",), None),
     "marker twice": (changed("m1 =", "tip ="), ("marker named twice: tip",), "markers.SET"),
-    "too few axes": (changed('axes = ["-y"], ', ""), ("prismatic joint has 1", "here are 0"), "joint rail"),
-    "too many axes": (changed('axes = ["-y"]', 'axes = ["-y", "x"]'), ("prismatic joint has 1", "here are 2"), "joint rail"),
+    "too few axes": (changed('axes = ["-y"], ', ""), ("prismatic joint has 1", "here 0, 1, 1, 0 and 0"), "joint rail"),
+    "too many axes": (changed('axes = ["-y"]', 'axes = ["-y", "x"]'), ("prismatic joint has 1", "here 2, 1, 1, 0 and 0"), "joint rail"),
     "too few coordinates": (changed('["lift", "turn"]', '["lift"]'), ("universal joint has 2", "2, 1, 2, 0 and 2"), "joint shoulder"),
     "too few ranges": (changed("range = [[-90, 45], [-10, 20]]", "range = [[-90, 45]]"), ("universal", "2, 2, 1, 0 and 2"), "joint shoulder"),
     "too many spreads": (changed("spread = [30, 5]", "spread = [30, 5, 1]"), ("universal", "2, 2, 2, 0 and 3"), "joint shoulder"),
@@ -238,7 +242,9 @@ def other_side(name):
 def test_the_left_side_is_the_mirror_image_of_the_right():
     body = parse_body(SIDES)
     tree = body.tree
-    assert {"leg_l", "ski_l", "pole_l"} <= set(tree.segments) and {"l_ear", "l_knee", "ski_tip_l"} <= set(body.landmarks.names)
+    assert {"leg_l", "ski_l", "pole_l"} <= set(tree.segments) and {"l_ear", "l_knee", "ski_tip_l"} <= set(
+        body.landmarks.names
+    )
     assert body.landmarks.names.count("nose") == 1
     right = [c for c in tree.coordinates if "_r" in c]
     left = [c.replace("_r", "_l") for c in right]

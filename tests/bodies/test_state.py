@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from tests.oracle import STATES, random_body, state_of
 
 from kinefit.bodies import BodyState
 from kinefit.geometry import se3
-from tests.oracle import STATES, random_body, state_of
 
 BODY = random_body(0)
 

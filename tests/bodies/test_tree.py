@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.oracle import STATES, central_differences, posture, random_body, slow_motions, slow_positions, state_of
 
 from kinefit.bodies import BodyState, KinematicTree, load_body
 from kinefit.errors import BodyError
 from kinefit.geometry import lines, se3
-from tests.oracle import STATES, central_differences, posture, random_body, slow_motions, slow_positions, state_of
 
 BODIES = {
     "random 0": lambda: random_body(0),

@@ -7,6 +7,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from tests.oracle import (
+    STATES,
+    central_differences,
+    design,
+    look_at,
+    random_body,
+    random_unit,
+    slow_positions,
+    state_of,
+)
 
 import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, load_body
@@ -25,7 +35,6 @@ from kinefit.correspondences import (
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
-from tests.oracle import STATES, central_differences, design, look_at, random_body, random_unit, slow_positions, state_of
 
 LENSES = (("radtan", (-0.1, 0.05, 0.001, -0.002, 0.01)), ("radtan", ()), ("fisheye", (0.02, -0.01, 0.003, -0.001)))
 
@@ -85,17 +94,19 @@ CASES = {
     "plane_rows": lambda s: lambda state: plane_rows(s.body, state, s.points, s.target, s.normal, sigma=s.sigma),
     "ray_rows": lambda s: lambda state: ray_rows(s.body, state, s.points, s.line, sigma=s.sigma),
     "pixel_rows": lambda s: lambda state: pixel_rows(s.body, state, s.points, s.rig, s.camera, s.uv, sigma=s.sigma),
-    "image_line_rows": lambda s: lambda state: image_line_rows(
-        s.body, state, s.points, s.rig, s.camera, s.image_line, sigma=s.sigma
+    "image_line_rows": lambda s: (
+        lambda state: image_line_rows(s.body, state, s.points, s.rig, s.camera, s.image_line, sigma=s.sigma)
     ),
-    "edge_rows": lambda s: lambda state: edge_rows(
-        s.body, state, s.points, s.others, s.rig, s.camera, s.image_line, sigma=s.sigma
+    "edge_rows": lambda s: (
+        lambda state: edge_rows(s.body, state, s.points, s.others, s.rig, s.camera, s.image_line, sigma=s.sigma)
     ),
     "coincidence_rows": lambda s: lambda state: coincidence_rows(s.body, state, s.points, s.others, sigma=s.sigma),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
-    "prediction_rows": lambda s: lambda state: prediction_rows(
-        s.body, state, s.state.retract(moved(s)), sigma=np.linspace(0.1, 2.0, s.body.tree.n_dofs)
+    "prediction_rows": lambda s: (
+        lambda state: prediction_rows(
+            s.body, state, s.state.retract(moved(s)), sigma=np.linspace(0.1, 2.0, s.body.tree.n_dofs)
+        )
     ),
 }
 
@@ -153,7 +164,9 @@ def test_derivatives_agree_with_central_differences(maker, kind, body):
     rows = make(state)
     assert len(rows) >= 6
     expected = central_differences(lambda s: whitened(make(s)), body, state, 1e-5)
-    np.testing.assert_allclose(-np.sqrt(rows.weight)[:, None] * design(rows, body, state), expected, rtol=1e-6, atol=2e-6)
+    np.testing.assert_allclose(
+        -np.sqrt(rows.weight)[:, None] * design(rows, body, state), expected, rtol=1e-6, atol=2e-6
+    )
 
 
 def whitened(rows):
@@ -179,8 +192,8 @@ def check(rows, points, x, direction, residual, weight, group):
 
 def test_point_rows_in_numpy(scene):
     s, k = scene, np.repeat(np.arange(len(scene.points)), 3)
-    check(CASES["point_rows"](s)(s.state), s.points, s.x[k], np.tile(np.eye(3), (len(s.x), 1)), (s.target - s.x).ravel(),
-          1 / s.sigma[k] ** 2, k)  # fmt: skip
+    axes, gap = np.tile(np.eye(3), (len(s.x), 1)), (s.target - s.x).ravel()
+    check(CASES["point_rows"](s)(s.state), s.points, s.x[k], axes, gap, 1 / s.sigma[k] ** 2, k)
 
 
 def test_plane_rows_in_numpy(scene):
@@ -212,7 +225,9 @@ def test_pixel_rows_in_opencv(scene):
     seen = [s.seen(c, x) for c, x in zip(s.camera, s.x, strict=True)]
     g = np.concatenate([J for _, J in seen])
     gap, size = (s.uv - np.array([uv for uv, _ in seen])).ravel(), np.linalg.norm(g, axis=1)
-    check(CASES["pixel_rows"](s)(s.state), s.points, s.x[k], g / size[:, None], gap / size, size**2 / s.sigma[k] ** 2, k)
+    check(
+        CASES["pixel_rows"](s)(s.state), s.points, s.x[k], g / size[:, None], gap / size, size**2 / s.sigma[k] ** 2, k
+    )
 
 
 def image_line_rows_in_opencv(s, points):
@@ -300,7 +315,9 @@ def test_at_the_truth_nothing_is_left_over(body):
     assert np.all(prediction_rows(body, state, state, sigma=np.ones(body.tree.n_dofs)).residual == 0)
 
 
-@pytest.mark.parametrize("maker", ["point_rows", "plane_rows", "ray_rows", "pixel_rows", "image_line_rows", "edge_rows"])
+@pytest.mark.parametrize(
+    "maker", ["point_rows", "plane_rows", "ray_rows", "pixel_rows", "image_line_rows", "edge_rows"]
+)
 def test_what_was_not_measured_makes_no_row(maker):
     body = random_body(1, 10)
     s = Scene(body, state_of(body, "random", seed=3))
@@ -350,7 +367,9 @@ def bad(maker, match, **changes):
         bad("image_line_rows", r"camera.*0 to 2", camera=np.full(14, 3)),
         bad("edge_rows", "camera", camera=np.zeros(5, int)),
         bad("coincidence_rows", "must be positive", sigma=0.0),
-        bad("coincidence_rows", "14.*13", others=random_body(1, 10).landmarks.select(tuple(f"p{i}" for i in range(13)))),
+        bad(
+            "coincidence_rows", "14.*13", others=random_body(1, 10).landmarks.select(tuple(f"p{i}" for i in range(13)))
+        ),
     ],
 )
 def test_what_cannot_be_used_is_told(maker, changes, match):

@@ -32,7 +32,9 @@ def test_points_of_a_line_have_no_distance_to_it():
 def test_distance_of_a_point_to_a_line():
     n = (B - A) / np.linalg.norm(B - A, axis=1, keepdims=True)
     off = (X - A) - np.sum((X - A) * n, axis=1, keepdims=True) * n
-    np.testing.assert_allclose(np.linalg.norm(lines.point_line(X, LINE), axis=1), np.linalg.norm(off, axis=1), atol=1e-13)
+    np.testing.assert_allclose(
+        np.linalg.norm(lines.point_line(X, LINE), axis=1), np.linalg.norm(off, axis=1), atol=1e-13
+    )
 
 
 def test_derivative_of_point_to_line():
@@ -74,7 +76,9 @@ def test_derivative_of_line_to_plane():
 @pytest.mark.parametrize("size", [1.0, 1e-7])
 def test_a_moved_line_is_the_line_of_the_moved_points(size):
     T = se3.exp(size * random.normal(size=(30, 6)))
-    np.testing.assert_allclose(lines.move_line(T, LINE), lines.line_through(se3.apply(T, A), se3.apply(T, B)), atol=1e-12)
+    np.testing.assert_allclose(
+        lines.move_line(T, LINE), lines.line_through(se3.apply(T, A), se3.apply(T, B)), atol=1e-12
+    )
 
 
 def test_motion_changes_no_distance():

@@ -107,7 +107,9 @@ def test_left_jacobian_agrees_with_central_differences(xi):
     h = 1e-5
     for x in xi[:10]:
         inverse = se3.inverse(se3.exp(x))
-        columns = [(se3.log(se3.exp(x + d) @ inverse) - se3.log(se3.exp(x - d) @ inverse)) / (2 * h) for d in h * np.eye(6)]
+        columns = [
+            (se3.log(se3.exp(x + d) @ inverse) - se3.log(se3.exp(x - d) @ inverse)) / (2 * h) for d in h * np.eye(6)
+        ]
         np.testing.assert_allclose(se3.left_jacobian(x), np.stack(columns, axis=1), atol=2e-8)
         np.testing.assert_allclose(se3.left_jacobian_so3(x[3:]), se3.left_jacobian(x)[3:, 3:], atol=1e-15)
 
@@ -152,7 +154,9 @@ def test_rodrigues_formula():
     for x in twists("uniform", 10):
         theta = np.linalg.norm(x[3:])
         w = se3.hat(x[3:] / theta)
-        np.testing.assert_allclose(se3.exp_so3(x[3:]), np.eye(3) + np.sin(theta) * w + (1 - np.cos(theta)) * w @ w, atol=1e-14)
+        np.testing.assert_allclose(
+            se3.exp_so3(x[3:]), np.eye(3) + np.sin(theta) * w + (1 - np.cos(theta)) * w @ w, atol=1e-14
+        )
 
 
 def test_a_screw_without_pitch_leaves_its_axis_still():

@@ -4,15 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from kinefit.bodies import KinematicTree, load_body
-from kinefit.correspondences import coincidence_rows, point_rows, prior_rows
-from kinefit.geometry import se3
-from kinefit.rows import PairRows, ParameterRows, Rows
-from kinefit.solvers import _kernels_linear
-from kinefit.solvers.equations import covariance, joint_std, normal_equations
-from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.losses import SQUARED, geman_mcclure, huber, tukey
 from tests.oracle import (
     STATES,
     central_differences,
@@ -24,6 +15,16 @@ from tests.oracle import (
     slow_positions,
     state_of,
 )
+
+from kinefit.bodies import KinematicTree, load_body
+from kinefit.correspondences import coincidence_rows, point_rows, prior_rows
+from kinefit.errors import KinefitError
+from kinefit.geometry import se3
+from kinefit.rows import PairRows, ParameterRows, Rows
+from kinefit.solvers import _kernels_linear
+from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.losses import SQUARED, geman_mcclure, huber, tukey
 
 LOSSES = {"squared": SQUARED, "huber": huber(), "tukey": tukey(), "geman-mcclure": geman_mcclure()}
 
@@ -43,7 +44,9 @@ def random_pairs(body, state, count=12, seed=1):
     random = np.random.default_rng(seed)
     points = state.T_world_root[:3, 3] + random.normal(size=(2, count, 3))
     segments = random.integers(0, len(body.tree.segments), (count, 2))
-    return PairRows(segments, *points, random_unit(random, count), random.normal(size=count), random.uniform(1, 9, count))
+    return PairRows(
+        segments, *points, random_unit(random, count), random.normal(size=count), random.uniform(1, 9, count)
+    )
 
 
 def random_parameters(body, count=15, seed=2):
@@ -61,12 +64,16 @@ def robust_factors(rows, loss):
             j += 1
         s2 = float(np.sum(rows.weight[i:j] * rows.residual[i:j] ** 2))
         s, c = np.sqrt(s2), loss.scale
-        rho, factor[i:j] = {
-            "squared": (s2, 1.0),
-            "huber": (s2, 1.0) if s <= c else (2 * c * s - c * c, c / s),
-            "tukey": (c * c / 3 * (1 - max(0, 1 - s2 / c**2) ** 3), max(0, 1 - s2 / c**2) ** 2),
-            "geman-mcclure": (s2 / (1 + s2 / c**2), (1 + s2 / c**2) ** -2),
-        }[next(n for n, v in LOSSES.items() if v == loss)] if rows.group[i] >= 0 else (s2, 1.0)
+        rho, factor[i:j] = (
+            {
+                "squared": (s2, 1.0),
+                "huber": (s2, 1.0) if s <= c else (2 * c * s - c * c, c / s),
+                "tukey": (c * c / 3 * (1 - max(0, 1 - s2 / c**2) ** 3), max(0, 1 - s2 / c**2) ** 2),
+                "geman-mcclure": (s2 / (1 + s2 / c**2), (1 + s2 / c**2) ** -2),
+            }[next(n for n, v in LOSSES.items() if v == loss)]
+            if rows.group[i] >= 0
+            else (s2, 1.0)
+        )
         cost += rho
         i = j
     return factor, cost
@@ -77,7 +84,9 @@ def dense(parts, body, state, loss=SQUARED):
     H, g, cost = np.zeros((body.tree.n_dofs,) * 2), np.zeros(body.tree.n_dofs), 0.0
     for rows in parts:
         J = design(rows, body, state)
-        factor, part = robust_factors(rows, loss) if isinstance(rows, Rows) else (1.0, np.sum(rows.weight * rows.residual**2))
+        factor, part = (
+            robust_factors(rows, loss) if isinstance(rows, Rows) else (1.0, np.sum(rows.weight * rows.residual**2))
+        )
         w = rows.weight * factor
         H, g, cost = H + J.T @ (w[:, None] * J), g + J.T @ (w * rows.residual), cost + part
     return H, g, cost
@@ -112,7 +121,12 @@ def test_normal_equations_are_the_dense_ones(body, kind, loss):
 
 def test_rows_of_every_kind_together(body):
     state = state_of(body, "random")
-    parts = [random_rows(body, state), random_pairs(body, state), random_parameters(body), random_rows(body, state, 40, 5)]
+    parts = [
+        random_rows(body, state),
+        random_pairs(body, state),
+        random_parameters(body),
+        random_rows(body, state, 40, 5),
+    ]
     found = normal_equations(body, state, parts, loss=huber())
     H, g, cost = dense(parts, body, state, huber())
     np.testing.assert_allclose(found.matrix, H, atol=1e-11 * np.abs(H).max())
@@ -135,7 +149,9 @@ def test_the_gradient_is_that_of_the_robust_cost(body):
     state, points = state_of(body, "random"), body.landmarks
     target = slow_positions(body, state, points) + np.random.default_rng(0).normal(scale=0.05, size=(len(points), 3))
     make = lambda s: [point_rows(body, s, points, target, sigma=0.02), prior_rows(body, s, sigma=0.7)]
-    slope = central_differences(lambda s: np.array(normal_equations(body, s, make(s), loss=geman_mcclure()).cost), body, state)
+    slope = central_differences(
+        lambda s: np.array(normal_equations(body, s, make(s), loss=geman_mcclure()).cost), body, state
+    )
     found = normal_equations(body, state, make(state), loss=geman_mcclure()).gradient
     np.testing.assert_allclose(slope, -2 * found, atol=1e-6 * np.abs(slope).max())
 
@@ -143,8 +159,21 @@ def test_the_gradient_is_that_of_the_robust_cost(body):
 def test_no_rows_are_nothing(body):
     found = normal_equations(body, state_of(body, "random"), [])
     assert found.cost == 0 and not found.matrix.any() and not found.gradient.any()
-    unknown = np.isinf(np.diag(covariance(found)))
+    unknown = np.isinf(covariance(found).std)
     assert np.all(unknown[6:]) and np.all(unknown[:6] == body.tree.root_free)
+
+
+def test_rows_of_another_body_are_refused():
+    body = random_body(0)
+    state, far = state_of(body, "random"), 10**8
+    here = np.zeros((1, 3))
+    for rows in (
+        Rows.of([far], here, [[1.0, 0, 0]], [1.0], 1.0),
+        PairRows([[0, far]], here, here, [[1.0, 0, 0]], [1.0], [1.0]),
+        ParameterRows([far], [1.0], [1.0]),
+    ):
+        with pytest.raises(KinefitError):
+            normal_equations(body, state, rows)
 
 
 def test_the_far_origin_of_the_world_costs_no_digits():
@@ -184,7 +213,7 @@ def test_factors_and_solutions(body, pattern):
     np.testing.assert_allclose(x, np.linalg.solve(H, b), rtol=1e-7, atol=1e-10)
     _kernels_linear.pack(H, chain, depth, C)
     out = np.empty((n, n))
-    assert _kernels_linear.invert(C, chain, depth, out) == -1
+    assert _kernels_linear.invert(C, chain, depth, out)
     np.testing.assert_allclose(out, np.linalg.inv(H), rtol=1e-7, atol=1e-10)
 
 
@@ -214,7 +243,7 @@ def test_covariance_is_the_inverse(body, pairs):
     parts += [random_pairs(body, state)] if pairs else []
     equations = normal_equations(body, state, parts)
     free = slice(0 if body.tree.root_free else 6, n)
-    cov = covariance(equations)
+    cov = covariance(equations).matrix
     np.testing.assert_allclose(cov[free, free], np.linalg.inv(equations.matrix[free, free]), rtol=1e-7, atol=1e-11)
     assert not cov[: free.start].any()
 
@@ -224,10 +253,12 @@ def test_what_is_locked_is_known():
     state, n = state_of(body, "random"), body.tree.n_dofs
     equations = normal_equations(body, state, random_rows(body, state, 600))
     locked = np.isin(np.arange(n), [1, 4, 8])
-    cov = covariance(equations, locked=locked)
+    cov = covariance(equations, locked=locked).matrix
     assert not cov[locked].any() and not cov[:, locked].any()
     free = np.flatnonzero(~locked)
-    np.testing.assert_allclose(cov[np.ix_(free, free)], np.linalg.inv(equations.matrix[np.ix_(free, free)]), rtol=1e-7, atol=1e-11)
+    np.testing.assert_allclose(
+        cov[np.ix_(free, free)], np.linalg.inv(equations.matrix[np.ix_(free, free)]), rtol=1e-7, atol=1e-11
+    )
 
 
 def arm_scene(seed=0):
@@ -242,6 +273,7 @@ def test_covariance_agrees_with_sampled_noise():
     truth, points = posture(body, 0, 0.3), body.landmarks
     x, sigma, random = body.positions(truth, points), 0.002, np.random.default_rng(0)
     cov = covariance(normal_equations(body, truth, point_rows(body, truth, points, x, sigma=sigma)))
+    spread, cov = cov, cov.matrix
     assert np.all(np.isfinite(cov))
     states = []
     for _ in range(700):
@@ -253,14 +285,14 @@ def test_covariance_agrees_with_sampled_noise():
     correlation = cov / np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
     np.testing.assert_allclose(np.corrcoef(steps.T), correlation, atol=0.17)
     centres = body.tree.segment_poses(np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states]))
-    np.testing.assert_allclose(centres[..., :3, 3].std(axis=0), joint_std(body, truth, cov), rtol=0.12)
+    np.testing.assert_allclose(centres[..., :3, 3].std(axis=0), joint_std(body, truth, spread), rtol=0.12)
 
 
 def test_a_fixed_root_is_known():
     """The arm's shoulder stays where it is put, so seven angles are all that is unknown."""
     body, truth, points = arm_scene()
     equations = normal_equations(body, truth, point_rows(body, truth, points, body.positions(truth, points)))
-    cov = covariance(equations)
+    cov = covariance(equations).matrix
     np.testing.assert_array_equal(cov[:6], 0)
     np.testing.assert_allclose(cov[6:, 6:], np.linalg.inv(equations.matrix[6:, 6:]), rtol=1e-7)
 
@@ -269,7 +301,7 @@ def test_what_nothing_observes_is_unbounded():
     body, truth, points = arm_scene()
     upper = points.select(tuple(n for n, s in zip(points.names, points.segments, strict=True) if s <= 1))
     cov = covariance(normal_equations(body, truth, point_rows(body, truth, upper, body.positions(truth, upper))))
-    told = dict(zip(body.dof_names, np.diag(cov), strict=True))
+    told = dict(zip(body.dof_names, cov.std, strict=True))
     for name in ("elbow_flex_r", "pro_sup_r", "wrist_flex_r", "wrist_dev_r"):
         assert np.isinf(told[name])
     std = joint_std(body, truth, cov)
@@ -284,16 +316,17 @@ def without_right_arm(body):
 
 
 UNSEEN = {"arm_rot_r", "elbow_flex_r", "pro_sup_r", "wrist_flex_r", "wrist_dev_r"}
+TWIST = {"lumbar_rotation", "thorax_extension", "thorax_bending", "thorax_rotation"}
 
 
 @pytest.mark.parametrize(
     ("truth", "unknown"),
     [
-        # two joints of the trunk turn about one line at rest
+        # no point lies on the abdomen: its turn about the line between its two ball joints is free in every posture
         (load_body("humanoid").rest_state(), UNSEEN | {"lumbar_rotation", "thorax_rotation"}),
         pytest.param(
-            posture(load_body("humanoid"), 2, 0.3), UNSEEN,
-            marks=pytest.mark.xfail(reason="information that is rounding alone counts as information"),
+            posture(load_body("humanoid"), 2, 0.3), UNSEEN | TWIST,
+            marks=pytest.mark.xfail(reason="free directions mix with degrees of freedom that have no row"),
         ),
     ],
     ids=["at rest", "in a posture"],
@@ -303,10 +336,10 @@ def test_a_turn_about_a_line_of_points_is_unbounded(truth, unknown):
     body = load_body("humanoid")
     few = without_right_arm(body)
     cov = covariance(normal_equations(body, truth, point_rows(body, truth, few, body.positions(truth, few))))
-    assert {n for n, v in zip(body.dof_names, np.diag(cov), strict=True) if np.isinf(v)} == unknown
+    assert {n for n, v in zip(body.dof_names, cov.std, strict=True) if np.isinf(v)} == unknown
     std = joint_std(body, truth, cov)
     told = dict(zip(body.tree.segments, np.isinf(std).any(axis=1), strict=True))
-    assert told["hand_r"] and not told["foot_r"]
+    assert told["hand_r"] and not told["hand_l"] and not told["foot_r"]
 
 
 def test_angles_that_only_count_together():
@@ -321,7 +354,9 @@ def test_angles_that_only_count_together():
     keep = tuple(n for n, s in zip(body.landmarks.names, body.landmarks.segments, strict=True) if s != 1)
     points = body.landmarks.select(keep)
     state = body.rest_state(se3.exp(np.arange(6.0) / 7))
-    cov = covariance(normal_equations(body, state, point_rows(body, state, points, body.positions(state, points))))
+    cov = covariance(
+        normal_equations(body, state, point_rows(body, state, points, body.positions(state, points)))
+    ).matrix
     assert [np.isinf(v) for v in np.diag(cov)] == [False] * 6 + [True, True, False]
 
 
@@ -335,12 +370,17 @@ def test_joint_std_is_the_spread_carried_along(body):
 
     J = central_differences(centres, body, state)
     expected = np.sqrt(np.einsum("sin,nm,sim->si", J, cov, J))
-    np.testing.assert_allclose(joint_std(body, state, cov), expected, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(
+        joint_std(body, state, Covariance(cov, np.empty((n, 0)))), expected, rtol=1e-6, atol=1e-8
+    )
 
 
 def test_a_contact_adds_certainty():
     body, truth, points = arm_scene()
     rows = point_rows(body, truth, points, body.positions(truth, points))
-    with_contact = [rows, coincidence_rows(body, truth, points.select(("r_shoulder",)), points.select(("r_dactylion",)))]
-    a, b = (covariance(normal_equations(body, truth, parts)) for parts in (rows, with_contact))
+    with_contact = [
+        rows,
+        coincidence_rows(body, truth, points.select(("r_shoulder",)), points.select(("r_dactylion",))),
+    ]
+    a, b = (covariance(normal_equations(body, truth, parts)).matrix for parts in (rows, with_contact))
     assert np.all(np.diag(b) <= np.diag(a) + 1e-15) and np.any(np.diag(b) < 0.9 * np.diag(a))

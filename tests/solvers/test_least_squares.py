@@ -1,7 +1,10 @@
 """Fits find known poses, hold limits and locks, close chains, and do not depend on where the world's origin is."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
+from tests.oracle import look_at, posture, random_body, random_unit, rig_around
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet, load_body
 from kinefit.correspondences import (
@@ -21,7 +24,6 @@ from kinefit.geometry.camera import Rig
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 from kinefit.solvers.losses import geman_mcclure, huber, tukey
-from tests.oracle import look_at, posture, random_body, random_unit, rig_around
 
 HUMANOID = load_body("humanoid")
 POINTS = HUMANOID.landmarks
@@ -85,7 +87,7 @@ def test_gauss_newton_converges_quadratically_near_the_truth():
         step = gauss_newton(HUMANOID, state, make(state))
         state, norms = step.state, [*norms, step.norm]
     assert norms[-1] < 1e-9
-    assert all(b < a for a, b in zip(norms, norms[1:]) if a > 1e-9)
+    assert all(b < a for a, b in pairwise(norms) if a > 1e-9)
 
 
 @pytest.mark.parametrize("loss", [huber(), tukey(), geman_mcclure()], ids=["huber", "tukey", "geman-mcclure"])
@@ -156,7 +158,9 @@ def test_soft_limits_pull_back():
     assert fit.state.angles[d] == pytest.approx(HUMANOID.tree.lower[d], abs=1e-3)
 
 
-@pytest.mark.parametrize("names", [("root_tx", "root_ry"), ("hip_flexion_r", "elbow_flex_l"), ("root_tz", "knee_angle_l")])
+@pytest.mark.parametrize(
+    "names", [("root_tx", "root_ry"), ("hip_flexion_r", "elbow_flex_l"), ("root_tz", "knee_angle_l")]
+)
 def test_what_is_locked_stays(names):
     truth, start = posture(HUMANOID, 6, 0.35), posture(HUMANOID, 7, 0.1)
     locked = np.isin(HUMANOID.dof_names, names)
@@ -233,7 +237,7 @@ def test_a_closed_chain_closes_the_better_the_stronger_it_is():
         )  # fmt: skip
         left.append(gap(HUMANOID, fit.state, a, b))
     assert left[0] > 0.01 and left[2] < 1e-3 and left[3] < 1e-4
-    assert all(strong < weak for weak, strong in zip(left, left[1:]))
+    assert all(strong < weak for weak, strong in pairwise(left))
 
 
 def test_a_planar_chain_of_two_closes_as_its_formula_says():
@@ -258,7 +262,10 @@ def test_prediction_and_measurement_share_by_their_variances():
     truth = posture(HUMANOID, 9, 0.35)
     predicted = truth.retract(np.r_[0.3, np.zeros(46)])
     sigma = np.full(47, 0.1)
-    rows = lambda s: [prediction_rows(HUMANOID, s, predicted, sigma=sigma), prediction_rows(HUMANOID, s, truth, sigma=2 * sigma)]
+    rows = lambda s: [
+        prediction_rows(HUMANOID, s, predicted, sigma=sigma),
+        prediction_rows(HUMANOID, s, truth, sigma=2 * sigma),
+    ]
     fit = levenberg_marquardt(HUMANOID, truth, rows)
     np.testing.assert_allclose(truth.difference(fit.state)[:3], [0.3 * 0.8, 0, 0], atol=1e-6)
 
@@ -323,5 +330,7 @@ def test_every_joint_type_is_fitted():
     random = np.random.default_rng(0)
     truth = BodyState(se3.exp(0.3 * random.normal(size=6)), 0.3 * random.normal(size=len(body.tree.coordinates)))
     x = body.positions(truth, body.landmarks)
-    fit = levenberg_marquardt(body, body.rest_state(), lambda s: point_rows(body, s, body.landmarks, x), tolerance=1e-14)
+    fit = levenberg_marquardt(
+        body, body.rest_state(), lambda s: point_rows(body, s, body.landmarks, x), tolerance=1e-14
+    )
     np.testing.assert_allclose(body.positions(fit.state, body.landmarks), x, atol=1e-7)

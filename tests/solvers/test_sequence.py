@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.oracle import posture, random_unit
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.correspondences import plane_rows, point_rows
@@ -9,7 +10,6 @@ from kinefit.errors import ObservationError
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.solvers.losses import SQUARED, huber
 from kinefit.solvers.sequence import Planes, fit_sequence
-from tests.oracle import posture, random_unit
 
 BODY = load_body("humanoid")
 POINTS = BODY.landmarks
@@ -32,7 +32,9 @@ def states_of(result):
 @pytest.mark.parametrize("limits", [True, False])
 def test_points_give_what_frame_by_frame_gives(loss, limits):
     states, _, measured = sway()
-    result = fit_sequence(BODY, BODY.rest_state(states[0].T_world_root), POINTS, measured, loss=loss, limits=limits, tolerance=1e-12)
+    result = fit_sequence(
+        BODY, BODY.rest_state(states[0].T_world_root), POINTS, measured, loss=loss, limits=limits, tolerance=1e-12
+    )
     start = BODY.rest_state(states[0].T_world_root)
     for f, found in enumerate(states_of(result)):
         make = lambda s: point_rows(BODY, s, POINTS, measured[f], sigma=0.005)  # noqa: B023
@@ -44,18 +46,30 @@ def test_points_give_what_frame_by_frame_gives(loss, limits):
 
 
 def test_exact_points_are_met():
-    states, x, _ = sway()
+    _, x, _ = sway()
     result = fit_sequence(BODY, BODY.rest_state(), POINTS, x, tolerance=1e-10)
     for found, truth in zip(states_of(result), x, strict=True):
         np.testing.assert_allclose(BODY.positions(found, POINTS), truth, atol=1e-5)
     assert result.costs.max() < 1e-4
 
 
+def test_a_frame_that_fits_exactly_does_not_stop_the_next():
+    """Steps that cannot better what is exact raise the damping; the next frame must not start with that."""
+    for seed in range(10):
+        states, x, _ = sway(2, seed)
+        three, normals = POINTS.select(POINTS.names * 3), random_unit(np.random.default_rng(seed), 2, 3 * len(POINTS))
+        planes = Planes(three, np.tile(x, (1, 3, 1)), normals, 0.002)
+        result = fit_sequence(BODY, states[0].retract(np.full(47, 0.01)), planes=planes)
+        assert result.costs.max() < 1e-3, f"seed {seed}: {result.costs}"
+
+
 @pytest.mark.parametrize(
     "missing",
     [
         False,
-        pytest.param(True, marks=pytest.mark.xfail(reason="never ends: a kernel's test for NaN is compiled away", run=False)),
+        pytest.param(
+            True, marks=pytest.mark.xfail(reason="never ends: a kernel's test for NaN is compiled away", run=False)
+        ),
     ],
 )
 def test_planes_give_what_frame_by_frame_gives(missing):
@@ -83,7 +97,7 @@ def test_points_and_planes_together_and_points_that_are_missing():
     states, x, measured = sway(4)
     random = np.random.default_rng(0)
     measured[:, ::3] = np.nan
-    measured[2] = np.nan  # a whole frame: planes alone
+    measured[3] = np.nan  # a whole frame: planes alone
     three = POINTS.select(POINTS.names * 3)
     planes = Planes(three, np.tile(x, (1, 3, 1)), random_unit(random, 4, len(three)), 0.002)
     result = fit_sequence(BODY, states[0], POINTS, measured, planes=planes)

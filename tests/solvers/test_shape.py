@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, PointSet, load_body
 from kinefit.solvers.shape import PixelFrames, fit_shape, mirror_points
-from tests.oracle import posture, rig_around
 
 BODY = load_body("humanoid")
 SET = BODY.keypoints("BODY_25B")
@@ -47,20 +47,25 @@ def lengths(scales):
     return np.array(list(BODY.scaled(scales).segment_lengths().values()))
 
 
-def test_lengths_and_shifts_of_a_known_person_come_back():
-    """From 20 frames with 2 px of noise: bones that have keypoints at both ends to 1 % and 4 mm on average."""
+@pytest.mark.parametrize(("shifted", "lengths_within"), [(False, 0.004), (True, 0.008)])
+def test_a_known_person_comes_back(shifted, lengths_within):
+    """From 20 frames of four cameras with 2 px of noise (9 mm at the person): points to 9 mm, lengths to 4 mm.
+
+    Where the detector's points sit 1 cm beside the joints to every side, the lengths to 8 mm: a bone that both its
+    points lengthen looks the same as a longer bone.
+    """
     scales, shifts = person()
+    shifts = shifts * shifted
     pixels, states, x = seen(scales, shifts)
     start = [s.retract(np.random.default_rng(k).normal(scale=0.03, size=47)) for k, s in enumerate(states)]
     shape = fit_shape(BODY, RIG, pixels, start, np.full(len(GROUPS), 1.0))
-    for name in ("thigh", "shank", "upperarm", "forearm"):
-        g = GROUPS.index(name)
-        assert shape.scales[g] == pytest.approx(scales[g], rel=0.03), name
     body = BODY.scaled(shape.scales)
     points = PointSet(SET.names, SET.segments, body.keypoints("BODY_25B").points + shape.shifts)
     found = np.stack([body.positions(s, points) for s in shape.states])
-    assert np.linalg.norm(found - x, axis=-1).mean() < 0.004
-    assert np.abs(lengths(shape.scales) - lengths(scales)).mean() < 0.008
+    assert np.linalg.norm(found - x, axis=-1).mean() < 0.009
+    assert np.abs(lengths(shape.scales) - lengths(scales)).mean() < lengths_within
+    limbs = [GROUPS.index(name) for name in ("thigh", "shank", "upperarm", "forearm")]
+    np.testing.assert_allclose(shape.scales[limbs], scales[limbs], rtol=0.06 if shifted else 0.02)
 
 
 def test_left_and_right_are_alike():
@@ -88,7 +93,7 @@ def test_exact_pixels_of_a_body_of_usual_shape_leave_it_as_it_is():
 
 def test_outliers_hardly_matter():
     scales, shifts = person(2)
-    pixels, states, x = seen(scales, shifts, frames=12)
+    pixels, states, _ = seen(scales, shifts, frames=12)
     random = np.random.default_rng(0)
     wrong = random.random(pixels.weight.shape) < 0.1
     uv = np.where(wrong[..., None], pixels.uv + random.uniform(50, 200, (*wrong.shape, 1)), pixels.uv)
@@ -106,7 +111,11 @@ def test_what_was_not_seen_does_not_matter():
     shapes = []
     for filler in (np.nan, 0.0):
         uv[:, ::5] = filler
-        shapes.append(fit_shape(BODY, RIG, PixelFrames(SET, pixels.camera, pixels.column, uv, weight), states, np.ones(len(GROUPS))))
+        shapes.append(
+            fit_shape(
+                BODY, RIG, PixelFrames(SET, pixels.camera, pixels.column, uv, weight), states, np.ones(len(GROUPS))
+            )
+        )
     np.testing.assert_allclose(shapes[0].scales, shapes[1].scales, atol=1e-12)
     assert np.all(np.isfinite(shapes[0].scales))
 
@@ -121,11 +130,13 @@ def test_angles_stay_within_their_limits():
 def test_the_cost_falls_with_more_iterations():
     scales, shifts = person(5)
     pixels, states, _ = seen(scales, shifts, frames=5)
-    costs = [fit_shape(BODY, RIG, pixels, states, np.ones(len(GROUPS)), max_iterations=n, tolerance=0).cost for n in (0, 1, 3, 8)]
+    costs = [
+        fit_shape(BODY, RIG, pixels, states, np.ones(len(GROUPS)), max_iterations=n, tolerance=0).cost
+        for n in (0, 1, 3, 8)
+    ]
     assert costs[0] > costs[1] > costs[2] >= costs[3] > 0
 
 
-@pytest.mark.xfail(reason="the root of a fixed body moves while its shape is fitted")
 def test_a_fixed_root_stays():
     arm = load_body("arm")
     points = arm.keypoints("MEDIAPIPE_33")
@@ -134,8 +145,12 @@ def test_a_fixed_root_stays():
     x = np.stack([arm.scaled(np.full(len(arm.scale_groups), 1.1)).positions(s, points) for s in states])
     uv = np.concatenate([c.project(x) for c in rig], axis=1)
     count = len(points)
-    pixels = PixelFrames(points, np.repeat(np.arange(4), count), np.tile(np.arange(count), 4), uv, np.ones(uv.shape[:2]))
-    for before, after in zip(states, fit_shape(arm, rig, pixels, states, np.ones(len(arm.scale_groups))).states, strict=True):
+    pixels = PixelFrames(
+        points, np.repeat(np.arange(4), count), np.tile(np.arange(count), 4), uv, np.ones(uv.shape[:2])
+    )
+    for before, after in zip(
+        states, fit_shape(arm, rig, pixels, states, np.ones(len(arm.scale_groups))).states, strict=True
+    ):
         np.testing.assert_array_equal(after.T_world_root, before.T_world_root)
 
 
@@ -150,7 +165,9 @@ def shared(*points):
 
 
 def test_mirrored_points_of_two_limbs_share_a_shift():
-    lead, sign = shared(("leg_l", (0.1, 0.2, -0.03)), ("leg_r", (0.1, 0.2, 0.03)), ("leg_r", (0.0, 0.0, 0.0)), ("leg_l", (0, 0, 0)))
+    lead, sign = shared(
+        ("leg_l", (0.1, 0.2, -0.03)), ("leg_r", (0.1, 0.2, 0.03)), ("leg_r", (0.0, 0.0, 0.0)), ("leg_l", (0, 0, 0))
+    )
     assert list(lead) == [1, 1, 2, 2] and list(sign) == [-1, 1, 1, -1]
 
 
@@ -160,7 +177,9 @@ def test_points_of_the_trunk_share_across_its_middle():
 
 
 def test_a_point_without_a_partner_is_its_own():
-    lead, sign = shared(("leg_l", (0.1, 0.2, -0.03)), ("foot_r", (0.0, 0.1, 0.0)), ("trunk", (0, 0.5, 0.1)), ("trunk", (0, 0.4, -0.1)))
+    lead, sign = shared(
+        ("leg_l", (0.1, 0.2, -0.03)), ("foot_r", (0.0, 0.1, 0.0)), ("trunk", (0, 0.5, 0.1)), ("trunk", (0, 0.4, -0.1))
+    )
     assert list(lead) == [0, 1, 2, 3] and list(sign) == [1, 1, 1, 1]
 
 

@@ -26,9 +26,9 @@ def joint_errors(truth: Motion, result: Motion) -> NDArray:
 def angle_errors(truth: Motion, result: Motion) -> NDArray:
     """Differences (F, D) [deg] of all angles, result minus truth, between -180 and 180; of prismatic joints [m].
 
-    A ball joint with three axes at right angles has two triples (a, b, c) and (a + 180, 180 - b, c + 180) for every turn;
-    the one nearer to the truth counts. Near the pose in which two of its axes fall together, large errors of both may
-    still mean the same turn: see `orientation_errors`.
+    A ball joint with three axes at right angles has two triples (a, b, c) and (a + 180, 180 - b, c + 180) for every
+    turn; the one nearer to the truth counts. Near the pose in which two of its axes fall together, large errors of
+    both may still mean the same turn: see `orientation_errors`.
     """
     result = _comparable(truth, result)
     tree = truth.body.tree

@@ -121,24 +121,22 @@ def adapt(damping, growth, fall, predicted):
 
 @jit
 def invert(C, chain, depth, out):
-    """Inverse (n, n) of H (packed, destroyed); returns -1, or a degree of freedom without information of its own."""
+    """Inverse (n, n) of H (packed, destroyed); False where some degree of freedom has no information of its own."""
     n = depth.size
     own = np.empty(n)
     for k in range(n):
         own[k] = C[k, depth[k]]
-        if not own[k] > 0.0:
-            return k
     if not factor_tree(C, chain, depth):
-        return 0
+        return False
     for k in range(n):
         if not 1.0 / (C[k, depth[k]] * C[k, depth[k]]) > 1e-10 * own[k]:
-            return k
+            return False
     for k in range(n):
         for i in range(n):
             out[k, i] = 0.0
         out[k, k] = 1.0
         solve_tree(C, chain, depth, out[k])
-    return -1
+    return True
 
 
 @jit

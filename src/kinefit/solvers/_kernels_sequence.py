@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from kinefit._jit import jit
@@ -17,7 +19,7 @@ def gather(order, x, n, weight, target, normal, weights):
     for i in range(order.size):
         k = order[i]
         total = x[k, 0] + x[k, 1] + x[k, 2] + n[k, 0] + n[k, 1] + n[k, 2]
-        known = total - total == 0.0
+        known = math.isfinite(total)
         for j in range(3):
             target[j, i] = x[k, j] if known else 0.0
             normal[j, i] = n[k, j] if known else 0.0
@@ -34,9 +36,9 @@ def fit_sequence(
 
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
-    roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the mean
-    diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than `tolerance` of
-    the cost ends a frame.
+    roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
+    mean diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than
+    `tolerance` of the cost ends a frame.
     """
     n_segments, n_angles = parents.size, axes.shape[0]
     n = n_angles + 6
@@ -73,10 +75,12 @@ def fit_sequence(
             if first:
                 cost = new_cost
                 H, other_H, g, other_g = other_H, H, other_g, g
-                if damping < 0.0:
-                    damping = 0.0
-                    for i in range(n):
-                        damping += damping_share * H[i, depth[i]] / n
+                most = 0.0
+                for i in range(n):
+                    most += damping_share * H[i, depth[i]] / n
+                if not 0.0 <= damping <= most:  # a frame that fitted exactly leaves it high
+                    damping = most
+                growth = 2.0
             else:
                 damping, growth = adapt(damping, growth, cost - new_cost, predicted)
                 if new_cost < cost:

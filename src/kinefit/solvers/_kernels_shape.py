@@ -31,9 +31,9 @@ def frame_system(
 ):  # fmt: skip
     """Add one frame's pixels to H (m, m; lower triangle) and g (m,), m = dofs, then scales, then point shifts.
 
-    owner (K,), rest (K, 3): points of the body; base (K, 3): their place in the segment before scaling; shift (K,): first
-    shift parameter of each point, -1 for none; mirror (K,): -1 where the shift counts mirrored in z. Measurements:
-    camera (N,), column (N,) point, target (N, 2) [px], weight (N,) [1/px²]. Returns the robust cost.
+    owner (K,), rest (K, 3): points of the body; base (K, 3): their place in the segment before scaling; shift (K,):
+    first shift parameter of each point, -1 for none; mirror (K,): -1 where the shift counts mirrored in z.
+    Measurements: camera (N,), column (N,) point, target (N, 2) [px], weight (N,) [1/px²]. Returns the robust cost.
     """
     n = screws.shape[0] + 6
     motion = np.empty((parents.size, n_groups, 3))

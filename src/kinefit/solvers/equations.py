@@ -9,9 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, Rows, sort_out
 from kinefit.solvers import _kernels, _kernels_linear
 from kinefit.solvers.losses import SQUARED, Loss
+
+_ROUNDING = 1e-14  # share of the most informed degree of freedom's information that is none
+_LOOSE = 1e-3  # share of a free direction from which a degree of freedom takes part in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +63,8 @@ def normal_equations(
     rows, pairs, parameters = sort_out(parts)
     tree = body.tree
     n = tree.n_dofs
+    _within("segment", len(tree.segments), body, rows.segment, *(q.segments for q in pairs))
+    _within("degree of freedom", n, body, *(p.index for p in parameters))
     _, screws = tree.forward(state.T_world_root, state.angles)
     centre = np.ascontiguousarray(state.T_world_root[:3, 3])
     chain, depth = tree.chain, tree.depth
@@ -83,6 +89,16 @@ def normal_equations(
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
+def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
+    """Kernels look nowhere else: an index of another body must not reach them."""
+    for index in indices:
+        if index.size and not 0 <= index.min() <= index.max() < count:
+            raise ObservationError(
+                f"rows name {what} {int(index.max())}, but body '{body.name}' has {count}",
+                remedy="Make the rows with the body that is fitted.",
+            )
+
+
 def lock(body: Body, locked: NDArray | None) -> NDArray:
     """(6 + D,) bool, degrees of freedom that may not move: those given, and the root of a body that is fixed."""
     out = np.zeros(body.tree.n_dofs, bool) if locked is None else np.array(locked, bool)
@@ -90,50 +106,73 @@ def lock(body: Body, locked: NDArray | None) -> NDArray:
     return out
 
 
-def covariance(equations: Equations, *, locked: NDArray | None = None) -> NDArray:
-    """(n, n) inverse of the undamped normal matrix; what nothing observes has infinite variance and no covariance.
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Uncertainty of a state.
 
-    A degree of freedom counts as unobserved where its information, given all others, is below 1e-10 of its own.
+    Parameters
+    ----------
+    observed : (n, n)
+        Covariance of what was observed: zero along free directions and for known degrees of freedom.
+    free : (n, k)
+        Directions in which nothing holds the state.
+    """
+
+    observed: NDArray
+    free: NDArray
+
+    @property
+    def matrix(self) -> NDArray:
+        """(n, n) covariance, infinite on the diagonal (and zero beside it) where a free direction takes part."""
+        lost = np.abs(self.free).max(axis=1, initial=0.0) > _LOOSE
+        out = np.where(lost[:, None] | lost[None, :], 0.0, self.observed)
+        out[lost, lost] = np.inf
+        return out
+
+    @property
+    def std(self) -> NDArray:
+        """(n,) [m, rad] standard deviation of every degree of freedom, inf where it is free."""
+        return np.sqrt(np.diag(self.matrix))
+
+    def of(self, moves: NDArray) -> NDArray:
+        """Standard deviation (...) of quantities with derivatives `moves` (..., n); inf where they are free."""
+        variance = np.einsum("...i,...i->...", moves @ self.observed, moves)
+        blind = np.abs(moves @ self.free).max(axis=-1, initial=0.0) > _LOOSE
+        return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covariance:
+    """Inverse of the undamped normal matrix.
+
+    A direction counts as free where its information is below 1e-10 of what its degrees of freedom have each on their own.
 
     Parameters
     ----------
     locked : (n,) bool, degrees of freedom that are known: their variance is zero. A fixed root always is.
     """
     n = len(equations.depth)
-    known, lost = lock(equations.body, locked), np.zeros(n, bool)
-    out, C = np.empty((n, n)), np.array(equations.packed)
-    while True:  # a free direction is found at one of its degrees of freedom, then all that take part are taken out
-        without = known | lost
-        if without.any():
-            H = np.where(without[:, None] | without[None, :], np.eye(n), equations.matrix)
-            _kernels_linear.pack(H, equations.chain, equations.depth, C)
-        found = _kernels_linear.invert(C, equations.chain, equations.depth, out)
-        if found < 0:
-            break
-        lost |= _free_direction(equations.matrix, without, found)
-    out[without, :] = out[:, without] = 0.0
-    out[lost, lost] = np.inf
-    return out
-
-
-def _free_direction(H: NDArray, lost: NDArray, found: int) -> NDArray:
-    """(n,) degrees of freedom that take part in directions without information, by eigenvalues of the scaled H."""
-    scale = 1.0 / np.sqrt(np.where(np.diag(H) > 0, np.diag(H), 1.0))
-    kept = np.where(lost[:, None] | lost[None, :], np.eye(len(H)), H * scale[:, None] * scale[None, :])
-    values, vectors = np.linalg.eigh(kept)
+    known, out = lock(equations.body, locked), np.empty((n, n))
+    C = np.array(equations.packed)
+    whole = not known.any() and equations.diagonal.min() > _ROUNDING * equations.diagonal.max()
+    if whole and _kernels_linear.invert(C, equations.chain, equations.depth, out):
+        return Covariance(out, np.empty((n, 0)))
+    H = np.where(known[:, None] | known[None, :], 0.0, equations.matrix)
+    own = np.diag(H)
+    some = own > _ROUNDING * own.max()
+    H = np.where(some[:, None] & some[None, :], H, 0.0)
+    scale = 1.0 / np.sqrt(np.where(some, own, 1.0))
+    values, vectors = np.linalg.eigh(H * scale[:, None] * scale[None, :] + np.diag(known.astype(float)))
     weak = values < 1e-10
-    out = np.sum(np.square(vectors[:, weak]), axis=1) > 1e-8
-    out[found] = True
-    return out
+    directions = vectors * scale[:, None]
+    held = directions[:, ~weak] / np.sqrt(values[~weak])
+    held[known] = 0.0
+    return Covariance(held @ held.T, directions[:, weak] / np.linalg.norm(directions[:, weak], axis=0))
 
 
-def joint_std(body: Body, state: BodyState, cov: NDArray) -> NDArray:
-    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is unobserved."""
+def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:
+    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is free."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
-    lost = ~np.isfinite(np.diag(cov))
     moves = np.empty((len(tree.segments), 3, tree.n_dofs))
     _kernels.joint_moves(frames, screws, tree.rest, state.T_world_root, tree.dof_parent, tree.last_dof, moves)
-    variance = np.einsum("sin,sin->si", moves @ np.where(np.isfinite(cov), cov, 0.0), moves)
-    blind = np.abs(moves[:, :, lost]).max(axis=2, initial=0.0) > 1e-9
-    return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    return cov.of(moves)

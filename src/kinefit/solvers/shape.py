@@ -162,6 +162,9 @@ def fit_shape(
         )  # fmt: skip
         H[range(6, n), range(6, n)] += posture
         g[6:n] -= posture * (state.angles - tree.usual)
+        if not tree.root_free:
+            H[:6], H[:, :6], g[:6] = 0.0, 0.0, 0.0
+            H[range(6), range(6)] = 1.0
         return H, g
 
     def step(theta: NDArray, states: Sequence[BodyState], damping: float) -> tuple[NDArray, list[BodyState]]:

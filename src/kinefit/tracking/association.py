@@ -41,6 +41,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         last: NDArray | None = None
         for f in range(frames):
             people = [(q, int(p)) for q, sure in enumerate(surety) for p in np.flatnonzero(sure[f] > 0)]
+            people.sort(key=lambda node, f=f: -surety[node[0]][f, node[1]])
             group, last = _best_group(people, meetings, surety, f, last)
             for q, p in group:
                 chosen[q][f] = p

@@ -116,6 +116,10 @@ def make_channels(
         column += list(range(span.start, span.stop))
         spread += [float(sigma[q])] * len(chosen)
         columns = [record.names.index(n) for n in chosen]
+        if record.points.shape[1] == 0:  # nobody was ever seen there
+            uv.append(np.full((len(record), len(chosen), 2), np.nan))
+            confidence.append(np.zeros((len(record), len(chosen))))
+            continue
         frames, one = np.arange(len(record)), np.maximum(person, 0)
         there = (np.asarray(person) >= 0)[:, None]
         uv.append(np.where(there[..., None], record.points[frames, one][:, columns], np.nan))

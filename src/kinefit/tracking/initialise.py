@@ -51,15 +51,16 @@ def triangulated_frame(
 def _agreed(
     channels: Channels, uv: NDArray, confidence: NDArray, swapped: NDArray, limit: float
 ) -> tuple[NDArray, float]:
-    """Triangulated points of one frame, and the summed confidence of the views that agree."""
+    """Triangulated points of one frame, and the confidence of the views that agree, summed by how well they do."""
     uv, confidence = exchange(channels, uv, swapped), exchange(channels, confidence, swapped)
     view = np.full((len(channels.points), len(channels.rig), 2), np.nan)
     trust = np.zeros(view.shape[:2])
     use = np.isfinite(uv).all(axis=1) & (confidence > 0.1)
     view[channels.column[use], channels.camera[use]] = uv[use]
     trust[channels.column[use], channels.camera[use]] = confidence[use]
-    x, inliers, _ = triangulate_robust(channels.rig, view, trust, max_residual_px=limit)
-    return x, float(np.sum(np.where(inliers.sum(1) >= 2, (inliers * trust).sum(1), 0.0)))
+    x, inliers, residual = triangulate_robust(channels.rig, view, trust, max_residual_px=limit)
+    closeness = np.where(inliers, 1.0 - np.square(np.where(inliers, residual, 0.0) / limit), 0.0)
+    return x, float(np.sum(closeness * trust))
 
 
 def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:

@@ -103,7 +103,7 @@ def _motion(
         equations = normal_equations(body, state, point_rows(body, state, points, x[f], sigma=sigma), loss=loss)
         weights[f, equations.rows.group] = equations.factor
         spread = covariance(equations)
-        dof_std[f], joints[f] = np.sqrt(np.diag(spread)), joint_std(body, state, spread)
+        dof_std[f], joints[f] = spread.std, joint_std(body, state, spread)
     quality = np.stack([_share(weights, points.segments == s) for s in range(segments)], axis=1)
     values = x - body.trajectories(roots, angles, points)
     return Motion(

@@ -11,7 +11,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences import _kernels, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.rows import AnyRows, ParameterRows, Rows
-from kinefit.solvers.equations import covariance, joint_std, normal_equations
+from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.tracking.channels import Channels, fitted_pixels
@@ -183,13 +183,11 @@ class Tracker:
             self.body, fit.state, [fit.equations.rows, prior_rows(self.body, fit.state)], loss=self.settings.loss
         )
         cov = covariance(own)
-        blind = 6 + np.flatnonzero(
-            np.diag(cov)[6:] > 0.9 * np.square(self.body.tree.spread)
-        )  # known from the prior alone
-        cov[blind, :] = cov[:, blind] = 0.0
-        cov[blind, blind] = np.inf
+        blind = 6 + np.flatnonzero(cov.std[6:] > 0.95 * self.body.tree.spread)  # known from the prior alone
+        if blind.size:
+            cov = Covariance(cov.observed, np.concatenate([cov.free, np.eye(len(cov.observed))[:, blind]], axis=1))
         return FrameResult(
-            fit.state, np.sqrt(np.diag(cov)), joint_std(self.body, fit.state, cov), factor, uv, fitted, swapped,
+            fit.state, cov.std, joint_std(self.body, fit.state, cov), factor, uv, fitted, swapped,
             float(np.mean(quality)), quality,
         )  # fmt: skip
 

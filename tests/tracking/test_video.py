@@ -1,0 +1,145 @@
+"""The main job: on the real trial, and on rendered truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kinefit import Keypoints, load_body, load_observations, read_take, track
+from kinefit.errors import ObservationError, TrackingError
+from kinefit.evaluation import joint_errors
+from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.tracking.take import track_take
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Two seconds of squatting and waving."""
+    return resampled(squat_and_wave(rate=30), 30)
+
+
+def a_take(folder: Path, where: Path, detector: str) -> Path:
+    """Take file of the real balancing trial."""
+    text = f'[take]\nup = "z"\n[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
+    for c in range(1, 5):
+        name = f"cam0{c}"
+        image = 'image = "letterboxed"' if c < 3 else ""
+        file = f"openpose_json/{name}" if detector == "openpose" else f"mediapipe_landmarks_{name}.npy"
+        frame = "calibration" if detector == "openpose" else "video"
+        text += f'[[camera]]\nname = "{name}"\nvideo = "{folder}/videos/{name}.mp4"\n{image}\n'
+        text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{folder}/{file}"\nformat = "{detector}"\nframe = "{frame}"\n'
+    path = where / f"{detector}.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(("detector", "limit"), [("openpose", 9.5), ("mediapipe", 9.5)])
+def test_real_trial_is_tracked_throughout(data_dir, tmp_path, detector, limit):
+    motion, _ = track_take(a_take(data_dir("video_balancing_4cam"), tmp_path, detector))
+    assert len(motion) == 100
+    assert motion.quality.min() > 0.5
+    residuals = np.concatenate([r.norms.ravel() for r in motion.residuals.values()])
+    assert np.nanmedian(residuals) < limit
+    lengths = motion.body.segment_lengths()
+    assert 0.35 < lengths["thigh_r-shank_r"] < 0.48
+    assert np.isclose(lengths["thigh_r-shank_r"], lengths["thigh_l-shank_l"])
+    assert np.abs(np.diff(motion.angles, axis=0)).max() < np.radians(15)
+
+
+def test_real_swaps_are_found_in_cam02_alone(data_dir, tmp_path):
+    motion, _ = track_take(a_take(data_dir("video_balancing_4cam"), tmp_path, "mediapipe"))
+    swapped = {name: int(r.swapped.sum()) for name, r in motion.residuals.items()}
+    assert 26 <= swapped.pop("cam02") <= 36
+    assert not any(swapped.values())
+
+
+def test_bystanders_are_not_followed(data_dir, tmp_path):
+    observations = load_observations(read_take(a_take(data_dir("video_balancing_4cam"), tmp_path, "openpose")))
+    shuffled = [
+        Keypoints(k.camera, k.keypoint_set, k.names, k.rate, k.points[:, ::-1], k.confidence[:, ::-1])
+        for k in observations.keypoints
+    ]
+    as_is = track(observations.rig, observations.keypoints, load_body("humanoid"))
+    other = track(observations.rig, shuffled, load_body("humanoid"))
+    np.testing.assert_allclose(other.angles, as_is.angles, atol=1e-6)
+
+
+def test_known_motion_is_recovered(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", seed=1)
+    motion = track(rig, keypoints, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    assert joint_errors(truth, motion).mean() < 0.012
+
+
+def test_exact_pixels_give_the_exact_motion(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", noise_px=0.0, outliers=0.0, missing=0.0)
+    motion = track(rig, keypoints, load_body("humanoid"), accuracy=0.5, up=truth.up)
+    assert joint_errors(truth, motion).mean() < 0.004
+
+
+def test_a_person_who_leaves_is_told_and_found_again(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "BODY_25B", seed=2)
+    gone = slice(20, 35)
+    emptied = []
+    for k in keypoints:
+        points, confidence = k.points.copy(), k.confidence.copy()
+        points[gone], confidence[gone] = np.nan, 0.0
+        emptied.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
+    motion = track(rig, emptied, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    assert np.all(motion.quality[gone] == 0.0)
+    assert np.all(motion.segment_quality[gone] == 0.0)
+    assert not np.isfinite(motion.dof_std[gone][:, 6:]).any()
+    assert motion.quality[36:].min() > 0.4
+    assert joint_errors(truth, motion)[38:].mean() < 0.02
+
+
+def test_a_hidden_limb_is_told_by_segment(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "BODY_25B", outliers=0.0, missing=0.0, seed=3)
+    hidden = []
+    for k in keypoints:
+        points, confidence = k.points.copy(), k.confidence.copy()
+        arm = [k.names.index(n) for n in ("RElbow", "RWrist")]
+        points[20:40, :, arm], confidence[20:40, :, arm] = np.nan, 0.0
+        hidden.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
+    motion = track(rig, hidden, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    segment = motion.body.tree.segment
+    assert np.all(motion.segment_quality[22:38, segment("forearm_r")] == 0.0)
+    assert motion.segment_quality[22:38, segment("forearm_l")].min() > 0.5
+
+
+def test_a_detector_that_exchanges_sides_is_put_right(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "BODY_25B", swaps=0.2, seed=4)
+    motion = track(rig, keypoints, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    assert sum(r.swapped.sum() for r in motion.residuals.values()) > 10
+    assert joint_errors(truth, motion).mean() < 0.015
+
+
+def test_streams_that_differ_are_refused(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig)
+    short = simulate_keypoints(cut(truth, 0, 10), rig)
+    with pytest.raises(ObservationError, match="differ"):
+        track(rig, [*keypoints[:3], short[3]], load_body("humanoid"))
+
+
+def test_nobody_is_a_typed_error(truth):
+    rig = studio_rig(truth)
+    empty = [
+        Keypoints(k.camera, k.keypoint_set, k.names, k.rate, np.full_like(k.points, np.nan), np.zeros_like(k.confidence))
+        for k in simulate_keypoints(truth, rig)
+    ]
+    with pytest.raises(TrackingError, match="nobody"):
+        track(rig, empty, load_body("humanoid"))
+
+
+def test_one_camera_is_told(truth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig)
+    with pytest.raises(TrackingError, match="two cameras"):
+        track(rig.select(rig.names[:1]), keypoints[:1], load_body("humanoid"))
