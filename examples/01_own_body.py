@@ -8,6 +8,7 @@ import numpy as np
 from kinefit import levenberg_marquardt
 from kinefit.bodies import BodyState, parse_body
 from kinefit.correspondences import point_rows, prior_rows
+from kinefit.solvers.equations import covariance
 
 LAMP = """
 [body]
@@ -65,7 +66,7 @@ def main(seed=0, noise=0.002):
 
     fit = levenberg_marquardt(lamp, lamp.rest_state(), make_rows)
     # The normal matrix has six rows for the root in front; this root is fixed.
-    std = np.degrees(np.sqrt(np.diag(np.linalg.inv(fit.equations.matrix[6:, 6:]))))
+    std = np.degrees(covariance(fit.equations).std[6:])
     found = np.degrees(fit.state.angles)
     print(f"{lamp.name}: fitted in {fit.iterations} iterations")
     for name, a, s, t in zip(lamp.tree.coordinates, found, std, np.degrees(truth.angles)):

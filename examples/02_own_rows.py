@@ -12,7 +12,7 @@ from kinefit.bodies import BodyState
 from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.rows import Rows
 from kinefit.simulation import studio_rig
-from kinefit.solvers.equations import joint_std
+from kinefit.solvers.equations import covariance, joint_std
 
 
 def sphere_rows(body, state, points, centre, radius, *, sigma=0.005):
@@ -55,9 +55,8 @@ def main(seed=0, noise_px=1.0):
         fit = levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)
         wrist = arm.landmarks.select(("r_wrist",))
         error = np.linalg.norm(arm.positions(fit.state, wrist) - arm.positions(truth, wrist))
-        covariance = np.zeros((arm.tree.n_dofs, arm.tree.n_dofs))  # none of the root, which is fixed
-        covariance[6:, 6:] = np.linalg.inv(fit.equations.matrix[6:, 6:])
-        std = np.linalg.norm(joint_std(arm, fit.state, covariance)[arm.tree.segment("hand_r")])
+        spread = covariance(fit.equations)
+        std = np.linalg.norm(joint_std(arm, fit.state, spread)[arm.tree.segment("hand_r")])
         errors[name] = (error, std)
         print(f"{name:<16} wrist off by {1000 * error:5.1f} mm, one standard deviation {1000 * std:5.1f} mm")
     return errors

@@ -74,12 +74,7 @@ def test_a_wild_point_in_one_camera_does_not_pull():
     "frames",
     [
         (1, 2, 4, 5),
-        pytest.param(
-            (0, 3),
-            marks=pytest.mark.xfail(
-                reason="views that agree are counted within 30 px, however well; here all hypotheses do"
-            ),
-        ),
+        (0, 3),
     ],
     ids=["far apart", "40 px apart"],
 )

@@ -29,7 +29,8 @@ def a_take(folder: Path, where: Path, detector: str) -> Path:
         file = f"openpose_json/{name}" if detector == "openpose" else f"mediapipe_landmarks_{name}.npy"
         frame = "calibration" if detector == "openpose" else "video"
         text += f'[[camera]]\nname = "{name}"\nvideo = "{folder}/videos/{name}.mp4"\n{image}\n'
-        text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{folder}/{file}"\nformat = "{detector}"\nframe = "{frame}"\n'
+        text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{folder}/{file}"\n'
+        text += f'format = "{detector}"\nframe = "{frame}"\n'
     path = where / f"{detector}.toml"
     path.write_text(text)
     return path
@@ -131,7 +132,7 @@ def test_streams_that_differ_are_refused(truth):
 def test_nobody_is_a_typed_error(truth):
     rig = studio_rig(truth)
     empty = [
-        Keypoints(k.camera, k.keypoint_set, k.names, k.rate, np.full_like(k.points, np.nan), np.zeros_like(k.confidence))
+        Keypoints(k.camera, k.keypoint_set, k.names, k.rate, k.points * np.nan, 0 * k.confidence)
         for k in simulate_keypoints(truth, rig)
     ]
     with pytest.raises(TrackingError, match="nobody"):

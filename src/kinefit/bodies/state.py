@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
+from kinefit.errors import BodyError
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,8 @@ class BodyState:
     def __post_init__(self) -> None:
         for name in ("T_world_root", "angles"):
             array = np.array(getattr(self, name), dtype=float, order="C")
+            if not math.isfinite(array.sum()):
+                raise BodyError(f"a state with {name} that are not finite", remedy="Leave out what is not known.")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 

@@ -12,6 +12,8 @@ from kinefit.correspondences._kernels import plane_rows, point_rows
 from kinefit.solvers._kernels import assemble
 from kinefit.solvers._kernels_linear import adapt, damped_step
 
+_TRIES = 60  # of more damping, for a matrix that is not positive
+
 
 @jit
 def gather(order, x, n, weight, target, normal, weights):
@@ -19,7 +21,7 @@ def gather(order, x, n, weight, target, normal, weights):
     for i in range(order.size):
         k = order[i]
         total = x[k, 0] + x[k, 1] + x[k, 2] + n[k, 0] + n[k, 1] + n[k, 2]
-        known = math.isfinite(total)
+        known = abs(total) < math.inf
         for j in range(3):
             target[j, i] = x[k, j] if known else 0.0
             normal[j, i] = n[k, j] if known else 0.0
@@ -91,7 +93,9 @@ def fit_sequence(
             if attempt == max_iterations:
                 break
             predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
-            while predicted < 0.0:
+            for _ in range(_TRIES):
+                if predicted >= 0.0:
+                    break
                 damping = 10.0 * damping + 1e-12
                 predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
             retract(root, q, delta, lower, upper, new_root, new_q)

@@ -15,7 +15,7 @@ from kinefit.solvers import _kernels, _kernels_linear
 from kinefit.solvers.losses import SQUARED, Loss
 
 _ROUNDING = 1e-14  # share of the most informed degree of freedom's information that is none
-_LOOSE = 1e-3  # share of a free direction from which a degree of freedom takes part in it
+_LOOSE = 1e-5  # share of a free direction from which a degree of freedom takes part in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ class Covariance:
 def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covariance:
     """Inverse of the undamped normal matrix.
 
-    A direction counts as free where its information is below 1e-10 of what its degrees of freedom have each on their own.
+    A direction is free where its information is below 1e-10 of what its degrees of freedom have each on their own.
 
     Parameters
     ----------
@@ -156,17 +156,17 @@ def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covari
     whole = not known.any() and equations.diagonal.min() > _ROUNDING * equations.diagonal.max()
     if whole and _kernels_linear.invert(C, equations.chain, equations.depth, out):
         return Covariance(out, np.empty((n, 0)))
-    H = np.where(known[:, None] | known[None, :], 0.0, equations.matrix)
-    own = np.diag(H)
+    H = equations.matrix
+    own = np.where(known, 0.0, np.diag(H))
     some = own > _ROUNDING * own.max()
-    H = np.where(some[:, None] & some[None, :], H, 0.0)
-    scale = 1.0 / np.sqrt(np.where(some, own, 1.0))
-    values, vectors = np.linalg.eigh(H * scale[:, None] * scale[None, :] + np.diag(known.astype(float)))
+    scale = 1.0 / np.sqrt(own[some])
+    values, vectors = np.linalg.eigh(H[np.ix_(some, some)] * scale[:, None] * scale[None, :])
     weak = values < 1e-10
-    directions = vectors * scale[:, None]
+    directions = np.zeros((n, len(values)))
+    directions[some] = vectors * scale[:, None]
     held = directions[:, ~weak] / np.sqrt(values[~weak])
-    held[known] = 0.0
-    return Covariance(held @ held.T, directions[:, weak] / np.linalg.norm(directions[:, weak], axis=0))
+    loose, _ = np.linalg.qr(directions[:, weak])
+    return Covariance(held @ held.T, np.concatenate([loose, np.eye(n)[:, ~some & ~known]], axis=1))
 
 
 def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:

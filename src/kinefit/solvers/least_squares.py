@@ -14,6 +14,8 @@ from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Equations, lock, normal_equations
 from kinefit.solvers.losses import SQUARED, Loss
 
+_TRIES = 30  # of more damping, for a matrix that is not positive
+
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
 
 
@@ -86,7 +88,9 @@ def gauss_newton(
     floor = 1e-12 * float(eq.diagonal.mean()) + 1e-300
     damping = max(damping, floor)
     delta, fall = _step(eq, damping, bounds, held)
-    while fall < 0:
+    for _ in range(_TRIES):
+        if fall >= 0:
+            break
         damping *= 100.0
         delta, fall = _step(eq, damping, bounds, held)
     return Step(state.retract(delta, bounds), delta, float(np.linalg.norm(delta)), eq.cost)

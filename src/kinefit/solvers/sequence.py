@@ -83,6 +83,8 @@ def fit_sequence(
     if x.shape != (count, len(points), 3):
         raise ObservationError(f"measured points have shape {x.shape}", remedy=f"Give (frames, {len(points)}, 3).")
     seen = np.isfinite(x).all(axis=2)
+    if not np.all(np.asarray(sigma, float) > 0) or (planes is not None and not planes.sigma > 0):
+        raise ObservationError("the standard deviation of points and planes must be positive")
     weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
     order = np.argsort(points.segments, kind="stable")  # rows of one segment in one run
     p = planes or Planes(_NO_POINTS, np.zeros((count, 0, 3)), np.zeros((count, 0, 3)))

@@ -40,8 +40,8 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         meetings = _meetings(rig, keypoints, surety, frames)
         last: NDArray | None = None
         for f in range(frames):
-            people = [(q, int(p)) for q, sure in enumerate(surety) for p in np.flatnonzero(sure[f] > 0)]
-            people.sort(key=lambda node, f=f: -surety[node[0]][f, node[1]])
+            ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(surety) for p in np.flatnonzero(s[f] > 0)]
+            people = [(q, p) for _, q, p in sorted(ranked, reverse=True)]
             group, last = _best_group(people, meetings, surety, f, last)
             for q, p in group:
                 chosen[q][f] = p
