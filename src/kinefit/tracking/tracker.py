@@ -31,7 +31,7 @@ class Settings:
     velocity_gain : float in 0..1
         Share of each frame's own motion in the velocity that predicts the next.
     poor : float in 0..1
-        Quality below which a frame is started anew from its own keypoints.
+        Support below which a frame is started anew from its own keypoints.
     """
 
     loss: Loss = field(default_factory=geman_mcclure)
@@ -54,6 +54,7 @@ class FrameResult:
     uv, fitted : (N, 2) [px] measurements as used, and where the body is seen.
     swapped : (N,) bool, channels exchanged with their partner.
     quality : float, and segment_quality (S,), in 0..1.
+    support : float in 0..1, mean robust factor of what was seen: low where the body is not where the pixels are.
     """
 
     state: BodyState
@@ -65,6 +66,7 @@ class FrameResult:
     swapped: NDArray
     quality: float
     segment_quality: NDArray
+    support: float
 
 
 class Tracker:
@@ -112,9 +114,9 @@ class Tracker:
         if self._state is not None:
             predicted = self._state.retract(self._velocity)
             result = self._fit(predicted, predicted, uv, weight)
-        if result is None or result.quality < self.settings.poor:
+        if result is None or result.support < self.settings.poor:
             again = self._start(uv, weight, confidence)
-            if again is not None and (result is None or again.quality > result.quality + 0.1):
+            if again is not None and (result is None or again.support > result.support + 0.1):
                 result = again
                 self._state = None
         if result is None:
@@ -122,7 +124,7 @@ class Tracker:
         if self._state is not None:
             moved = self._state.difference(result.state)
             gain = self.settings.velocity_gain
-            trusted = gain * moved if result.quality > self.settings.poor else 0.0
+            trusted = gain * moved if result.support > self.settings.poor else 0.0
             self._velocity = (1.0 - gain) * self._velocity + trusted
         else:
             self._velocity = np.zeros_like(self._velocity)
@@ -188,7 +190,7 @@ class Tracker:
             cov = Covariance(cov.observed, np.concatenate([cov.free, np.eye(len(cov.observed))[:, blind]], axis=1))
         return FrameResult(
             fit.state, cov.std, joint_std(self.body, fit.state, cov), factor, uv, fitted, swapped,
-            float(np.mean(quality)), quality,
+            float(np.mean(quality)), quality, float(factor.sum() / max(int(seen.sum()), 1)),
         )  # fmt: skip
 
 
