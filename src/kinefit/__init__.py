@@ -26,6 +26,7 @@ _HOMES = {
     "load_observations": "kinefit.readers.load",
     "read_amc": "kinefit.readers.amc",
     "read_bvh": "kinefit.readers.bvh",
+    "read_caliscope_csv": "kinefit.readers.keypoints",
     "read_calibration": "kinefit.readers.calibration",
     "read_keypoints": "kinefit.readers.keypoints",
     "read_markers": "kinefit.readers.markers",

@@ -25,7 +25,7 @@ def cache_directory() -> Path:
 
 
 def _kernel_hash() -> str:
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(numba.__version__.encode() + Path(__file__).read_bytes())
     for source in sorted(_PACKAGE.rglob("_kernels*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

@@ -115,6 +115,8 @@ class Motion:
             array = np.array(getattr(self, name), dtype=float)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        if self.up not in UP_AXES:
+            raise ObservationError(choices("vertical axis", self.up, UP_AXES))
         if not np.all(np.isfinite(self.Ts_world_root)) or not np.all(np.isfinite(self.angles)):
             raise ObservationError(
                 "a motion holds poses that are not finite", remedy="Leave out frames without a pose."

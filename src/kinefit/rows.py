@@ -156,7 +156,8 @@ class ParameterRows:
     ----------
     index : (N,) int, degree of freedom: 0-2 the root's shift, 3-5 its turn, 6.. the angles.
     residual : (N,) [rad or m] how much further it should be.
-    weight : (N,) [1/rad² or 1/m²]
+    weight : (N,) [1/rad² or 1/m²], or (N, N)
+        Inverse variances, or the inverse covariance of all of them together.
     """
 
     index: NDArray
@@ -164,7 +165,8 @@ class ParameterRows:
     weight: NDArray
 
     def __post_init__(self) -> None:
-        _as_kernels_take_them(self, index=(np.int64, (None,)), residual=(float, (None,)), weight=(float, (None,)))
+        shape = (None,) * max(np.ndim(self.weight), 1)
+        _as_kernels_take_them(self, index=(np.int64, (None,)), residual=(float, (None,)), weight=(float, shape))
         _check("parameter rows", self.residual, self.weight)
 
     def __len__(self) -> int:

@@ -125,6 +125,18 @@ class KinematicTree:
             out[k, self.depth[k]] = k
         return _frozen(out, np.int64)
 
+    @cached_property
+    def ball_joints(self) -> tuple[slice, ...]:
+        """Coordinates of every joint that turns about three axes at right angles; see `charts`."""
+        out = []
+        for s in range(len(self.segments)):
+            d = slice(int(self.dof_start[s]), int(self.dof_start[s + 1]))
+            axes = self.axes[d]
+            turns = len(axes) == 3 and not self.prismatic[d].any()
+            if turns and np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
+                out.append(d)
+        return tuple(out)
+
     def segment(self, name: str) -> int:
         """Index of a segment by name."""
         if name not in self.segments:

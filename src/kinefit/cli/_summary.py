@@ -35,6 +35,9 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     say(f"quality: {motion.quality.mean():.2f} of 1 on average, lowest {motion.quality[worst]:.2f} in frame {worst}")
     doubtful = np.flatnonzero(motion.quality < DOUBTFUL)
     say(f"doubtful frames: {frame_ranges(doubtful)}" if len(doubtful) else "doubtful frames: none")
+    nobody = np.flatnonzero(motion.quality <= 0)
+    if len(nobody):
+        say(f"nobody seen: frames {frame_ranges(nobody)}")
     for name, lost in lost_segments(motion).items():
         say(f"lost: {name} in frames {frame_ranges(lost)}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
@@ -60,7 +63,9 @@ def frame_ranges(frames: NDArray) -> str:
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
     """Segments that no measurement supports, and in which frames."""
-    lost = {name: np.flatnonzero(motion.segment_quality[:, s] <= 0) for s, name in enumerate(motion.body.tree.segments)}
+    seen = motion.quality > 0
+    gone = (motion.segment_quality <= 0) & seen[:, None]
+    lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
     return {name: frames for name, frames in lost.items() if len(frames)}
 
 

@@ -16,7 +16,10 @@ from kinefit.rows import Rows
 
 def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
     """(K,) weight 1/σ² of each measurement, 0 where it is absent; σ a scalar or (K,)."""
-    sigma = np.broadcast_to(np.asarray(sigma, float), present.shape)
+    sigma = np.asarray(sigma, float)
+    if sigma.shape not in ((), present.shape):
+        raise ObservationError(f"deviations of {what} have shape {sigma.shape}", remedy=f"Give {present.shape}.")
+    sigma = np.broadcast_to(sigma, present.shape)
     if not np.all(sigma[present] > 0):
         remedy = "Leave out what was not measured, or give it a large one."
         raise ObservationError(f"the standard deviation of {what} must be positive", remedy=remedy)

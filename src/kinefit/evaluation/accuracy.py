@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.charts import twin
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
 
@@ -33,14 +34,10 @@ def angle_errors(truth: Motion, result: Motion) -> NDArray:
     result = _comparable(truth, result)
     tree = truth.body.tree
     errors = _wrapped(result.angles - truth.angles)
-    for s in range(len(tree.segments)):
-        d = slice(tree.dof_start[s], tree.dof_start[s + 1])
-        axes = tree.axes[d]
-        if len(axes) == 3 and np.allclose(axes @ axes.T, np.eye(3), atol=1e-6):
-            other = np.array([np.pi, np.pi, np.pi]) + result.angles[:, d] * (1.0, -1.0, 1.0)
-            twin = _wrapped(other - truth.angles[:, d])
-            nearer = np.abs(twin).sum(axis=1) < np.abs(errors[:, d]).sum(axis=1)
-            errors[nearer, d] = twin[nearer]
+    for d in tree.ball_joints:
+        other = _wrapped(twin(result.angles[:, d]) - truth.angles[:, d])
+        nearer = np.abs(other).sum(axis=1) < np.abs(errors[:, d]).sum(axis=1)
+        errors[nearer, d] = other[nearer]
     return np.where(tree.prismatic, result.angles - truth.angles, errors)
 
 

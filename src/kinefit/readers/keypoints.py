@@ -149,7 +149,7 @@ def read_mediapipe(
     try:
         data = np.load(path, allow_pickle=False)
     except FileNotFoundError as error:
-        raise FileError("no such file", file=path) from error
+        raise FileError("no such file", file=path, remedy="Check the path.") from error
     except (OSError, ValueError, EOFError) as error:
         raise FileError(f"not a numpy array file ({error})", file=path, remedy="Write it by numpy.save.") from error
     if not isinstance(data, np.ndarray) or data.dtype.kind not in "fiu" or data.shape[1:] != (len(names), 3):
@@ -167,7 +167,10 @@ def read_mediapipe(
             remedy="A frame with nobody must be NaN (or zero) as a whole.",
         )
     if not data[..., 2].any():
-        raise ObservationError(f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path)
+        raise ObservationError(
+            f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path,
+            remedy="Check that the detector ran on this camera's video; or leave this camera out.",
+        )
     return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
 
 
@@ -201,9 +204,10 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
                 raise ObservationError(f"no column {', '.join(missing)}", file=path, remedy=needed)
             table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
     except FileNotFoundError as error:
-        raise FileError("no such file", file=path) from error
+        raise FileError("no such file", file=path, remedy="Check the path.") from error
     except (ValueError, TypeError, UnicodeDecodeError) as error:
-        raise ObservationError(f"a cell is not a number ({error})", file=path) from error
+        problem = f"a cell is not a number ({error})"
+        raise ObservationError(problem, file=path, remedy="Export the table again.") from error
     table = table[(table[:, 3] < len(names)) & np.isfinite(table).all(axis=1)]
     if not len(table):
         raise ObservationError("no landmark of the body in this table", file=path, remedy="Track the whole pose.")
@@ -250,7 +254,7 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
 def _numbered_files(folder: Path) -> list[Path]:
     """Json files of a folder by frame number, without gaps."""
     if not folder.is_dir():
-        raise FileError("no such folder of json files", file=folder)
+        raise FileError("no such folder of json files", file=folder, remedy="Name the folder, not one of its files.")
     numbered: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() != ".json":
@@ -266,7 +270,8 @@ def _numbered_files(folder: Path) -> list[Path]:
             )
         numbered[number] = path
     if not numbered:
-        raise FileError("there are no json files in this folder", file=folder)
+        remedy = "Name the folder that the detector wrote for this camera."
+        raise FileError("there are no json files in this folder", file=folder, remedy=remedy)
     first, last = min(numbered), max(numbered)
     count = last - first + 1 - len(numbered)
     if count:
@@ -291,10 +296,12 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     for i, person in enumerate(people):
         if len(person.pose_keypoints_2d) != 3 * count:
             fitting = [name for name in KEYPOINT_SETS if 3 * len(KEYPOINT_SETS[name]) == len(person.pose_keypoints_2d)]
-            raise ObservationError(
-                f"{len(person.pose_keypoints_2d)} numbers where {keypoint_set} has {count} x 3", file=path,
-                place=f"person {i}", remedy=f"This number fits: {', '.join(fitting) or 'no known keypoint set'}.",
-            )
+            remedy = (
+                f"This number fits: {', '.join(fitting)}; name it by set = ... of [[keypoints]]." if fitting
+                else f"No set has so many; there are: {', '.join(KEYPOINT_SETS)}. Run the detector with one of these."
+            )  # fmt: skip
+            problem = f"{len(person.pose_keypoints_2d)} numbers where {keypoint_set} has {count} x 3"
+            raise ObservationError(problem, file=path, place=f"person {i}", remedy=remedy)
     data = np.array([person.pose_keypoints_2d for person in people], dtype=float).reshape(len(people), count, 3)
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")

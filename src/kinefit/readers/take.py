@@ -128,9 +128,9 @@ def read_take(path: str | PathLike[str]) -> Take:
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise FileError("no such take file", file=path) from error
+        raise FileError("no such take file", file=path, remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"cannot be read ({error})", file=path) from error
+        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
     except tomllib.TOMLDecodeError as error:
         raise FileError(f"not TOML: {error}", file=path, remedy="Put texts in quotes and numbers not.") from error
     _check_keys(raw, path)

@@ -203,7 +203,7 @@ def check_rates(rates: Mapping[str, float], *, file: str | PathLike[str] | None 
         listed = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in rates.items())
         raise ObservationError(
             f"streams of different rate: {listed}", file=file,
-            remedy="Resample them to one rate: ffmpeg -i IN -r RATE OUT.",
+            remedy="Correct rate = ... of [[keypoints]], or resample the videos: ffmpeg -i IN -r RATE OUT.",
         )
 
 
@@ -244,11 +244,16 @@ def _open(path: Path) -> Any:
     try:
         container = av.open(str(path))
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise FileError(f"not a readable video, 0 frames ({error})", file=path, remedy=_REMEDY) from error
+        raise FileError(f"not a readable video, 0 frames ({_reason(error)})", file=path, remedy=_REMEDY) from error
     if not container.streams.video:
         container.close()
         raise FileError("there is no video stream in this file", file=path, remedy="Name a video file.")
     return container
+
+
+def _reason(error: Exception) -> str:
+    """What FFmpeg says, without its error number and the path."""
+    return str(getattr(error, "strerror", None) or error)
 
 
 def _presentation_times(path: Path) -> list[int]:

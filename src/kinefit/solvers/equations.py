@@ -30,7 +30,7 @@ class Equations:
     packed : (n, m) H in the pattern of chain and depth, see `_kernels_linear`.
     gradient : (n,) g = Σ Jᵀ W r.
     cost : float, Σ ρ(w r²) over all rows.
-    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it with pair rows.
+    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it where rows couple them.
     """
 
     body: Body
@@ -74,11 +74,18 @@ def normal_equations(
         rows.data, rows.segment, rows.group, len(rows), loss.kind, loss.scale, centre,
         tree.parents, tree.dof_start, chain, depth, screws, factor, blocks, C, g,
     )  # fmt: skip
+    joint = [p for p in parameters if p.weight.ndim == 2]
     for p in parameters:
-        cost += _kernels.add_parameters(p.index, p.residual, p.weight, depth, C, g)
-    if pairs:
+        if p.weight.ndim == 1:
+            cost += _kernels.add_parameters(p.index, p.residual, p.weight, depth, C, g)
+    if pairs or joint:
         H = np.zeros((n, n))
         _kernels_linear.unpack(C, chain, depth, H)
+        for p in joint:
+            pull = p.weight @ p.residual
+            H[np.ix_(p.index, p.index)] += p.weight
+            g[p.index] += pull
+            cost += float(p.residual @ pull)
         for q in pairs:
             cost += _kernels.add_pairs(
                 q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,

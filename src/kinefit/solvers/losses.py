@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from kinefit.errors import ObservationError
 from kinefit.solvers import _kernels
 
 
@@ -22,7 +23,7 @@ class Loss:
 
     def __post_init__(self) -> None:
         if not self.scale > 0:
-            raise ValueError(f"the scale of a loss must be positive, got {self.scale}")
+            raise ObservationError(f"the scale of a loss must be positive, got {self.scale}")
 
 
 SQUARED = Loss()

@@ -109,10 +109,17 @@ def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: floa
     whole = height / body.stature if height and body.stature else float(np.median(list(means.values())))
     if not 0.2 < whole < 5.0:
         raise TrackingError(
-            f"the person would be {whole:.2g} times as large as the body: the calibration's unit is wrong",
-            remedy="Set unit under [calibration].",
+            f"the person would be {float(f'{whole:.2g}'):g} times the body's size: the calibration's unit is wrong",
+            remedy=f"Set unit = {_unit_for(whole)} under [calibration], or correct what stands there.",
         )
     return np.array([np.clip(means.get(g, whole), 0.6 * whole, 1.6 * whole) for g in range(len(body.scale_groups))])
+
+
+def _unit_for(times: float) -> str:
+    """The unit that a calibration is probably in whose numbers make a person so many times too large."""
+    units = {"mm": 1e3, "cm": 1e2, "dm": 1e1, "inch": 39.37}
+    name, factor = min(units.items(), key=lambda u: abs(np.log(u[1] / times)))
+    return f'"{name}"' if abs(np.log(factor / times)) < 0.7 else "what its numbers are in"
 
 
 def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,6 +26,7 @@ def fit_markers(
     sigma: ArrayLike = 0.005,
     loss: Loss | None = None,
     limits: bool = True,
+    up: str | None = None,
 ) -> Motion:
     """Motion of a body from labelled markers, each frame from the last, the first with no pose given.
 
@@ -36,6 +39,7 @@ def fit_markers(
         Default: the body's set that shares most labels.
     sigma : scalar or one for each marker used [m]
     loss : default Geman-McClure, so that a wrong label or a ghost does not pull.
+    up : vertical axis of the world; default: the file's where it says so, else y.
 
     Raises
     ------
@@ -52,7 +56,7 @@ def fit_markers(
     before = fit_sequence(body, state, points, x[:first][::-1], sigma=sigma, loss=loss, limits=limits)
     roots = np.concatenate([before.Ts_world_root[::-1], after.Ts_world_root])
     angles = np.concatenate([before.angles[::-1], after.angles])
-    return _motion(body, markers, points, x, roots, angles, sigma, loss)
+    return _motion(body, markers, points, x, roots, angles, sigma, loss, up)
 
 
 def _matched(body: Body, markers: Markers, marker_set: str | None) -> tuple[PointSet, list[int]]:
@@ -94,6 +98,7 @@ def _motion(
     angles: NDArray,
     sigma: ArrayLike,
     loss: Loss,
+    up: str | None,
 ) -> Motion:
     frames, dofs, segments = len(x), body.tree.n_dofs, len(body.tree.segments)
     dof_std, joints = np.empty((frames, dofs)), np.empty((frames, segments, 3))
@@ -119,10 +124,10 @@ def _motion(
         residuals={
             "markers": Residuals(points.names, points.segments, values, weights, "m", x, np.zeros(frames, bool))
         },
-        up=markers.up or "y",
-        name=markers.source or "markers",
+        up=up or markers.up or "y",
+        name=Path(markers.source).stem or "markers",
     )
 
 
 def _share(weights: NDArray, mine: NDArray) -> NDArray:
-    return weights[:, mine].mean(axis=1) if mine.any() else weights.mean(axis=1)
+    return weights[:, mine].mean(axis=1) if mine.any() else np.zeros(len(weights))

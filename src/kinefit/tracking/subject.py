@@ -49,7 +49,7 @@ def fit_subject(
     TrackingError
         No frame shows enough of the person in two cameras.
     """
-    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(frames, len(channels.uv))).astype(int))
+    chosen = np.unique(np.linspace(0, len(channels.uv) - 1, min(max(frames, 1), len(channels.uv))).astype(int))
     if progress:
         progress("bone lengths", 0, 1)
     x = triangulated(channels, chosen)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.charts import off_the_limits
 from kinefit.correspondences import _kernels, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.rows import AnyRows, ParameterRows, Rows
@@ -16,7 +17,10 @@ from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.tracking.channels import Channels, fitted_pixels
 from kinefit.tracking.initialise import pose_from_points, triangulated_frame
+from kinefit.tracking.prediction import Prediction, belief
 from kinefit.tracking.swaps import find_swaps, limb_groups
+
+_LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 
 
 @dataclass(frozen=True)
@@ -27,17 +31,17 @@ class Settings:
     ----------
     loss : Loss of a keypoint, in its standard deviations.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
-        How abruptly a person moves: one standard deviation; times dt² it is that of the predicted pose.
-    velocity_gain : float in 0..1
-        Share of each frame's own motion in the velocity that predicts the next.
+        How abruptly a person moves: one standard deviation.
+    velocity_memory : float [s]
+        How long a velocity lasts that nothing confirms.
     poor : float in 0..1
         Support below which a frame is started anew from its own keypoints.
     """
 
     loss: Loss = field(default_factory=geman_mcclure)
-    angle_acceleration: float = 400.0
-    root_acceleration: float = 60.0
-    velocity_gain: float = 0.25
+    angle_acceleration: float = 100.0
+    root_acceleration: float = 10.0
+    velocity_memory: float = 0.2
     poor: float = 0.5
 
 
@@ -81,29 +85,27 @@ class Tracker:
     """
 
     def __init__(self, body: Body, channels: Channels, rate: float, settings: Settings | None = None) -> None:
-        self.body, self.channels, self.dt = body, channels, 1.0 / rate
+        self.body, self.channels = body, channels
         self.settings = settings or Settings()
         self._rest = body.points_rest(channels.points)[channels.column]
         self._owner = channels.points.segments[channels.column]
         self._groups = limb_groups(body, channels)
         self._informs = informing(body, channels)
         n = 2 * len(self._owner)
-        self._dofs = np.arange(body.tree.n_dofs)
+        self._angles = np.arange(6, body.tree.n_dofs)
         self._posture = np.square(1.0 / body.tree.spread)
-        still = np.full(body.tree.n_dofs, self.settings.angle_acceleration * self.dt**2)
-        still[:3] = self.settings.root_acceleration * self.dt**2
-        self._stay = np.square(1.0 / still)
+        self._prediction = Prediction(
+            body,
+            1.0 / rate,
+            angle_acceleration=self.settings.angle_acceleration,
+            root_acceleration=self.settings.root_acceleration,
+            memory=self.settings.velocity_memory,
+        )
         self._buffers = np.empty((8, n)), np.empty(n, np.int64), np.empty(n, np.int64)
-        self._state: BodyState | None = None
-        self._velocity = np.zeros(body.tree.n_dofs)
-
-    def forget(self) -> None:
-        """Start anew with the next frame."""
-        self._state, self._velocity = None, np.zeros_like(self._velocity)
 
     def start_at(self, state: BodyState) -> None:
-        """Take a state as that of the last frame."""
-        self._state, self._velocity = state, np.zeros_like(self._velocity)
+        """Take a state as that of the last frame; its velocity is unknown."""
+        self._prediction.start(state)
 
     def update(self, uv: NDArray, confidence: NDArray) -> FrameResult | None:
         """Track a frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None until there is a start."""
@@ -111,24 +113,20 @@ class Tracker:
         weight = np.where(seen, confidence / np.square(self.channels.sigma), 0.0)
         uv = np.where(seen[:, None], uv, np.nan)
         result = None
-        if self._state is not None:
-            predicted = self._state.retract(self._velocity)
-            result = self._fit(predicted, predicted, uv, weight)
+        if self._prediction.state is not None:
+            if not seen.any():
+                self._prediction.halt()
+            predicted, information = self._prediction.ahead()
+            fit, result = self._fit(predicted, (predicted, information), uv, weight)
+            self._prediction.correct(result.state, np.linalg.inv(fit.equations.matrix))
+            chart = off_the_limits(self.body.tree, result.state.angles)
+            if chart is not None:
+                self._prediction.change_chart(*chart)
         if result is None or result.support < self.settings.poor:
             again = self._start(uv, weight, confidence)
             if again is not None and (result is None or again.support > result.support + 0.1):
                 result = again
-                self._state = None
-        if result is None:
-            return None
-        if self._state is not None:
-            moved = self._state.difference(result.state)
-            gain = self.settings.velocity_gain
-            trusted = gain * moved if result.support > self.settings.poor else 0.0
-            self._velocity = (1.0 - gain) * self._velocity + trusted
-        else:
-            self._velocity = np.zeros_like(self._velocity)
-        self._state = result.state
+                self._prediction.start(result.state, result.dof_std)
         return result
 
     def _start(self, uv: NDArray, weight: NDArray, confidence: NDArray) -> FrameResult | None:
@@ -137,9 +135,11 @@ class Tracker:
             state, _ = pose_from_points(self.body, self.channels.points, x)
         except TrackingError:
             return None
-        return self._fit(state, None, uv, weight)
+        return self._fit(state, None, uv, weight)[1]
 
-    def _fit(self, start: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> FrameResult:
+    def _fit(
+        self, start: BodyState, predicted: tuple[BodyState, NDArray] | None, uv: NDArray, weight: NDArray
+    ) -> tuple[Fit, FrameResult]:
         swapped = find_swaps(self.channels, self._groups, uv, weight, fitted_pixels(self.body, self.channels, start))
         partner = np.arange(len(swapped))
         for _ in range(3):
@@ -148,15 +148,18 @@ class Tracker:
             fit = levenberg_marquardt(
                 self.body, start, lambda s: self._rows(s, predicted, used, used_weight),  # noqa: B023
                 loss=self.settings.loss, max_iterations=40, tolerance=1e-5,
+                damping=None if predicted is None else _LIGHT,
             )  # fmt: skip
             fitted = fitted_pixels(self.body, self.channels, fit.state)
             again = find_swaps(self.channels, self._groups, uv, weight, fitted)
             if np.array_equal(again, swapped):
                 break
             swapped, start = again, fit.state
-        return self._judge(fit, used, used_weight, fitted, swapped)
+        return fit, self._judge(fit, used, used_weight, fitted, swapped)
 
-    def _rows(self, state: BodyState, predicted: BodyState | None, uv: NDArray, weight: NDArray) -> list[AnyRows]:
+    def _rows(
+        self, state: BodyState, predicted: tuple[BodyState, NDArray] | None, uv: NDArray, weight: NDArray
+    ) -> list[AnyRows]:
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         data, segment, group = self._buffers[0].copy(), self._buffers[1].copy(), self._buffers[2].copy()
         end = _kernels.pixel_rows(
@@ -165,9 +168,9 @@ class Tracker:
         )  # fmt: skip
         rows = Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
         tree = self.body.tree
-        parts: list[AnyRows] = [rows, ParameterRows(self._dofs[6:], tree.usual - state.angles, self._posture)]
+        parts: list[AnyRows] = [rows, ParameterRows(self._angles, tree.usual - state.angles, self._posture)]
         if predicted is not None:
-            parts.append(ParameterRows(self._dofs, state.difference(predicted), self._stay))
+            parts.append(belief(state, *predicted))
         return parts
 
     def _judge(self, fit: Fit, uv: NDArray, weight: NDArray, fitted: NDArray, swapped: NDArray) -> FrameResult:

@@ -76,7 +76,13 @@ def track(
     if len(lengths) > 1 or len(rates) > 1:
         told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
         raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
-    sigma = [float(accuracy)] * len(keypoints) if isinstance(accuracy, int | float) else [float(a) for a in accuracy]
+    sigma = _accuracies(accuracy, len(keypoints))
+    if len({k.camera for k in keypoints}) < 2:
+        raise TrackingError(
+            f"the keypoints are of one camera only, {keypoints[0].camera}", remedy="Tracking needs two cameras or more."
+        )
+    if height is not None and not 0.3 < height < 3.0:
+        raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     channels = make_channels(body, rig, keypoints, choose_people(rig, keypoints), sigma)
     if subject is None:
         subject = fit_subject(body, channels, frames=shape_frames, height=height, progress=progress)
@@ -86,6 +92,14 @@ def track(
     if len(motion) < len(channels.uv):
         raise TrackingInterrupted(motion, len(channels.uv))
     return motion
+
+
+def _accuracies(accuracy: float | Sequence[float], count: int) -> list[float]:
+    """One standard deviation [px] for each of the records."""
+    values = np.asarray(accuracy, float).ravel()
+    if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
+        raise ObservationError(f"accuracies {values}", remedy=f"Give one positive number of pixels, or {count}.")
+    return [float(v) for v in np.broadcast_to(values, count)]
 
 
 def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> list[FrameResult | None]:

@@ -1,0 +1,86 @@
+"""What earlier frames tell of the next one: a Kalman filter with constant velocity over all degrees of freedom."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.rows import ParameterRows
+
+
+class Prediction:
+    """Pose, velocity and their joint covariance, carried from frame to frame.
+
+    Positions and velocities (per frame) of the n degrees of freedom make a state of 2n. Its prediction enters the next
+    frame's fit as one row on all degrees of freedom together, so that what one frame left open is filled from those
+    before it, and what it saw well is hardly touched.
+
+    Parameters
+    ----------
+    body : Body
+    dt : float [s] between frames.
+    angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
+        One standard deviation of the random acceleration that drives the motion.
+    memory : float [s]
+        How long a velocity lasts that nothing confirms.
+    """
+
+    def __init__(
+        self, body: Body, dt: float, *, angle_acceleration: float, root_acceleration: float, memory: float
+    ) -> None:
+        n = body.tree.n_dofs
+        self._bounds = body.tree.lower, body.tree.upper
+        self._keep = float(np.exp(-dt / memory))
+        jolt = np.concatenate([np.full(3, root_acceleration), np.full(n - 3, angle_acceleration)]) * dt**2
+        self._noise = [np.diag(jolt**2 * share) for share in (0.25, 0.5, 1.0)]
+        self._first_velocity = np.diag(np.concatenate([np.full(3, 1.0), np.full(n - 3, 5.0)]) * dt) ** 2
+        self._wide = np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)])
+        self.state: BodyState | None = None
+        self._velocity = np.zeros(n)
+
+    def start(self, state: BodyState, std: NDArray | None = None) -> None:
+        """Begin at a state whose velocity is unknown; std (n,) [m, rad], inf where nothing is known."""
+        self.state, self._velocity = state, np.zeros_like(self._velocity)
+        spread = self._wide if std is None else np.minimum(std, self._wide)
+        self._xx, self._vv = np.diag(spread**2), self._first_velocity.copy()
+        self._vx = np.zeros_like(self._xx)
+
+    def change_chart(self, angles: NDArray, signs: NDArray) -> None:
+        """Go on in other charts of some ball joints: their angles (D,), and the signs (D,) of how they change."""
+        assert self.state is not None
+        turned = np.concatenate([np.ones(6), signs])
+        self.state = BodyState(self.state.T_world_root, angles)
+        self._velocity = turned * self._velocity
+        both = turned[:, None] * turned[None, :]
+        self._xx, self._vx, self._vv = both * self._xx, both * self._vx, both * self._vv
+
+    def halt(self) -> None:
+        """Stay where the body was last seen: for a frame in which nothing is."""
+        self._velocity = np.zeros_like(self._velocity)
+
+    def ahead(self) -> tuple[BodyState, NDArray]:
+        """The next frame's state, and the information (n, n) that it stands for."""
+        assert self.state is not None
+        self._velocity = self._keep * self._velocity
+        vx, vv = self._keep * self._vx, self._keep**2 * self._vv
+        self._xx = self._xx + vx + vx.T + vv + self._noise[0]
+        self._vx = vx + vv + self._noise[1]
+        self._vv = vv + self._noise[2]
+        self._ahead = self.state.retract(self._velocity, self._bounds)
+        self._information = np.linalg.inv(self._xx)
+        return self._ahead, self._information
+
+    def correct(self, state: BodyState, posterior: NDArray) -> None:
+        """Take the fitted state, with the covariance (n, n) that its normal matrix gives, prediction included."""
+        gain = self._vx @ self._information
+        self._velocity = self._velocity + gain @ self._ahead.difference(state)
+        self._vv = self._vv - gain @ (self._xx - posterior) @ gain.T
+        self._vx = gain @ posterior
+        self._xx = posterior
+        self.state = state
+
+
+def belief(state: BodyState, predicted: BodyState, information: NDArray) -> ParameterRows:
+    """The prediction as one row on all degrees of freedom: r = predicted − state, weighed by an (n, n) information."""
+    return ParameterRows(np.arange(len(information)), state.difference(predicted), information)
