@@ -129,7 +129,7 @@ def test_lengths_that_nothing_measures_follow_the_others_or_the_height():
 def test_scales_that_cannot_be_are_told():
     with pytest.raises(TrackingError, match=r"no bone.*calibration"):
         first_scales(BODY, POINTS, np.full((2, len(POINTS), 3), np.nan))
-    with pytest.raises(TrackingError, match=r"1000 times.*unit = "mm""):
+    with pytest.raises(TrackingError, match=r'1000 times.*unit = "mm"'):
         first_scales(BODY, POINTS, 1000 * FRAMES)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,9 +92,24 @@ def normal_equations(
                 q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
                 centre, screws, tree.dof_parent, tree.last_dof, H, g,
             )  # fmt: skip
-        chain, depth = np.tile(np.arange(n), (n, 1)), np.arange(n)
-        return Equations(body, state, rows, factor, H, g, float(cost), chain, depth)
+        return Equations(body, state, rows, factor, H, g, float(cost), *_dense(n))
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
+
+
+@lru_cache(maxsize=8)
+def _dense(n: int) -> tuple[NDArray, NDArray]:
+    """Chain and depth of a matrix in which all degrees of freedom meet."""
+    chain, depth = np.tile(np.arange(n), (n, 1)), np.arange(n)
+    chain.flags.writeable = depth.flags.writeable = False
+    return chain, depth
+
+
+def inverse(matrix: NDArray) -> NDArray:
+    """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
+    out = np.empty_like(matrix)
+    if not _kernels_linear.invert(np.array(matrix), *_dense(len(matrix)), out):
+        out = np.linalg.inv(matrix)
+    return 0.5 * (out + out.T)
 
 
 def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:

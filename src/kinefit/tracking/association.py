@@ -14,6 +14,7 @@ from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import Keypoints
 
 _ENOUGH = 4  # points of a person that must be seen
+_SOME = 13  # points, spread over the set, that decide whether two detections are of one person
 _STRIDE = 0.3  # [m] people stay about where they are from frame to frame
 _AGREE = 0.04  # two views of one person differ by less than this share of the person's height in the picture
 
@@ -82,8 +83,10 @@ def _meetings(
 
 def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArray) -> NDArray:
     """(F, 3) median point in space where two detections agree in some frames, NaN where they do not."""
-    uv = np.stack([a.points[frames, pa], b.points[frames, pb]], axis=2)
-    sure = np.stack([a.confidence[frames, pa], b.confidence[frames, pb]], axis=2) > 0.1
+    some = np.unique(np.linspace(0, len(a.names) - 1, _SOME).astype(int))
+    at = frames[:, None], some
+    uv = np.stack([k.points[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2)
+    sure = np.stack([k.confidence[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2) > 0.1
     uv = np.where((np.isfinite(uv).all(axis=-1) & sure).all(axis=2)[..., None, None], uv, np.nan)
     x = triangulate(pair, uv.reshape(-1, 2, 2)).reshape(*uv.shape[:2], 3)
     error = np.stack([np.linalg.norm(c.project(x) - uv[:, :, k], axis=-1) for k, c in enumerate(pair)], axis=-1)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import ParameterRows
+from kinefit.solvers.equations import inverse
 
 
 class Prediction:
@@ -68,14 +69,15 @@ class Prediction:
         self._vx = vx + vv + self._noise[1]
         self._vv = vv + self._noise[2]
         self._ahead = self.state.retract(self._velocity, self._bounds)
-        self._information = np.linalg.inv(self._xx)
+        self._information = inverse(self._xx)
         return self._ahead, self._information
 
     def correct(self, state: BodyState, posterior: NDArray) -> None:
         """Take the fitted state, with the covariance (n, n) that its normal matrix gives, prediction included."""
         gain = self._vx @ self._information
         self._velocity = self._velocity + gain @ self._ahead.difference(state)
-        self._vv = self._vv - gain @ (self._xx - posterior) @ gain.T
+        vv = self._vv - gain @ (self._xx - posterior) @ gain.T
+        self._vv = 0.5 * (vv + vv.T)
         self._vx = gain @ posterior
         self._xx = posterior
         self.state = state

@@ -12,7 +12,7 @@ from kinefit.bodies.charts import off_the_limits
 from kinefit.correspondences import _kernels, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.rows import AnyRows, ParameterRows, Rows
-from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
+from kinefit.solvers.equations import Covariance, covariance, inverse, joint_std, normal_equations
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.tracking.channels import Channels, fitted_pixels
@@ -39,8 +39,8 @@ class Settings:
     """
 
     loss: Loss = field(default_factory=geman_mcclure)
-    angle_acceleration: float = 100.0
-    root_acceleration: float = 10.0
+    angle_acceleration: float = 150.0
+    root_acceleration: float = 15.0
     velocity_memory: float = 0.2
     poor: float = 0.5
 
@@ -118,7 +118,7 @@ class Tracker:
                 self._prediction.halt()
             predicted, information = self._prediction.ahead()
             fit, result = self._fit(predicted, (predicted, information), uv, weight)
-            self._prediction.correct(result.state, np.linalg.inv(fit.equations.matrix))
+            self._prediction.correct(result.state, inverse(fit.equations.matrix))
             chart = off_the_limits(self.body.tree, result.state.angles)
             if chart is not None:
                 self._prediction.change_chart(*chart)
@@ -147,7 +147,7 @@ class Tracker:
             used, used_weight = np.ascontiguousarray(uv[order]), np.ascontiguousarray(weight[order])
             fit = levenberg_marquardt(
                 self.body, start, lambda s: self._rows(s, predicted, used, used_weight),  # noqa: B023
-                loss=self.settings.loss, max_iterations=40, tolerance=1e-5,
+                loss=self.settings.loss, max_iterations=40, tolerance=1e-4,
                 damping=None if predicted is None else _LIGHT,
             )  # fmt: skip
             fitted = fitted_pixels(self.body, self.channels, fit.state)
