@@ -41,7 +41,7 @@ class Settings:
     loss: Loss = field(default_factory=geman_mcclure)
     angle_acceleration: float = 150.0
     root_acceleration: float = 15.0
-    velocity_memory: float = 0.2
+    velocity_memory: float = 0.1
     poor: float = 0.5
 
 
