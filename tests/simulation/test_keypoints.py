@@ -10,7 +10,7 @@ from kinefit.readers.load import load_observations
 from kinefit.readers.take import read_take
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
-from kinefit.simulation.keypoints import _mirrored
+from kinefit.tracking.channels import mirror_name
 
 MOTION = squat_and_wave(rate=60.0, duration=4.0)
 RIG = studio_rig(MOTION)
@@ -88,7 +88,7 @@ def test_swaps_come_in_bursts():
 @pytest.mark.parametrize("keypoint_set", sorted(KEYPOINT_SETS))
 def test_the_mirror_of_a_mirror_is_the_point_itself(keypoint_set):
     names = KEYPOINT_SETS[keypoint_set]
-    pairs = {name: _mirrored(name, names) for name in names}
+    pairs = {name: mirror_name(name) for name in names}
     assert all(pairs[other] == name for name, other in pairs.items())
     assert len(names) - sum(name == other for name, other in pairs.items()) >= 16
 

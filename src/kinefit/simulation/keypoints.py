@@ -10,6 +10,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Keypoints
 from kinefit.readers.keypoints import keypoint_names
+from kinefit.tracking.channels import mirror_name
 
 _MARGIN = 0.04  # of the image, that stays free around the person
 _NEAREST = 3.0  # [m]
@@ -190,7 +191,7 @@ def _detect(
     lost = (random.random((frames, count)) < missing) | np.isnan(uv).any(axis=-1)
     found[lost], confidence[lost] = np.nan, 0.0
     swapped = _bursts(frames, swaps, random)
-    mirror = [names.index(_mirrored(name, names)) for name in names]
+    mirror = [names.index(other if (other := mirror_name(name)) in names else name) for name in names]
     found[swapped], confidence[swapped] = found[swapped][:, mirror], confidence[swapped][:, mirror]
     return found, confidence
 
@@ -202,14 +203,3 @@ def _bursts(frames: int, share: float, random: np.random.Generator) -> NDArray:
         start, length = random.integers(frames), 1 + random.poisson(_BURST - 1)
         out[start : min(start + length, start + round(share * frames) - int(out.sum()))] = True
     return out
-
-
-def _mirrored(name: str, names: tuple[str, ...]) -> str:
-    """Name of the same point on the other side; its own for a point in the middle."""
-    for a, b in (("left", "right"), ("Left", "Right"), ("L", "R")):
-        for old, new in ((a, b), (b, a)):
-            other = name.replace(old, new, 1) if len(a) > 1 else new + name[1:] if name.startswith(old) else name
-            if other != name and other in names:
-                return other
-    return name
-

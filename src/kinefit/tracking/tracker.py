@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.charts import off_the_limits
-from kinefit.correspondences import _kernels, prior_rows
+from kinefit.correspondences import _kernels, prior_rows, targets
 from kinefit.errors import TrackingError
-from kinefit.rows import AnyRows, ParameterRows, Rows
+from kinefit.rows import AnyRows, ParameterRows
 from kinefit.solvers.equations import Covariance, covariance, inverse, joint_std, normal_equations
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 from kinefit.solvers.losses import Loss, geman_mcclure
@@ -87,11 +87,11 @@ class Tracker:
     def __init__(self, body: Body, channels: Channels, rate: float, settings: Settings | None = None) -> None:
         self.body, self.channels = body, channels
         self.settings = settings or Settings()
-        self._rest = body.points_rest(channels.points)[channels.column]
-        self._owner = channels.points.segments[channels.column]
+        names = tuple(channels.points.names[c] for c in channels.column)
+        place = channels.points.points[channels.column]
+        self._points = PointSet(names, channels.points.segments[channels.column], place)  # one for every channel
         self._groups = limb_groups(body, channels)
         self._informs = informing(body, channels)
-        n = 2 * len(self._owner)
         self._angles = np.arange(6, body.tree.n_dofs)
         self._posture = np.square(1.0 / body.tree.spread)
         self._prediction = Prediction(
@@ -101,7 +101,6 @@ class Tracker:
             root_acceleration=self.settings.root_acceleration,
             memory=self.settings.velocity_memory,
         )
-        self._buffers = np.empty((8, n)), np.empty(n, np.int64), np.empty(n, np.int64)
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
@@ -114,7 +113,7 @@ class Tracker:
         uv = np.where(seen[:, None], uv, np.nan)
         result = None
         if self._prediction.state is not None:
-            if not seen.any():
+            if not weight.any():
                 self._prediction.halt()
             predicted, information = self._prediction.ahead()
             fit, result = self._fit(predicted, (predicted, information), uv, weight)
@@ -160,13 +159,8 @@ class Tracker:
     def _rows(
         self, state: BodyState, predicted: tuple[BodyState, NDArray] | None, uv: NDArray, weight: NDArray
     ) -> list[AnyRows]:
-        frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
-        data, segment, group = self._buffers[0].copy(), self._buffers[1].copy(), self._buffers[2].copy()
-        end = _kernels.pixel_rows(
-            frames, self._owner, self._rest, self.channels.rig.packed, self.channels.camera, uv, weight,
-            data, segment, group, 0,
-        )  # fmt: skip
-        rows = Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
+        cameras, camera = self.channels.rig.packed, self.channels.camera
+        rows = targets.fill(_kernels.pixel_rows, 2, self.body, state, self._points, cameras, camera, uv, weight)
         tree = self.body.tree
         parts: list[AnyRows] = [rows, ParameterRows(self._angles, tree.usual - state.angles, self._posture)]
         if predicted is not None:
