@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,8 @@ class Motion:
         Vertical axis of the world: "x", "y", "z", "-x", "-y" or "-z".
     name : str
         Name of the take.
+    provenance : Mapping
+        What was done with which settings, in numbers, texts, lists and mappings (as JSON has them).
     """
 
     body: Body
@@ -109,6 +112,7 @@ class Motion:
     residuals: Mapping[str, Residuals] = field(default_factory=dict)
     up: str = "y"
     name: str = "motion"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"):

@@ -30,7 +30,7 @@ def rewritten(path, **changes):
 
 @pytest.fixture
 def written(tmp_path):
-    motion = smooth_motion(15, up="-z")
+    motion = replace(smooth_motion(15, up="-z"), provenance={"track": {"accuracy": [8.0], "smooth": True}})
     write_motion(motion, tmp_path / "a.npz")
     return motion, tmp_path / "a.npz"
 
@@ -38,10 +38,11 @@ def written(tmp_path):
 def test_everything_comes_back_exactly(written):
     motion, path = written
     back = read_motion(path)
-    assert len(fields(motion)) == len(ARRAYS) + 5  # whoever adds one to a motion adds it to its file
+    assert len(fields(motion)) == len(ARRAYS) + 6  # whoever adds one to a motion adds it to its file
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(motion, name), strict=True)
     assert (back.rate, back.up, back.name) == (motion.rate, motion.up, motion.name)
+    assert back.provenance == motion.provenance
     assert list(back.residuals) == list(motion.residuals) == ["cam 0", "cam 1", "markers/1"]
     for sensor, r in motion.residuals.items():
         for field in fields(Residuals):
@@ -155,3 +156,15 @@ def test_the_name_must_end_in_npz(tmp_path):
     with pytest.raises(ExportError, match=r"Call it a\.npz"):
         write_motion(smooth_motion(2), tmp_path / "a.dat")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_provenance_that_json_cannot_hold_is_refused_and_nothing_written(tmp_path):
+    with pytest.raises(ExportError, match="provenance"):
+        write_motion(replace(smooth_motion(3), provenance={"x": float("nan")}), tmp_path / "a.npz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_without_provenance_reads(written):
+    _, path = written
+    rewritten(path, provenance=None)
+    assert read_motion(path).provenance == {}

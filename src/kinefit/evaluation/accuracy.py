@@ -81,6 +81,26 @@ def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> Coverage:
     return Coverage(_share(shift, sigmas * turned.joint_std), _share(angles, sigmas * turned.dof_std[:, 6:]))
 
 
+def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -> dict[str, Coverage]:
+    """The same for each group of joints (the body's scale groups: pelvis, trunk, ..., both sides together).
+
+    A joint belongs to the group of the segment that it moves.
+    """
+    turned = _comparable(truth, result)
+    shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
+    angles = angle_errors(truth, result)
+    angles = np.abs(np.where(truth.body.tree.prismatic, angles, np.radians(angles)))
+    out = {}
+    for g, name in enumerate(truth.body.scale_groups):
+        segments = truth.body.segment_scale == g
+        dofs = segments[truth.body.tree.owners]
+        out[name] = Coverage(
+            _share(shift[:, segments], sigmas * turned.joint_std[:, segments]),
+            _share(angles[:, dofs], sigmas * turned.dof_std[:, 6:][:, dofs]),
+        )
+    return out
+
+
 def _share(errors: NDArray, bars: NDArray) -> float:
     known = np.isfinite(bars)
     return float(np.mean(errors[known] <= bars[known])) if known.any() else float("nan")

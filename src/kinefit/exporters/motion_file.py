@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -32,6 +35,7 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
         "name": np.array(motion.name),
         "up": np.array(motion.up),
         "rate": np.array(float(motion.rate)),
+        "provenance": np.array(_json(motion.provenance)),
     }
     arrays |= {key: getattr(motion, key) for key in ARRAYS}
     arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
@@ -42,3 +46,11 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
             arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = array
     with writing(path) as temporary:
         np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
+
+
+def _json(provenance: Mapping[str, Any]) -> str:
+    try:
+        return json.dumps(dict(provenance), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        remedy = "Give numbers, texts, lists and mappings of them."
+        raise ExportError(f"a provenance that JSON cannot hold ({error})", remedy=remedy) from error

@@ -7,6 +7,7 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     version ()                       1
     name ()  up ()                   text; up is "x", "y", "z", "-x", "-y" or "-z", the world's vertical axis
     rate ()  times (F,)              [Hz], [s]
+    provenance ()                    JSON text: what was done with which settings; may be absent
     Ts_world_root (F, 4, 4)          pose of the root
     angles (F, D)                    joint coordinates, named in body/coordinates
     dof_std (F, 6 + D)               standard deviation of the root's twist (v, ω), then the angles; inf: not observed
@@ -24,6 +25,7 @@ Sensor names are percent-encoded in keys.
 
 from __future__ import annotations
 
+import json
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -103,6 +105,7 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
         residuals={unquote(s): _residuals(_below(arrays, f"residuals/{s}/"), s, F, S) for s in sensors},
         up=up,
         name=str(arrays["name"]),
+        provenance=json.loads(str(arrays["provenance"])) if "provenance" in arrays else {},
     )
 
 

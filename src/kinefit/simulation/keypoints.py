@@ -102,6 +102,8 @@ def simulate_keypoints(
     outliers: float = 0.1,
     missing: float = 0.1,
     swaps: float = 0.0,
+    drift_px: float = 0.0,
+    drift_time: float = 0.5,
     bystander: Motion | None = None,
     seed: int = 0,
 ) -> list[Keypoints]:
@@ -121,6 +123,11 @@ def simulate_keypoints(
         NaN with confidence 0, as are points outside the image.
     swaps : share of each camera's frames
         In bursts of about eight frames, left is taken for right in the whole person.
+    drift_px : float [px]
+        Standard deviation of a second error along u and v that changes slowly: what a detector misses in one frame it
+        misses in the next.
+    drift_time : float [s]
+        In which that error forgets itself by 1/e.
     bystander : Motion, optional
         A second person, seen in as many frames as it has, with the same errors.
     seed : int
@@ -139,8 +146,12 @@ def simulate_keypoints(
     for name, share in (("outliers", outliers), ("missing", missing), ("swaps", swaps)):
         if not 0.0 <= share <= 1.0:
             raise ObservationError(f"{name} is {share}", remedy="Give a share between 0 and 1.")
-    if not 0.0 <= noise_px < np.inf:
-        raise ObservationError(f"noise_px is {noise_px}", remedy="Give a standard deviation in pixels.")
+    for name, size in (("noise_px", noise_px), ("drift_px", drift_px)):
+        if not 0.0 <= size < np.inf:
+            raise ObservationError(f"{name} is {size}", remedy="Give a standard deviation in pixels.")
+    if not 0.0 < drift_time < np.inf:
+        raise ObservationError(f"drift_time is {drift_time}", remedy="Give a time in seconds.")
+    keep = float(np.exp(-1.0 / (motion.rate * drift_time)))
     names = keypoint_names(keypoint_set)
     random = np.random.default_rng(seed)
     people = [motion] if bystander is None else [motion, bystander]
@@ -151,6 +162,8 @@ def simulate_keypoints(
         for p, person in enumerate(people):
             frames = min(len(motion), len(person))
             uv = _project(person, camera, keypoint_set, names)[:frames]
+            if drift_px:
+                uv = uv + drift_px * _drift(uv.shape, keep, random)
             found = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
             points[:frames, p], confidence[:frames, p] = found
         if len(people) > 1:  # the order of people means nothing
@@ -170,6 +183,14 @@ def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str
     inside = np.all((uv >= -0.5) & (uv < np.array(camera.size) - 0.5), axis=-1)
     uv[~inside] = np.nan
     return uv
+
+
+def _drift(shape: tuple[int, ...], keep: float, random: np.random.Generator) -> NDArray:
+    """Values (F, ...) of unit variance, each the share `keep` of the last frame's and something new."""
+    out = random.standard_normal(shape)
+    for f in range(1, len(out)):
+        out[f] = keep * out[f - 1] + np.sqrt(1.0 - keep**2) * out[f]
+    return out
 
 
 def _detect(

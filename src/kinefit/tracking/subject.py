@@ -10,22 +10,32 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
-from kinefit.solvers.shape import PixelFrames, fit_shape
+from kinefit.solvers.equations import inverse
+from kinefit.solvers.shape import PixelFrames, Shape, fit_shape
 from kinefit.tracking.channels import Channels, fitted_pixels
 from kinefit.tracking.initialise import first_scales, pose_from_points, triangulated
 from kinefit.tracking.swaps import find_swaps, limb_groups
 
 Progress = Callable[[str, int, int], None]
 
+_SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take tells
+_BELIEF = 5.0  # axes of points that this counts for
+_ROUNDS = 3  # of fits with a better spread; it changes by less than a tenth from then on
 _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it."""
+    """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
+
+    `shape` tells from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a body
+    that was given.
+    """
 
     body: Body
     scales: NDArray
+    shape: Shape | None = None
+    covariance: NDArray | None = None
 
 
 def fit_subject(
@@ -69,7 +79,7 @@ def fit_subject(
         )
     weight = _weights(body.scaled(scales), sized, states)
     pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[list(states)], weight)
-    shape = fit_shape(body, channels.rig, pixels, list(states.values()), scales)
+    shape, covariance = _shape(body, channels, pixels, list(states.values()), scales)
     fitted = body.scaled(shape.scales)
     for name, span in channels.sets.items():
         points = fitted.keypoints(name)
@@ -78,7 +88,50 @@ def fit_subject(
         fitted = fitted.with_keypoints(name, moved)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
-    return Subject(fitted, shape.scales)
+    return Subject(fitted, shape.scales, shape, covariance)
+
+
+def _shape(
+    body: Body, channels: Channels, pixels: PixelFrames, states: list[BodyState], scales: NDArray
+) -> tuple[Shape, NDArray]:
+    """Shape, with as much freedom for a detector's points as this take asks for; and its covariance (p, p).
+
+    How far points stand from where the body has them is found as MacKay (1992) finds a prior's spread, beginning with
+    one centimetre, which counts as much as `_BELIEF` points seen along one axis.
+    """
+    spread = _SHIFT
+    for _ in range(_ROUNDS):
+        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread)
+        covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels))
+        moved = shape.theta - shape.parameters.mean
+        open_to = np.isclose(np.diag(shape.prior), spread**-2)
+        told = 1.0 - np.diag(covariance)[open_to] / spread**2
+        spread = float(
+            np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (np.sum(np.maximum(told, 0.0)) + _BELIEF))
+        )
+    return shape, covariance
+
+
+def _excess(shape: Shape, channels: Channels, pixels: PixelFrames) -> float:
+    """How many times larger than assumed a channel's variance is once all frames are averaged.
+
+    A detector's errors last: the mean over F frames varies by more than 1/F of the variance of one. Both are taken from
+    the residuals that are no outliers, F times the first and the second, and the larger counts.
+    """
+    fitted = np.stack([
+        shape.parameters.pixels(shape.theta, s, channels.rig, pixels.camera, pixels.column) for s in shape.states
+    ])  # fmt: skip
+    r = (pixels.uv - fitted) / channels.sigma[:, None]
+    r = np.where((pixels.weight > 0)[..., None], r, np.nan)
+    seen = np.isfinite(r)
+    if seen.sum() < 10:
+        return 1.0
+    size = np.median(np.abs(r[seen])) / 0.6745  # of a normal variable
+    r = np.where(np.abs(r) < 3.0 * size, r, np.nan)
+    counts = np.isfinite(r).sum(axis=0)
+    means = np.nansum(r, axis=0) / np.maximum(counts, 1)
+    lasting = float(np.sum(counts**2 * means**2) / max(counts.sum(), 1))
+    return max(lasting, float(size**2), 1e-3)
 
 
 def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:

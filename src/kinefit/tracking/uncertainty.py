@@ -1,0 +1,83 @@
+"""Error bars that are true: jitter as the fit's own covariance has it, errors that do not average out, and the shape.
+
+A fit takes every error for new in every frame. An error e that lasts goes through to the pose whole, by δ = P Jᵀ W e
+with P the covariance of one frame on its own, however many frames are smoothed together. With δ also the answer to a
+change of the shape θ (bone lengths, places of points), the pose being fitted anew,
+
+    Cov = C + P (Jᵀ W Σ W J + Σ_c s_c s_cᵀ) P + D Σ_θ Dᵀ,        D = −P H_qθ
+
+where C is the smoothed fit's covariance, Σ the variance of every channel's drift and s_c = Jᵀ W 1_c · shift that of a
+camera as a whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.solvers.equations import inverse
+from kinefit.solvers.shape import ShapeParameters
+from kinefit.tracking.channels import Channels
+from kinefit.tracking.noise import DetectorNoise
+
+_ANYWHERE = 1.0  # [m, rad] spread of a root that nothing holds, as a prior
+
+
+@dataclass(frozen=True, eq=False)
+class Lasting:
+    """What no smoothing takes away, of one frame.
+
+    Parameters
+    ----------
+    dofs : (n, n) [m, rad] covariance of the degrees of freedom.
+    joints : (S, 3) [m²] variance of the joint centres along the world's axes.
+    leverage : (N,) share of its own error that the fit of the frame alone follows in every channel.
+    """
+
+    dofs: NDArray
+    joints: NDArray
+
+
+def lasting(
+    parameters: ShapeParameters, theta: NDArray, Sigma_shape: NDArray, channels: Channels, state: BodyState,
+    weight: NDArray, noise: DetectorNoise,
+) -> Lasting:
+    """Covariance of one frame's pose from drift, camera shifts and shape.
+
+    Parameters
+    ----------
+    parameters, theta : of the shape; Sigma_shape (p, p) their covariance.
+    weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
+    """
+    tree = parameters.body.tree
+    n = tree.n_dofs
+
+    def system(uv: NDArray, weight: NDArray) -> tuple[NDArray, NDArray]:
+        return parameters.equations(theta, state, channels.rig, channels.camera, channels.column, uv, weight)
+
+    nowhere = np.zeros((len(weight), 2))
+    H, _ = system(nowhere, weight)
+    prior = np.concatenate([np.full(6, _ANYWHERE**-2), np.square(1.0 / tree.spread)])
+    alone = inverse(_whole(H[:n, :n]) + np.diag(prior))
+    meat = _whole(system(nowhere, np.square(weight * noise.drift))[0][:n, :n])
+    fitted = parameters.pixels(theta, state, channels.rig, channels.camera, channels.column)
+    for q, shift in enumerate(noise.shift):
+        mine = np.where(channels.source == q, weight, 0.0)
+        for axis in np.diag(shift):
+            if mine.any() and axis.any():
+                push = system(fitted + axis, mine)[1][:n]
+                meat += np.outer(push, push)
+    answer = -alone @ H[n:, :n].T
+    dofs = alone @ meat @ alone
+    moves, stretch = parameters.joint_moves(theta, state)
+    whole = moves @ answer + stretch
+    joints = np.einsum("sin,nm,sim->si", moves, dofs, moves) + np.einsum("sip,pq,siq->si", whole, Sigma_shape, whole)
+    return Lasting(dofs + answer @ Sigma_shape @ answer.T, joints)
+
+
+def _whole(lower: NDArray) -> NDArray:
+    """A symmetric matrix from its lower triangle."""
+    return np.tril(lower) + np.tril(lower, -1).T
