@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.evaluation import angle_errors, coverage, joint_errors, orientation_errors
+from kinefit.evaluation import angle_errors, coverage, coverage_of_groups, joint_errors, orientation_errors
 from kinefit.simulation import cut, squat_and_wave
 
 TRUTH = squat_and_wave()
@@ -74,6 +74,18 @@ def test_right_error_bars_cover_95_percent():
     assert coverage(TRUTH, TRUTH.turned("y")).angles == 1.0
     unknown = replace(TRUTH, dof_std=np.full_like(TRUTH.dof_std, np.inf))
     assert np.isnan(coverage(TRUTH, unknown).angles)
+
+
+def test_groups_are_judged_apart():
+    std, groups = np.full_like(TRUTH.joint_std, 0.01), TRUTH.body.scale_groups
+    feet = TRUTH.body.segment_scale == groups.index("foot")
+    std[:, feet] = np.inf
+    shifted = np.array(TRUTH.Ts_world_root)
+    shifted[:, :3, 3] += 0.015
+    told = coverage_of_groups(TRUTH, replace(TRUTH, Ts_world_root=shifted, joint_std=std))
+    assert tuple(told) == groups
+    assert np.isnan(told["foot"].joints) and told["thigh"].joints == 1.0
+    assert coverage_of_groups(TRUTH, replace(TRUTH, Ts_world_root=shifted, joint_std=std), sigmas=1)["hand"].joints == 0
 
 
 def test_what_cannot_be_compared_is_told():

@@ -216,6 +216,7 @@ WRONG = {
     "rate": (take_text(head="rate = -1"), "rate -1 Hz"),
     "nan": (take_text(a="time_offset = nan"), "time offset nan"),
     "accuracy": (take_text(keys='accuracy = 0'), "accuracy 0"),
+    "keypoints without file": (take_text(more='[[keypoints]]\ncamera = "a"'), "no file of openpose keypoints"),
     "marker unit": (take_text(more='[[markers]]\nfile = "a"\nunit = "ell"'), "no unit 'ell'"),
 }
 
@@ -237,6 +238,7 @@ def test_wrong_takes(small, case):
         (take_text(more='[[keypoints]]\ncamera = "a"\nfile = "none"'), "keypoints of camera a"),
         (take_text().replace("calibration.toml", "none.toml"), "[calibration] file"),
         (take_text(head='body = "none.toml"'), "[take] body"),
+        (take_text(head='subject = "none.toml"'), "[take] subject"),
     ],
 )
 def test_missing_files(small, text, place):
@@ -252,6 +254,18 @@ def test_no_take_and_no_toml(tmp_path):
         read_take(written(tmp_path, "[take]\nname = x"))
     with pytest.raises(FileError, match="cannot be read"):
         read_take(tmp_path)
+
+
+def test_cameras_that_saw_nothing(small):
+    with pytest.raises(TakeError, match="nothing that they saw"):
+        load(small, take_text().partition("[[keypoints]]")[0])
+
+
+def test_detections_that_are_not_there_yet(small):
+    text = take_text(more='[[keypoints]]\ncamera = "a"\nformat = "detect"')
+    with pytest.raises(FileError, match="detect") as caught:
+        load(small, text)
+    assert "kinefit detect" in caught.value.remedy
 
 
 def test_a_damaged_video_is_refused(small):

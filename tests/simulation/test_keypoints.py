@@ -1,5 +1,7 @@
 """Keypoints simulated from known motions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from kinefit.errors import ExportError, ObservationError
 from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.load import load_observations
+from kinefit.readers.motion import ARRAYS
 from kinefit.readers.take import read_take
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
@@ -65,6 +68,21 @@ def test_errors_have_the_size_and_share_asked_for():
         assert abs(np.std(residual[seen & ~far]) - 3.0) < 0.2
         assert np.mean(confidence[far]) < np.mean(confidence[seen & ~far]) - 0.1
         assert np.max(confidence[far]) > np.median(confidence[seen & ~far])  # some outliers look trustworthy
+
+
+def test_drift_lasts_and_jitter_does_not():
+    still = cut(MOTION, 0, 1)
+    still = replace(
+        still, times=np.arange(3000) / 60.0,
+        **{n: np.repeat(getattr(still, n), 3000, axis=0) for n in ARRAYS if n != "times"},
+    )
+    one = RIG.select(("cam01",))
+    (seen,) = simulate_keypoints(still, one, noise_px=0, drift_px=4, drift_time=0.2, outliers=0, missing=0)
+    errors = (seen.points[:, 0] - exact("cam01")[0])[:, np.isfinite(seen.points[0, 0, :, 0])]
+    assert errors.std() == pytest.approx(4.0, rel=0.1)
+    for lag in (1, 12, 60):
+        together = np.mean(errors[lag:] * errors[:-lag]) / np.mean(errors**2)
+        assert together == pytest.approx(np.exp(-lag / 12.0), abs=0.08)
 
 
 def test_the_seed_decides():

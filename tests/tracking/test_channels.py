@@ -140,3 +140,25 @@ def test_a_camera_that_saw_nobody_at_all():
     empty = record("cam2", people=0)
     channels = make_channels(BODY, RIG, [record("cam1"), empty], [np.zeros(3, int), np.full(3, -1)], [8.0, 8.0])
     assert np.all(np.isnan(channels.uv[:, 17:])) and not channels.confidence[:, 17:].any()
+
+
+@pytest.mark.parametrize("late", [0.3, -0.45])
+def test_a_camera_that_is_late_by_part_of_a_frame_is_brought_into_step(late):
+    """Points that move evenly: seen at t_j = (j + late) / rate, wanted at j / rate."""
+    frames = np.arange(6.0)
+    speed = np.array([3.0, -2.0])
+    records = []
+    for camera, offset in (("cam1", 0.0), ("cam2", late), ("cam3", 0.0)):
+        one = record(camera, frames=6, people=1, extra=())
+        points = 100.0 + (frames + offset)[:, None, None, None] * speed + np.zeros_like(one.points)
+        points[2, 0, 4] = np.nan
+        records.append(Keypoints(camera, one.keypoint_set, one.names, 25.0, points, one.confidence, offset / 25.0))
+    channels = make_channels(BODY, RIG, records, [np.zeros(6, int)] * 3, [8.0] * 3)
+    inner = channels.uv[1:-1]
+    expected = 100.0 + frames[1:-1, None, None] * speed + np.zeros_like(inner)
+    seen = np.isfinite(inner)
+    np.testing.assert_allclose(inner[seen], expected[seen])
+    unseen = ~seen.all(axis=2)
+    assert unseen[:, channels.source == 1].sum() == 2  # both steps beside the frame in which the point was not seen
+    assert unseen[:, channels.source == 0].sum() == 1
+    assert np.all((channels.confidence > 0) & (channels.confidence <= 1))

@@ -1,5 +1,12 @@
 """A result against the truth, as numbers."""
 
-from kinefit.evaluation.accuracy import Coverage, angle_errors, coverage, joint_errors, orientation_errors
+from kinefit.evaluation.accuracy import (
+    Coverage,
+    angle_errors,
+    coverage,
+    coverage_of_groups,
+    joint_errors,
+    orientation_errors,
+)
 
-__all__ = ["Coverage", "angle_errors", "coverage", "joint_errors", "orientation_errors"]
+__all__ = ["Coverage", "angle_errors", "coverage", "coverage_of_groups", "joint_errors", "orientation_errors"]

@@ -77,6 +77,9 @@ def load_observations(take: Take) -> Observations:
         keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
         rates[stream], lengths[stream], offsets[stream] = read.rate, len(read), read.time_offset
+    if not (lengths or markers):
+        remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
+        raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
     check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
     rate = take.rate or next(iter(rates.values()), None) or markers[0].rate
     if lengths:
@@ -137,19 +140,26 @@ def _read_keypoints(
 ) -> Keypoints:
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
-    if source.frame is None and not same:
+    if source.frame is None and not same and source.format != "detect":
         raise TakeError(
             "the video's picture is not the calibration's, and it is not told in which the keypoints are",
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
+    offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
+    if source.format == "detect":
+        from kinefit.readers.detections import detections_file, read_detections
+
+        file = source.file or detections_file(take.path, source.camera)
+        return read_detections(file).keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
         raise TakeError("nothing tells the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
+    assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
     return read_keypoints(
         source.file, format=source.format, camera=source.camera, rate=rate,
         image_frame=image if source.frame == "video" and not same else None,
-        time_offset=next(entry.time_offset for entry in take.cameras if entry.name == source.camera), **options,
+        time_offset=offset, **options,
     )
 
 

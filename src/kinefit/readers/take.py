@@ -42,8 +42,8 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     """`[[keypoints]]`: what a detector saw in one camera."""
 
     camera: str
-    file: Path  # or folder
-    format: Literal["openpose", "mediapipe"] = "openpose"
+    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    format: Literal["openpose", "mediapipe", "caliscope", "detect"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: float | None = None  # [Hz]; default: the camera's video, or the take
@@ -66,6 +66,7 @@ class _Head(_Entry, frozen=True, kw_only=True):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: float | None = None
+    subject: Path | None = None
     frames: tuple[int, int] | None = None
 
 
@@ -95,6 +96,8 @@ class Take:
         Name in the catalogue, or absolute path of a body file.
     height : float [m] or None
         Stature of the person, as a first guess.
+    subject : Path or None
+        Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
@@ -107,6 +110,7 @@ class Take:
     up: str
     body: str
     height: float | None
+    subject: Path | None
     frames: tuple[int, int] | None
     calibration: CalibrationEntry | None
     cameras: tuple[CameraEntry, ...]
@@ -147,8 +151,8 @@ def read_take(path: str | PathLike[str]) -> Take:
     body = str(folder / head.body) if head.body.endswith(".toml") else head.body
     take = Take(
         path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
-        frames=head.frames, calibration=content.calibration, cameras=content.camera, keypoints=content.keypoints,
-        markers=content.markers,
+        subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
+        keypoints=content.keypoints, markers=content.markers,
     )
     _check_values(take)
     _check_names(take)
@@ -222,8 +226,10 @@ def _check_values(take: Take) -> None:
         place = f"keypoints of camera {source.camera}"
         if source.set is not None and source.set not in KEYPOINT_SETS:
             refuse(choices("keypoint set", source.set, KEYPOINT_SETS), place, "Use one of these.")
-        if source.format == "mediapipe" and source.set not in (None, "MEDIAPIPE_33"):
-            refuse(f"mediapipe gives no {source.set}", place, 'Use set = "MEDIAPIPE_33", or leave it out.')
+        if source.format != "openpose" and source.set not in (None, "MEDIAPIPE_33"):
+            refuse(f"{source.format} gives no {source.set}", place, 'Use set = "MEDIAPIPE_33", or leave it out.')
+        if source.file is None and source.format != "detect":
+            refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if not 0 < source.accuracy < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
             refuse(f"accuracy {source.accuracy} px, rate {source.rate} Hz", place, "Give positive numbers.")
     for entry in take.markers:
@@ -246,7 +252,7 @@ def _check_names(take: Take) -> None:
     for source in take.keypoints:
         if source.camera not in names:
             raise TakeError(
-                choices("camera", source.camera, names), file=take.path, place=f"keypoints {source.file.name}",
+                choices("camera", source.camera, names), file=take.path, place=f"keypoints of camera {source.camera}",
                 remedy=f'Add [[camera]] with name = "{source.camera}", or correct the name.',
             )
     if take.cameras and take.calibration is None:
@@ -258,6 +264,7 @@ def _check_files(take: Take) -> None:
     named: list[tuple[str, Path | None]] = [("[calibration] file", take.calibration.file if take.calibration else None)]
     named += [(f"camera {entry.name}, video", entry.video) for entry in take.cameras]
     named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
+    named += [("[take] subject", take.subject)]
     named += [("markers", entry.file) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith(".toml") else None)]
     for place, file in named:

@@ -13,6 +13,8 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 
+_CLOCK = 0.01  # frames that no clock tells
+
 
 @dataclass(frozen=True, eq=False)
 class Channels:
@@ -122,14 +124,35 @@ def make_channels(
             continue
         frames, one = np.arange(len(record)), np.maximum(person, 0)
         there = (np.asarray(person) >= 0)[:, None]
-        uv.append(np.where(there[..., None], record.points[frames, one][:, columns], np.nan))
-        confidence.append(np.where(there, record.confidence[frames, one][:, columns], 0.0))
+        seen = np.where(there[..., None], record.points[frames, one][:, columns], np.nan)
+        trust = np.where(there, record.confidence[frames, one][:, columns], 0.0)
+        late = float(common_start(keypoints) - record.times[0]) * record.rate
+        uv.append(between_frames(seen, late))
+        confidence.append(between_frames(trust, late))
     twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
     labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
     return Channels(
         rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
         np.array(spread), np.concatenate(uv, axis=1), np.nan_to_num(np.concatenate(confidence, axis=1)),
     )  # fmt: skip
+
+
+def common_start(keypoints: Sequence[Keypoints]) -> float:
+    """Time [s] of the first frame of all records together: the step of the common time next to most of them."""
+    rate = keypoints[0].rate
+    return float(np.round(np.median([k.times[0] for k in keypoints if len(k)] or [0.0]) * rate) / rate)
+
+
+def between_frames(values: NDArray, late: float) -> NDArray:
+    """Values (F, ...) of frames `late` frames later, a fraction, linearly between neighbours; NaN beside unseen ones."""
+    if abs(late) < _CLOCK or len(values) < 2:
+        return values
+    at = np.clip(np.arange(len(values)) + late, 0, len(values) - 1)
+    before = np.minimum(at.astype(int), len(values) - 2)
+    share = (at - before).reshape(-1, *[1] * (values.ndim - 1))
+    a, b = values[before], values[before + 1]
+    out: NDArray = np.where(share == 0, a, np.where(share == 1, b, (1 - share) * a + share * b))
+    return out
 
 
 def fitted_pixels(body: Body, channels: Channels, state: BodyState) -> NDArray:

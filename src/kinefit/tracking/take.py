@@ -9,6 +9,9 @@ from kinefit.errors import TakeError
 from kinefit.motion import Motion
 from kinefit.readers.load import Observations, load_observations
 from kinefit.readers.take import Take, read_take
+from kinefit.tracking.association import choose_people
+from kinefit.tracking.channels import make_channels
+from kinefit.tracking.subject import Subject, fit_subject
 from kinefit.tracking.tracker import Settings
 from kinefit.tracking.video import Progress, track
 
@@ -23,24 +26,19 @@ def track_take(
     Raises
     ------
     TakeError
-        The take has no keypoints.
+        The take has no keypoints, or its subject's trial has another body.
     KinefitError
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
-    body = load_body(take.body)
-    observations = load_observations(take)
-    if not observations.keypoints or observations.rig is None:
-        raise TakeError(
-            "the take has no [[keypoints]]",
-            file=take.path,
-            remedy="Tracking needs 2D keypoints of two or more cameras.",
-        )
+    body, observations = load_body(take.body), load_keypoints(take)
+    assert observations.rig is not None
     motion = track(
         observations.rig,
         observations.keypoints,
         body,
         accuracy=[entry.accuracy for entry in take.keypoints],
+        subject=subject_of(take),
         settings=settings,
         height=take.height,
         up=take.up,
@@ -48,3 +46,32 @@ def track_take(
         progress=progress,
     )
     return motion, observations
+
+
+def load_keypoints(take: Take) -> Observations:
+    """What the sensors of a take saw, keypoints of calibrated cameras among it."""
+    observations = load_observations(take)
+    if not observations.keypoints or observations.rig is None:
+        raise TakeError(
+            "the take has no [[keypoints]]",
+            file=take.path,
+            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+        )
+    return observations
+
+
+def subject_of(take: Take, *, frames: int = 50) -> Subject | None:
+    """Bone lengths and points from the trial of the same person that a take names; None where it names none."""
+    if take.subject is None:
+        return None
+    trial = read_take(take.subject)
+    if trial.body != take.body:
+        raise TakeError(
+            f"the subject's trial has the body {trial.body}, the take {take.body}", file=take.path,
+            place="[take] subject", remedy="Use the same body in both.",
+        )
+    seen, body = load_keypoints(trial), load_body(take.body)
+    assert seen.rig is not None
+    accuracy = [entry.accuracy for entry in trial.keypoints]
+    channels = make_channels(body, seen.rig, seen.keypoints, choose_people(seen.rig, seen.keypoints), accuracy)
+    return fit_subject(body, channels, frames=frames, height=trial.height or take.height)

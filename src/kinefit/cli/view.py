@@ -1,0 +1,181 @@
+"""`kinefit view`: an interactive 3D scene of a motion, a take, or both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.motion import Motion
+    from kinefit.readers.load import Observations
+    from kinefit.readers.take import Take
+    from kinefit.viewers.show import Recording
+
+_EXAMPLES = """\b
+Examples:
+  kinefit view my_take-kinefit                  a folder of results, with the take beside it
+  kinefit view motion.npz --take take.toml      a motion with the cameras that saw it
+  kinefit view motion.npz other.npz             two motions in one scene
+  kinefit view take.toml                        cameras and keypoints before anything is tracked
+  kinefit view motion.npz --html scene.html     one file to keep or to send
+"""
+
+
+@click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog=_EXAMPLES)
+@click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--take", type=click.Path(path_type=Path), help="Take file whose cameras and markers are shown.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other computers look in, too.")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead.")
+@_screen.verbose_option
+def view(
+    sources: tuple[Path, ...], take: Path | None, port: int, host: str, browser: bool, html: Path | None, verbose: bool
+) -> None:
+    """Show a motion, a take or a folder of results as a 3D scene in the browser.
+
+    SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote; further motions are
+    shown beside the first one. Ctrl-C ends it.
+    """
+    recording = gather(sources, take)
+    if html is not None:
+        _write(recording, html)
+    else:
+        _serve(recording, port, host, browser)
+
+
+def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
+    """Read everything that is to be shown."""
+    import numpy as np
+
+    from kinefit.readers.load import load_observations
+    from kinefit.readers.motion import read_motion
+    from kinefit.readers.take import read_take
+    from kinefit.viewers.pictures import Pictures
+    from kinefit.viewers.show import Recording
+
+    motions: list[Motion] = []
+    beside: Path | None = None
+    for source in sources:
+        if source.suffix.lower() == ".toml":
+            if take_file is not None:
+                raise click.UsageError("One take is shown at a time: give one .toml file.")
+            take_file = source
+            continue
+        if source.is_dir():
+            source, there = _in_folder(source)
+            beside = beside or there
+        motions.append(read_motion(source))
+    if take_file is not None:
+        take = read_take(take_file)
+        seen = load_observations(take)
+    elif found := _fitting(beside, motions[0].name):
+        take, seen = found
+    else:
+        return Recording(tuple(motions), name=motions[0].name)
+    cameras = {camera.name: camera for camera in seen.rig or ()}
+    offsets = {entry.name: entry.time_offset for entry in take.cameras}
+    for motion in motions:
+        if motion.up != take.up:
+            _screen.note(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
+    return Recording(
+        tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
+        points=None if motions else _triangulated(take, seen),
+        pictures=Pictures(cameras, seen.videos, seen.images, offsets) if seen.videos else None,
+        markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
+    )  # fmt: skip
+
+
+def _fitting(file: Path | None, name: str) -> tuple[Take, Observations] | None:
+    """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
+    from kinefit.errors import KinefitError
+    from kinefit.readers.load import load_observations
+    from kinefit.readers.take import read_take
+
+    if file is None:
+        return None
+    try:
+        take = read_take(file)
+        if take.name != name:
+            _screen.note(f"Without {file}, which is of '{take.name}' and not of '{name}'; --take names another.")
+            return None
+        seen = load_observations(take)
+    except KinefitError as error:
+        _screen.note(f"Without the take beside it: {error}")
+        return None
+    _screen.note(f"With the take {file}; --take names another.")
+    return take, seen
+
+
+def _in_folder(folder: Path) -> tuple[Path, Path | None]:
+    """The motion file in a folder of results, and the take that it probably came from."""
+    from kinefit.errors import FileError
+
+    file = folder / "motion.npz"
+    if not file.is_file():
+        remedy = "Give the folder that `kinefit track` wrote, or a motion file."
+        raise FileError("there is no motion.npz in this folder", file=folder, remedy=remedy)
+    name = folder.absolute().name
+    places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
+    return file, next((place for place in places if place.is_file()), None)
+
+
+def _triangulated(take: Take, seen: Observations) -> NDArray | None:
+    """(F, K, 3) [m] keypoints of the person where two cameras agree; None, and a note, where there is nobody."""
+    import numpy as np
+
+    from kinefit.bodies import load_body
+    from kinefit.errors import TrackingError
+    from kinefit.tracking.association import choose_people
+    from kinefit.tracking.channels import make_channels
+    from kinefit.tracking.initialise import triangulated
+
+    if seen.rig is None or not seen.keypoints:
+        return None
+    try:
+        people = choose_people(seen.rig, seen.keypoints)
+    except TrackingError as error:
+        _screen.note(f"Only cameras are shown: {error.problem}.")
+        return None
+    accuracy = [entry.accuracy for entry in take.keypoints]
+    channels = make_channels(load_body(take.body), seen.rig, seen.keypoints, people, accuracy)
+    return triangulated(channels, np.arange(len(channels.uv)))
+
+
+def _serve(recording: Recording, port: int, host: str, browser: bool) -> None:
+    from kinefit.viewers.player import Player
+    from kinefit.viewers.stage import open_server, quiet
+
+    server = open_server(port, host=host, label=f"kinefit: {recording.name}")
+    try:
+        player = Player(server, recording)
+        player.tick(0.0)
+        if port and server.get_port() != port:
+            _screen.note(f"Port {port} is in use: another one is taken.")
+        address = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{server.get_port()}"
+        _screen.say(f"{recording.name}: {len(recording.times)} frames at {address}  (Ctrl-C ends)")
+        if browser:
+            click.launch(address)
+        player.run()
+    except KeyboardInterrupt:
+        _screen.note("Closed.")
+    finally:
+        with quiet():
+            server.stop()
+
+
+def _write(recording: Recording, html: Path) -> None:
+    from kinefit.exporters._atomic import write_text
+    from kinefit.viewers.page import page
+
+    _screen.note("Drawing the scene ...")
+    text, frames = page(recording)
+    write_text(html, text)
+    thinned = f" of {len(recording.times)}" if frames < len(recording.times) else ""
+    _screen.say(f"{html}: {frames}{thinned} frames, {len(text) / 1e6:.1f} MB; opens in any browser, offline")

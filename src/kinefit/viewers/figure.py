@@ -1,0 +1,152 @@
+"""One body in the scene: bones, joints, skin, landmarks and how sure they are. Thin calls of viser."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.geometry import se3
+from kinefit.viewers import scene as content
+
+PARTS = ("bones", "joints", "surface", "landmarks", "uncertainty")
+"""Layers of a figure."""
+
+_SURFACE_OPACITY, _ELLIPSOID = 0.22, (150, 60, 230)
+
+
+class Figure:
+    """A body whose segments can be moved; everything rigid hangs on the segments' frames.
+
+    Parameters
+    ----------
+    scene : viser's scene
+    name : str
+        Of the node, unique in the scene.
+    body : Body
+    colour : (r, g, b), optional
+        One for all; by default left and right are told apart.
+    """
+
+    def __init__(self, scene: Any, name: str, body: Body, *, colour: content.RGB | None = None) -> None:
+        self.body = body
+        S = len(body.tree.segments)
+        self.usual = content.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
+        self._root = scene.add_frame(f"/world/{name}", show_axes=False)
+        self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
+        self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
+        self._looks: list[tuple[Any, ...]] = [()] * S
+        self._bones: list[list[Any]] = [[] for _ in range(S)]
+        ball = _ball(0.016)
+        bones, surfaces = content.bone_meshes(body), content.surface_meshes(body)
+        for s, segment in enumerate(body.tree.segments):
+            at, shade = f"/world/{name}/{segment}", tuple(int(v) for v in self.usual[s])
+            for part, mesh, more in (
+                ("bones", bones[s], {}),
+                ("surface", surfaces[s], {"opacity": _SURFACE_OPACITY, "cast_shadow": False, "receive_shadow": False}),
+                ("joints", ball, {}),
+            ):
+                if mesh is None:
+                    continue
+                colour_of: Any = (245, 245, 245) if part == "joints" else shade
+                node = scene.add_mesh_simple(f"{at}/{part}", mesh.vertices, mesh.faces, color=colour_of, **more)
+                self._parts[part].append(node)
+                if part != "joints":
+                    self._bones[s].append((node, more.get("opacity", 1.0)))
+            mine = body.landmarks.points[body.landmarks.segments == s]
+            if len(mine):
+                at = f"{at}/landmarks"
+                self._parts["landmarks"].append(_balls(scene, at, mine, 0.008, (250, 220, 60)))
+        unit = _ball(1.0)  # one node each: browsers rebuild batched ones too slowly for a moving scene
+        self._centres = [scene.add_frame(f"/world/{name}/at_{n}", show_axes=False) for n in body.tree.segments]
+        self._parts["uncertainty"] = [
+            scene.add_mesh_simple(
+                f"/world/{name}/at_{n}/uncertainty", unit.vertices, unit.faces, color=_ELLIPSOID, opacity=0.4,
+                cast_shadow=False, receive_shadow=False,
+            )
+            for n in body.tree.segments
+        ]  # fmt: skip
+
+    def show(self, part: str, visible: bool) -> None:
+        """Show or hide one of `PARTS`."""
+        for node in self._parts[part]:
+            node.visible = visible
+
+    def show_all(self, visible: bool) -> None:
+        """Show or hide the whole figure."""
+        self._root.visible = visible
+
+    def pose(
+        self,
+        Ts_world_segment: NDArray,
+        *,
+        joint_std: NDArray | None = None,
+        quality: NDArray | None = None,
+        by_quality: bool = False,
+    ) -> None:
+        """Move the segments to poses (S, 4, 4), with the joints' standard deviations (S, 3) [m] and qualities (S,)."""
+        wxyz, x = se3.quaternion(Ts_world_segment[:, :3, :3]), Ts_world_segment[:, :3, 3]
+        for node, q, t in zip(self._segments, wxyz, x, strict=True):
+            node.wxyz, node.position = q, t
+        colours, opacities = content.segment_looks(
+            np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None
+        )
+        for s, (colour, opacity) in enumerate(zip(colours.tolist(), opacities.tolist(), strict=True)):
+            if self._looks[s] != (*colour, opacity):
+                self._looks[s] = (*colour, opacity)
+                for node, usual in self._bones[s]:
+                    node.color, node.opacity = tuple(colour), None if opacity * usual == 1.0 else opacity * usual
+        axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(joint_std)
+        steps = 1.1 ** np.rint(np.log(np.maximum(axes, 1e-5)) / np.log(1.1))  # sizes cost a browser more than moves
+        for centre, t in zip(self._centres, x, strict=True):
+            centre.position = t
+        for node, half in zip(self._parts["uncertainty"], steps.tolist(), strict=True):
+            if node.scale != tuple(half):
+                node.scale = tuple(half)
+
+
+class Cloud:
+    """Points that no segment carries, one small ball each.
+
+    Parameters
+    ----------
+    scene : viser's scene
+    name : str
+        Of the node, unique in the scene.
+    count : int
+    colour : (r, g, b)
+    radius : float [m]
+    """
+
+    def __init__(self, scene: Any, name: str, count: int, colour: content.RGB, *, radius: float = 0.012) -> None:
+        ball = _ball(radius)
+        self._root = scene.add_frame(f"/world/{name}", show_axes=False)
+        self._balls = [
+            scene.add_mesh_simple(f"/world/{name}/{k}", ball.vertices, ball.faces, color=colour) for k in range(count)
+        ]
+
+    def show(self, points: NDArray | None) -> None:
+        """Points (count, 3) [m], NaN where unknown; None hides all."""
+        self._root.visible = points is not None
+        if points is None:
+            return
+        for ball, x, known in zip(self._balls, points, np.isfinite(points).all(axis=-1), strict=True):
+            ball.visible = bool(known)
+            if known:
+                ball.position = x
+
+
+def _ball(radius: float) -> content.Mesh:
+    """A small sphere about the origin."""
+    return content.capsule(np.zeros(3), np.zeros(3), (radius, radius))
+
+
+def _balls(scene: Any, name: str, points: NDArray, radius: float, colour: content.RGB) -> Any:
+    """Spheres (N, 3) in one node."""
+    ball, N = _ball(radius), len(points)
+    unturned = np.tile(np.array([1.0, 0.0, 0.0, 0.0], np.float32), (N, 1))
+    return scene.add_batched_meshes_simple(
+        name, ball.vertices, ball.faces, unturned, np.asarray(points, np.float32), batched_colors=colour, lod="off"
+    )

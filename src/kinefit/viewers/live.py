@@ -1,0 +1,145 @@
+"""A live scene: follow a tracker, or any program that has states of a body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import BodyError, CalibrationError, choices
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.viewers import figure, pictures, stage
+
+
+class View:
+    """A body, and cameras if there are any, in a page of this computer's browser.
+
+    ```python
+    with View(body, rig, up="z") as view:
+        print(view.address)
+        for frame in frames:
+            view.show(tracker.step(frame).state, time=frame.time)
+    ```
+
+    Parameters
+    ----------
+    body : Body
+    rig : Rig, optional
+    image_frames : {camera: ImageFrame}, optional
+        From the calibration to the pictures that are shown; by default they are the same.
+    up : str
+        Vertical axis of the world: "x", "y", "z", "-x", "-y" or "-z".
+    floor : float [m]
+        Height of the floor along it.
+    port : int
+        The next free one is taken where it is in use; 0 for any.
+    host : str
+        "127.0.0.1" shows the page on this computer alone, "0.0.0.0" to all that can reach it.
+
+    Raises
+    ------
+    ExportError
+        viser is missing, or nothing can be served.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        rig: Rig | None = None,
+        *,
+        image_frames: Mapping[str, ImageFrame] | None = None,
+        up: str = "z",
+        floor: float = 0.0,
+        port: int = 8080,
+        host: str = "127.0.0.1",
+    ) -> None:
+        self.body = body
+        self._port, self._host, self._up, self._floor, self._rig = port, host, up, floor, rig
+        self.server = stage.open_server(port, host=host, label=f"kinefit: {body.name}")
+        self._figure: figure.Figure | None = None
+        self._stage: stage.Stage | None = None
+        self._frames = dict(image_frames or {})
+        self._maps: dict[str, NDArray] = {}
+        self._time = self.server.gui.add_markdown("waiting for the first state")
+        boxes = {part: self.server.gui.add_checkbox(part, part != "landmarks") for part in figure.PARTS}
+        self._boxes = boxes
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        host = "localhost" if self._host in ("127.0.0.1", "0.0.0.0") else self._host
+        return f"http://{host}:{self.server.get_port()}"
+
+    def show(
+        self,
+        state: BodyState,
+        *,
+        time: float | None = None,
+        joint_std: NDArray | None = None,
+        quality: NDArray | None = None,
+        images: Mapping[str, NDArray[np.uint8]] | None = None,
+    ) -> None:
+        """Show a state of the body.
+
+        Parameters
+        ----------
+        state : BodyState
+        time : float [s], optional
+        joint_std : (S, 3) [m], optional
+            Standard deviations of the joint centres along the world's axes, as in `Motion.joint_std`.
+        quality : (S,) in 0..1, optional
+            Of the segments; those with 0 become grey.
+        images : {camera: (H, W, 3) uint8 RGB}, optional
+            What cameras of the rig saw.
+
+        Raises
+        ------
+        BodyError
+            The state is of another body.
+        CalibrationError
+            A picture of a camera that is not in the rig.
+        """
+        if len(state.angles) != len(self.body.tree.coordinates):
+            raise BodyError(
+                f"a state of {len(state.angles)} angles for a body of {len(self.body.tree.coordinates)}",
+                remedy="Give a state of the body that the view was made for.",
+            )
+        Ts = self.body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
+        with self.server.atomic():
+            if self._stage is None or self._figure is None:
+                self._stage = stage.Stage(
+                    self.server, up=self._up, points=Ts[:, :3, 3], floor=self._floor, rig=self._rig
+                )
+                self._figure = figure.Figure(self.server.scene, "body", self.body)
+            for part, box in self._boxes.items():
+                self._figure.show(part, box.value)
+            self._figure.pose(Ts, joint_std=joint_std, quality=quality)
+            for name, image in (images or {}).items():
+                picture = self._flat(name, image)
+                self._stage.cameras[name].show(picture)
+            if time is not None:
+                self._time.content = f"**{time:.3f} s**"
+
+    def _flat(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if self._rig is None or name not in self._rig:
+            raise CalibrationError(choices("camera", name, self._rig.names if self._rig else ()))
+        if name not in self._maps:
+            view = pictures.flat_view(self._rig[name], stage.SMALL)
+            self._maps[name] = pictures.undistortion(
+                self._rig[name], self._frames.get(name, ImageFrame.identity()), view
+            )
+        return pictures.flatten(image, self._maps[name])
+
+    def close(self) -> None:
+        """End the server."""
+        with stage.quiet():
+            self.server.stop()
+
+    def __enter__(self) -> View:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()

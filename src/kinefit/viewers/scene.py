@@ -1,0 +1,202 @@
+"""What a 3D scene shows, as plain arrays: bones, uncertainty, rays, paths, floor. Nothing here draws."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.geometry.camera import Camera
+from kinefit.motion import UP_AXES, Motion, Residuals
+
+RGB = tuple[int, int, int]
+LEFT, RIGHT, MIDDLE, LOST = (70, 140, 255), (255, 140, 50), (140, 205, 130), (150, 150, 150)
+OTHERS: tuple[RGB, ...] = ((190, 80, 220), (20, 170, 170), (200, 170, 30), (120, 90, 60))
+"""Colours of the second, third ... motion, which are not told apart by side."""
+
+OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
+OUTLIER = (255, 30, 30)
+LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
+_RAMP = np.array([(40, 170, 80), (240, 200, 40), (240, 120, 30)], float)  # good, middling, bad
+_AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: vertices (V, 3) [m], faces (T, 3) int, counterclockwise from outside."""
+
+    vertices: NDArray
+    faces: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Line segments: points (N, 2, 3) [m] in the world, colours (N, 2, 3) uint8 RGB."""
+
+    points: NDArray
+    colours: NDArray
+
+
+def capsule(start: NDArray, end: NDArray, radii: tuple[float, float]) -> Mesh:
+    """Tube from `start` to `end` (3,) with rounded ends of the two radii [m]."""
+    start, end = np.asarray(start, float), np.asarray(end, float)
+    length = float(np.linalg.norm(end - start))
+    u = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    side = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
+    side /= np.linalg.norm(side)
+    polar = np.linspace(-np.pi / 2, 0, _CAP + 1)
+    along = np.concatenate([radii[0] * np.sin(polar), length - radii[1] * np.sin(polar[::-1])])
+    radius = np.concatenate([radii[0] * np.cos(polar), radii[1] * np.cos(polar[::-1])])
+    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
+    out = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(u, side))
+    vertices = start + along[:, None, None] * u + radius[:, None, None] * out  # (rings, _AROUND, 3)
+    i, j = np.meshgrid(np.arange(len(along) - 1), np.arange(_AROUND), indexing="ij")
+    a, b = i * _AROUND + j, i * _AROUND + (j + 1) % _AROUND
+    faces = np.stack([a, b, b + _AROUND, a, b + _AROUND, a + _AROUND], -1).reshape(-1, 3)
+    return Mesh(vertices.reshape(-1, 3), faces)
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh | None:
+    """Several meshes as one; None of none."""
+    if not meshes:
+        return None
+    first = np.cumsum([0] + [len(m.vertices) for m in meshes])
+    faces = np.concatenate([m.faces + n for m, n in zip(meshes, first)])
+    return Mesh(np.concatenate([m.vertices for m in meshes]), faces)
+
+
+def bone_meshes(body: Body) -> list[Mesh | None]:
+    """One thin mesh a segment, in its frame: to the joints of its children, or to the end of the last surface."""
+    tree, ends = body.tree, {c.segment: np.array(c.end) for c in body.surfaces}
+    out = []
+    for s in range(len(tree.segments)):
+        tips = [tree.offsets[k] for k in np.flatnonzero(tree.parents == s)] or ([ends[s]] if s in ends else [])
+        lengths = [float(np.linalg.norm(tip)) for tip in tips]
+        bones = [(tip, min(0.013, 0.1 * n)) for tip, n in zip(tips, lengths) if n > 1e-6]
+        out.append(joined([capsule(np.zeros(3), tip, (radius, 0.6 * radius)) for tip, radius in bones]))
+    return out
+
+
+def surface_meshes(body: Body) -> list[Mesh | None]:
+    """One mesh a segment, in its frame: its tapered round surfaces."""
+    found: list[list[Mesh]] = [[] for _ in body.tree.segments]
+    for c in body.surfaces:
+        if min(c.radii) > 0 and np.linalg.norm(c.end) > 1e-6:
+            found[c.segment].append(capsule(np.zeros(3), np.array(c.end), c.radii))
+    return [joined(meshes) for meshes in found]
+
+
+def side_colours(body: Body) -> NDArray:
+    """(S, 3) uint8: left blue, right orange, the middle green."""
+    sides = [LEFT if n.endswith("_l") else RIGHT if n.endswith("_r") else MIDDLE for n in body.tree.segments]
+    return np.array(sides, np.uint8).reshape(-1, 3)
+
+
+def ramp(values: NDArray) -> NDArray:
+    """(..., 3) uint8 from green (0) over yellow (0.5) to orange (1 and more)."""
+    t = 2.0 * np.clip(np.asarray(values, float), 0.0, 1.0)[..., None]
+    low = _RAMP[0] + (_RAMP[1] - _RAMP[0]) * np.minimum(t, 1.0)
+    return np.rint(low + (_RAMP[2] - _RAMP[1]) * np.maximum(t - 1.0, 0.0)).astype(np.uint8)
+
+
+def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tuple[NDArray, NDArray]:
+    """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
+
+    A segment that nothing supports (0) is grey and half transparent whatever the colours mean.
+    """
+    lost = np.asarray(quality) <= 0
+    colours = ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
+    return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
+
+
+def ellipsoids(joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
+    """Half axes (..., 3) [m] along the world's axes of `sigmas` standard deviations, at most `LARGEST_ELLIPSOID`."""
+    return np.minimum(sigmas * np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf), LARGEST_ELLIPSOID)
+
+
+def fitted_points(body: Body, residuals: Residuals) -> PointSet | None:
+    """The body's points that a sensor's residuals are of: the first set that has them all on the same segments."""
+    sets = body.keypoint_sets if residuals.unit == "px" else body.marker_sets
+    for points in sets.values():
+        if set(residuals.names) <= set(points.names):
+            found = points.select(residuals.names)
+            if np.array_equal(found.segments, residuals.segments):
+                return found
+    return None
+
+
+def camera_rays(
+    camera: Camera, measured: NDArray, x_world: NDArray, norms: NDArray, weights: NDArray, *, middling: float
+) -> Rays:
+    """Rays of one camera in one frame: from its centre through each keypoint, up to the fitted point and then to it.
+
+    Parameters
+    ----------
+    measured : (K, 2) [px], in the calibration's image; NaN where unseen.
+    x_world : (K, 3) [m] fitted points.
+    norms, weights : (K,) [px], 0..1
+        Residuals and robust weights; a point without weight is an outlier and red.
+    middling : float [px]
+        Residual that is drawn yellow; half of it and less is greener, twice of it orange.
+    """
+    directions = camera.ray(measured)
+    seen = np.flatnonzero(np.isfinite(directions).all(-1) & np.isfinite(norms))
+    d, x, centre = directions[seen], np.asarray(x_world)[seen], camera.centre_world
+    feet = centre + np.maximum(np.sum((x - centre) * d, axis=1), 0.1)[:, None] * d
+    colours = ramp(norms[seen] / (2.0 * max(middling, 1e-9)))
+    colours[np.asarray(weights)[seen] < OUTLIER_WEIGHT] = OUTLIER
+    points = np.concatenate([np.stack([np.broadcast_to(centre, feet.shape), feet], 1), np.stack([feet, x], 1)])
+    return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))
+
+
+def middling_residual(motion: Motion) -> float:
+    """[px] median of all keypoints that the cameras saw; 1 where there are none."""
+    norms = [r.norms.ravel() for r in motion.residuals.values() if r.unit == "px"]
+    known = np.concatenate(norms)[np.isfinite(np.concatenate(norms))] if norms else np.zeros(0)
+    return float(np.median(known)) if known.size else 1.0
+
+
+def root_path(motion: Motion) -> NDArray:
+    """(F - 1, 2, 3) [m] way of the root."""
+    x = motion.Ts_world_root[:, :3, 3]
+    return np.stack([x[:-1], x[1:]], axis=1)
+
+
+def floor_height(points: NDArray, up: str) -> float:
+    """[m] along the vertical axis where to draw the floor under points (N, 3).
+
+    The world's zero where the lowest point is within half a metre of it (a person may stand on a step or a beam, and a
+    floor that is calibrated a little wrong should be seen to be), else the lowest point.
+    """
+    heights = np.asarray(points).reshape(-1, 3) @ np.array(UP_AXES[up])
+    lowest = float(np.min(heights[np.isfinite(heights)], initial=np.inf))
+    return 0.0 if not np.isfinite(lowest) or abs(lowest) <= 0.5 else lowest
+
+
+def looked_at(cameras: Sequence[Camera]) -> NDArray:
+    """(3,) [m] point nearest to the axes of all cameras; two metres ahead of them where the axes are parallel."""
+    centres = np.array([c.centre_world for c in cameras])
+    axes = np.array([c.T_camera_world[2, :3] for c in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.eigvalsh(total)[0] < 0.01 * len(centres):  # about 6 degrees between two axes
+        return np.mean(centres + 2.0 * axes, axis=0)
+    return np.linalg.solve(total, np.einsum("cij,cj->i", across, centres))
+
+
+def angle_line(motion: Motion, coordinate: str, frame: int) -> str:
+    """Words for one coordinate in one frame, with twice its standard deviation: "knee_angle_r 34.2° ± 3.1°"."""
+    d = motion.body.tree.coordinates.index(coordinate)
+    turn = not motion.body.tree.prismatic[d]
+    value, std = motion.angles[frame, d], motion.dof_std[frame, 6 + d]
+    scale, unit, digits = (180 / np.pi, "°", 1) if turn else (1000.0, " mm", 0)
+    spread = f"± {2 * scale * std:.{digits}f}{unit}" if np.isfinite(std) else "(not observed)"
+    return f"{coordinate} {scale * value:.{digits}f}{unit} {spread}"
+
+
+def advance(position: float, elapsed: float, *, rate: float, speed: float, count: int) -> float:
+    """Place in a loop of `count` frames after `elapsed` seconds at `speed` times the real one; [frames]."""
+    return (position + elapsed * rate * speed) % max(count, 1)

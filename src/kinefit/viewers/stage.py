@@ -1,0 +1,200 @@
+"""The stage: a server with a scene, floor, cameras and what stands behind the person. Thin calls of viser."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import socket
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import UP_AXES
+from kinefit.viewers.pictures import View, flat_view
+
+if TYPE_CHECKING:
+    import viser
+
+SMALL, LARGE = 320, 1080  # [px] longer side of a camera's picture on its frustum, and when looked through
+_PLANES = {"x": "yz", "y": "xz", "z": "xy"}
+_SHADE = (70, 75, 85)
+_FARTHEST = 10.0  # [m] from which a person still fills about a fifth of the window's height
+
+
+def open_server(port: int, *, host: str = "127.0.0.1", label: str = "kinefit") -> viser.ViserServer:
+    """A server on a port, or on the next one that is free; `get_port()` tells which.
+
+    Raises
+    ------
+    ExportError
+        viser is not installed, no port is free, or the host's name is not one of this computer.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        remedy = "Install it: pip install viser."
+        raise ExportError("the 3D viewer needs the package viser", remedy=remedy) from error
+    port = free_port(host, port)
+    with quiet():
+        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+    return server
+
+
+def free_port(host: str, port: int) -> int:
+    """The first free port of a host from `port` on; 0 stands for any."""
+    for candidate in [*range(port, min(port + 100, 65536)), 0]:
+        try:
+            with socket.create_server((host, candidate)):
+                return candidate
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                problem = f"nothing can be served as '{host}' ({error.strerror or error})"
+                raise ExportError(problem, remedy="Take 127.0.0.1, or 0.0.0.0 for all networks.") from error
+    raise ExportError("no port is free", place=f"ports from {port} on", remedy="Name another one by --port.")
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep viser's own notes off the terminal."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+class CameraNode:
+    """A camera in the scene: its frustum with its picture, and a backdrop that is seen when looking through it."""
+
+    def __init__(self, scene: Any, camera: Camera, *, size: float, far: float) -> None:
+        self.camera, self.far = camera, far
+        self.view: View = flat_view(camera, SMALL)
+        T = camera.T_world_camera
+        self.wxyz, self.position = se3.quaternion(T[:3, :3]), T[:3, 3]
+        tx, ty = self.view.tangents
+        scale = size / max(tx, ty) * float(np.cbrt(tx * ty / 3.0))  # viser's is of the frustum's volume
+        self.frustum = scene.add_camera_frustum(
+            f"/world/cameras/{camera.name}", fov=self.view.fov, aspect=self.view.aspect, scale=scale, color=_SHADE,
+            wxyz=self.wxyz, position=self.position, thickness=0.004, cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        label = scene.add_label(f"/world/cameras/{camera.name}/name", camera.name)
+        label.position = (0.0, -0.6 * size, 0.0)
+        self._backdrop: Any = None
+        self._scene = scene
+
+    def show(self, picture: NDArray[np.uint8] | None) -> None:
+        """Put a picture on the frustum."""
+        if picture is not self.frustum.image:
+            self.frustum.image = picture
+
+    def look(self, picture: NDArray[np.uint8] | None) -> None:
+        """Put a picture behind the scene, as seen from this camera; None takes it away."""
+        if picture is None:
+            if self._backdrop is not None:
+                self._backdrop.remove()
+                self._backdrop = None
+        elif self._backdrop is None:
+            (tx, ty), middle = self.view.tangents, self.position + self.far * self.camera.T_camera_world[2, :3]
+            self._backdrop = self._scene.add_image(
+                f"/world/backdrop/{self.camera.name}", picture, 2 * self.far * tx, 2 * self.far * ty, jpeg_quality=80,
+                wxyz=self.wxyz, position=middle, cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+        elif picture is not self._backdrop.image:
+            self._backdrop.image = picture
+
+
+class Stage:
+    """Scene with the up-axis right, a floor and cameras.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    up : str
+        Vertical axis of the world, as `Motion.up`.
+    points : (N, 3) [m]
+        Where things are over time: the floor lies under them, the first look goes at their middle.
+    floor : float [m]
+        Height of the floor along the vertical axis.
+    rig : Rig, optional
+    first : (3,) [m], optional
+        Where to look first when things go far, which would make them small.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        *,
+        up: str,
+        points: NDArray,
+        floor: float,
+        rig: Rig | None = None,
+        first: NDArray | None = None,
+    ) -> None:
+        self.server, self.scene = server, server.scene
+        self._vertical = vertical = np.array(UP_AXES[up])
+        points = np.asarray(points, float).reshape(-1, 3)
+        points = points[np.isfinite(points).all(-1)]
+        points = points if len(points) else np.zeros((1, 3))
+        middle = 0.5 * (points.min(0) + points.max(0))
+        reach = max(1.0, float(np.linalg.norm(np.ptp(points, axis=0))))
+        centres = np.array([camera.centre_world for camera in rig or ()]).reshape(-1, 3)
+        self.width = 2 * float(np.ceil(np.abs(np.concatenate([points, centres]) - middle).max() + 0.5))
+        far = max([reach, *np.linalg.norm(centres - middle, axis=1)])
+        with server.atomic():
+            self.scene.set_up_direction(tuple(vertical))  # type: ignore[arg-type]
+            self.scene.world_axes.visible = False
+            self._world = self.scene.add_frame("/world", show_axes=False)
+            at = np.round(middle - (middle @ vertical) * vertical) + floor * vertical
+            plane: Any = _PLANES[up[-1]]
+            self.grid = self.scene.add_grid(
+                "/world/floor", self.width, self.width, plane=plane, position=at, cell_color=(215, 215, 215)
+            )
+            size = min(0.3, 0.1 * far)  # [m] half the longer side of a camera's picture
+            self.cameras = {c.name: CameraNode(self.scene, c, size=size, far=2.0 * far) for c in rig or ()}
+        look = server.initial_camera
+        eye = first_look(centres - middle, vertical)
+        self.goes_far = 1.8 * reach > _FARTHEST and first is not None
+        target = first if first is not None and self.goes_far else middle
+        around = 0.8 if len(points) > 1 else 2.0  # cameras alone are seen from outside
+        distance = _FARTHEST / 2 if self.goes_far else min(max(1.8 * reach, around * far), _FARTHEST)
+        look.position = target + distance * eye
+        look.look_at = target
+        look.up = vertical
+        look.fov = 0.7
+
+    def shift(self, way: NDArray) -> None:
+        """Draw everything shifted by (3,) [m] along the floor; the part along the vertical is left out."""
+        self._world.position = way - (way @ self._vertical) * self._vertical
+
+
+def first_look(cameras: NDArray, vertical: NDArray) -> NDArray:
+    """(3,) direction from the middle towards the eye: from above, in the widest gap between the cameras (C, 3)."""
+    side = np.roll(vertical, 1)
+    level = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    ways = np.cos(level)[:, None] * side + np.sin(level)[:, None] * np.cross(vertical, side)
+    flat = cameras - (cameras @ vertical)[:, None] * vertical
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+    nearest = (ways @ flat.T).max(axis=1) if len(flat) else ways @ -(side + 0.6 * np.cross(vertical, side))
+    eye = ways[np.argmin(nearest)] + 0.35 * vertical
+    return eye / np.linalg.norm(eye)
+
+
+def look_through(client: Any, node: CameraNode) -> None:
+    """Set a browser's view to a camera's: its pose, and a field of view that holds its whole picture."""
+    tx, ty = node.view.tangents
+    aspect = max(float(client.camera.aspect), 1e-3)
+    T = node.camera.T_world_camera
+    with client.atomic():
+        client.camera.up_direction = -T[:3, 1]
+        client.camera.position = T[:3, 3]
+        client.camera.look_at = T[:3, 3] + T[:3, 2]
+        client.camera.fov = fitting_fov((tx, ty), aspect)
+
+
+def fitting_fov(tangents: tuple[float, float], aspect: float) -> float:
+    """[rad] vertical angle of a window of an aspect (width / height) that holds a view of half-angle tangents."""
+    return 2.0 * float(np.arctan(max(tangents[1], tangents[0] / aspect)))

@@ -1,0 +1,268 @@
+"""The server answers, the scene's nodes stand where the motion says, and a page holds it all."""
+
+import base64
+import re
+import socket
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+import websockets.sync.client
+from tests.exporters.synthetic import a_camera, smooth_motion
+from tests.viewers.recordings import RATE, write_video
+
+from kinefit.bodies import BodyState, load_body
+from kinefit.errors import BodyError, CalibrationError, ExportError, ObservationError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.observations import Markers
+from kinefit.viewers import Choice, Pictures, Player, Recording, View, page
+from kinefit.viewers.page import MOST_FRAMES, chosen_frames
+from kinefit.viewers.show import ALL, Show
+from kinefit.viewers.stage import free_port, open_server, quiet
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return smooth_motion(8, rate=RATE)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return Rig([a_camera("cam 0", 0.0), a_camera("cam 1", 0.7)])
+
+
+@pytest.fixture
+def server():
+    server = open_server(0)
+    yield server
+    with quiet():
+        server.stop()
+
+
+def node(server, name):
+    return server.scene.get_handle_by_name(f"/world/{name}")
+
+
+def test_the_page_is_served(server, motion):
+    Player(server, Recording((motion,))).tick(0.0)
+    address = f"localhost:{server.get_port()}"
+    with urllib.request.urlopen(f"http://{address}", timeout=10) as answer:
+        assert answer.status == 200 and b"<html" in answer.read()[:1000].lower()
+    import viser
+
+    protocol = f"viser-v{viser.__version__}"
+    with websockets.sync.client.connect(f"ws://{address}", subprotocols=[protocol], max_size=None) as client:
+        assert len(client.recv(timeout=10)) > 1000  # the scene so far, compressed
+
+
+def test_segments_stand_where_the_motion_says(server, motion):
+    show = Show(server, Recording((motion,)))
+    for f in (3, 0):
+        show.frame(f)
+        for name, T in zip(motion.body.tree.segments, motion.segment_poses()[f], strict=True):
+            frame = node(server, f"body0/{name}")
+            assert np.allclose(frame.position, T[:3, 3], atol=1e-5)
+            assert np.allclose(se3.rotation_from_quaternion(frame.wxyz), T[:3, :3], atol=1e-5)
+            assert np.allclose(node(server, f"body0/at_{name}").position, T[:3, 3], atol=1e-5)
+
+
+def test_ellipsoids_are_two_sigmas_to_a_tenth(server, motion):
+    Show(server, Recording((motion,))).frame(2)
+    for name, std in zip(motion.body.tree.segments, motion.joint_std[2], strict=True):
+        assert np.allclose(node(server, f"body0/at_{name}/uncertainty").scale, 2 * std, rtol=0.06)
+
+
+def test_layers_are_shown_and_hidden(server, motion, rig):
+    show = Show(server, Recording((motion,), rig=rig))
+    show.frame(0, Choice(frozenset({"bones", "cameras"})))
+    assert node(server, "body0/thigh_l/bones").visible and not node(server, "body0/thigh_l/surface").visible
+    assert node(server, "cameras/cam 0").visible and not node(server, "floor").visible
+    show.frame(0, Choice(frozenset({"surface", "floor", "path"}), through="cam 1"))
+    assert not node(server, "body0/thigh_l/bones").visible and node(server, "body0/thigh_l/surface").visible
+    assert not node(server, "cameras/cam 0").visible and node(server, "floor").visible
+    assert node(server, "path0").visible
+
+
+def test_a_camera_stands_and_looks_as_it_was_calibrated(server, motion, rig):
+    Show(server, Recording((motion,), rig=rig)).frame(0)
+    for camera in rig:
+        frustum = node(server, f"cameras/{camera.name}")
+        assert np.allclose(frustum.position, camera.centre_world, atol=1e-6)
+        assert np.allclose(se3.rotation_from_quaternion(frustum.wxyz)[:, 2], camera.T_camera_world[2, :3], atol=1e-6)
+
+
+def test_the_backdrop_is_where_its_pixels_are_seen(server, motion, rig, tmp_path):
+    video = write_video(tmp_path / "a.mkv", 90, size=(64, 96))
+    pictures = Pictures({c.name: c for c in rig}, {"cam 0": video})
+    show = Show(server, Recording((motion,), rig=rig, pictures=pictures))
+    show.frame(1, Choice(through="cam 0"))
+    back, camera = node(server, "backdrop/cam 0"), rig["cam 0"]
+    side = se3.rotation_from_quaternion(back.wxyz)
+    corner = back.position - 0.5 * (back.render_width * side[:, 0] + back.render_height * side[:, 1])
+    at = camera.T_camera_world[:3, :3] @ corner + camera.T_camera_world[:3, 3]
+    assert np.allclose(show.stage.cameras["cam 0"].view.pixels(at), -0.5, atol=1e-3)  # of the first pixel
+    assert at[2] > (motion.positions() @ camera.T_camera_world[2, :3]).max() + camera.T_camera_world[2, 3]
+    assert node(server, "cameras/cam 1").image is None
+    show.frame(1, Choice())
+    assert node(server, "backdrop/cam 0") is None and node(server, "cameras/cam 0").image is not None
+    pictures.close()
+
+
+def test_rays_of_one_camera_or_of_all(server, motion, rig):
+    show = Show(server, Recording((motion,), rig=rig))
+    one, other = show.rays(2, "cam 0"), show.rays(2, "cam 1")
+    assert len(show.rays(2, ALL).points) == len(one.points) + len(other.points)
+    show.frame(2, Choice(rays="cam 1"))
+    assert np.allclose(node(server, "rays").points, other.points, atol=1e-5) and node(server, "rays").visible
+    show.frame(2, Choice())
+    assert not node(server, "rays").visible
+
+
+def test_a_second_motion_goes_by_time_and_is_turned(server, motion):
+    late = smooth_motion(8, rate=RATE, up="z")
+    object.__setattr__(late, "times", late.times + 2 / RATE)
+    show = Show(server, Recording((motion, late)))
+    show.frame(5)
+    assert np.allclose(node(server, "body1/pelvis").position, motion.Ts_world_root[3, :3, 3], atol=1e-5)
+    show.frame(0)
+    assert not node(server, "body1").visible and node(server, "body0").visible
+
+
+def test_markers_and_points_where_they_are_known(server):
+    x = np.random.default_rng(0).normal(size=(4, 3, 3))
+    x[2, 1] = np.nan
+    markers = Markers(("a", "b", "c"), 10.0, x, up="z")
+    show = Show(server, Recording(markers=(markers,), marker_offsets=(0.5,), steps=np.arange(10) / 10))
+    show.frame(7)
+    assert np.allclose(node(server, "markers0/0").position, x[2, 0]) and not node(server, "markers0/1").visible
+    show.frame(8)
+    assert node(server, "markers0/1").visible
+    show.frame(2)  # before the markers begin
+    assert not node(server, "markers0").visible
+
+
+def test_measured_markers_of_a_motion(server, motion):
+    Show(server, Recording((motion,))).frame(1)
+    assert np.allclose(node(server, "markers0/4").position, motion.residuals["markers/1"].measured[1, 4], atol=1e-6)
+
+
+def test_following_keeps_the_body_in_place(server, motion):
+    show = Show(server, Recording((motion,)))
+    show.frame(6, Choice(follow=True))
+    way = motion.Ts_world_root[0, :3, 3] - motion.Ts_world_root[6, :3, 3]
+    shift = server.scene.get_handle_by_name("/world").position
+    assert np.allclose(shift[[0, 2]], way[[0, 2]], atol=1e-6) and shift[1] == 0  # y is up: the floor stays level
+    show.frame(6, Choice())
+    assert np.allclose(server.scene.get_handle_by_name("/world").position, 0)
+
+
+def test_a_long_way_is_followed_from_nearby(server):
+    walk = smooth_motion(300, rate=RATE)  # 8 m
+    show = Show(server, Recording((walk,)))
+    assert show.stage.goes_far
+    look = server.initial_camera
+    assert np.allclose(look.look_at, walk.Ts_world_root[0, :3, 3])
+    assert np.linalg.norm(look.position - look.look_at) == pytest.approx(5)
+
+
+def test_markers_are_followed_by_their_middle():
+    x = np.random.default_rng(1).normal(size=(5, 7, 3))
+    x[2], x[1, 3] = np.nan, np.nan
+    recording = Recording(markers=(Markers(tuple("abcdefg"), 10.0, x),), marker_offsets=(0.0,))
+    way = recording.way()
+    assert np.allclose(way[[0, 4]], np.median(x[[0, 4]], axis=1)) and np.allclose(way[2], (way[1] + way[3]) / 2)
+    assert np.allclose(way[1], np.nanmedian(x[1], axis=0))
+
+
+def test_a_short_one_is_seen_whole(server, motion, rig):
+    show = Show(server, Recording((motion,), rig=rig))
+    places, look = show.recording.places, server.initial_camera
+    assert not show.stage.goes_far and np.allclose(look.look_at, 0.5 * (places.min(0) + places.max(0)))
+    away = (places - look.position) @ (look.look_at - look.position)
+    across = np.linalg.norm(np.cross(places - look.position, look.look_at - look.position), axis=1)
+    assert np.all(away > 0) and np.all(across < np.tan(look.fov / 2) * away)
+
+
+def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
+    player = Player(server, Recording((motion,), rig=rig))
+    player.tick(0.0)
+    player.clock.playing = True
+    player.tick(3.2 / RATE)
+    assert player.clock.frame == 3 and np.allclose(
+        node(server, "body0/pelvis").position, motion.Ts_world_root[3, :3, 3], atol=1e-5
+    )
+    player.clock.step(1)
+    player.tick(0.0)
+    assert player._slider.value == 4
+    player._slider.value = 6  # as a user moves it
+    player.tick(0.0)
+    assert player.clock.frame == 6
+    player._boxes["bones"].value = False
+    player._rays.value, player._look.value, player._colour.value = ALL, "cam 1", "quality"
+    player.tick(0.0)
+    assert not node(server, "body0/thigh_l/bones").visible and node(server, "rays").visible
+    assert not node(server, "cameras/cam 1").visible and node(server, "cameras/cam 0").visible
+    player._plots[0].box.value = "elbow_flex_l"
+    player.tick(0.0)
+    assert "elbow_flex_l" in player._plots[0].line.content
+
+
+def test_nothing_to_show_is_told():
+    with pytest.raises(ObservationError, match="no frame"):
+        Recording()
+
+
+def test_a_port_in_use_gives_the_next():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        found = free_port("127.0.0.1", port)
+        assert found != port
+        with socket.create_server(("127.0.0.1", found)):
+            pass
+
+
+def test_a_host_that_is_none_is_told():
+    with pytest.raises(ExportError, match="no.such.host"):
+        open_server(0, host="no.such.host.invalid")
+
+
+def test_without_viser_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ExportError, match="pip install viser"):
+        open_server(0)
+
+
+def test_a_page_is_one_file_with_all_in_it(motion, rig):
+    text, frames = page(Recording((motion,), rig=rig))
+    assert frames == len(motion)
+    assert len(base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)[1])) > 10_000
+    assert not re.search(r'(?:src|href)="https?://', text)
+
+
+@pytest.mark.parametrize(
+    ("count", "most"), [(5, 10), (10, 10), (11, 10), (1000, 7), (1, 1), (MOST_FRAMES * 3 + 1, MOST_FRAMES)]
+)
+def test_frames_are_thinned_evenly(count, most):
+    chosen = chosen_frames(count, most)
+    assert len(chosen) <= most and chosen[0] == 0 and chosen[-1] < count
+    assert len(set(np.diff(chosen))) <= 1
+    assert len(chosen) == count or len(chosen) > most / 2
+
+
+def test_a_live_view_follows_states(rig):
+    body = load_body("humanoid")
+    with View(body, rig, up="y", port=0) as view:
+        state = body.usual_state(se3.transform(np.eye(3), np.array([0.3, 0.9, 0.1])))
+        image = np.full((480, 320, 3), 90, np.uint8)
+        view.show(state, time=1.25, images={"cam 0": image})
+        assert np.allclose(node(view.server, "body/pelvis").position, (0.3, 0.9, 0.1))
+        assert node(view.server, "cameras/cam 0").image.max() == 90
+        assert "1.250 s" in view._time.content
+        with urllib.request.urlopen(view.address, timeout=10) as answer:
+            assert answer.status == 200
+        with pytest.raises(BodyError, match="3 angles"):
+            view.show(BodyState(np.eye(4), np.zeros(3)))
+        with pytest.raises(CalibrationError, match="cam 7"):
+            view.show(state, images={"cam 7": image})
