@@ -25,12 +25,32 @@ def run(*args):
     return CliRunner().invoke(main, [str(arg) for arg in args])
 
 
-@pytest.mark.parametrize("format", ["bvh", "glb", "trc", "mot", "osim"])
+@pytest.mark.parametrize("format", ["bvh", "glb", "trc", "mot", "osim", "c3d"])
 def test_a_file_beside_the_motion(format, file):
     told = run("export", file, "--to", format)
     assert told.exit_code == 0, told.output
     assert file.with_suffix(f".{format}").stat().st_size > 1000
     assert str(file.with_suffix(f".{format}")) in told.stdout
+
+
+def test_usd_is_binary_unless_named_otherwise(file):
+    pytest.importorskip("pxr")
+    assert run("export", file, "--to", "usd").exit_code == 0
+    assert (file.parent / "squat.usdc").read_bytes().startswith(b"PXR-USDC")
+    assert run("export", file, "--to", "usd", "--out", file.parent / "x.usda", "--names", "mixamo").exit_code == 0
+    assert "mixamorig_Hips/mixamorig_LeftUpLeg" in (file.parent / "x.usda").read_text()
+
+
+def test_every_choice_that_help_lists_is_one_of_the_exporter(file):
+    from kinefit.cli.export import FREEDOM
+
+    for format, free in FREEDOM.items():
+        for key in ("unit", "up", "names", "rest"):
+            for value in getattr(free, key):
+                if format not in ("parquet", "csv", "usd"):
+                    told = run("export", file, "--to", format, f"--{key}", value, "--out", file.parent / f"x.{format}")
+                    assert told.exit_code == 0, told.output
+                    assert f"{key} {value}" in told.stdout
 
 
 def test_tables_are_a_folder(file):
@@ -50,9 +70,14 @@ def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--to", "glb", "--unit", "m"], "--unit is of bvh and trc, not of glb"),
-        (["--to", "trc", "--up", "z"], "--up is of bvh, not of trc"),
-        (["--to", "trc", "--unit", "cm"], "no unit of length 'cm'"),
+        (["--to", "glb", "--unit", "m"], "GLB is in metres and y up by its specification. --unit is of csv"),
+        (["--to", "glb", "--up", "z"], "GLB is in metres and y up by its specification. --up is of"),
+        (["--to", "mot", "--names", "cmu"], "OpenSim's files are in metres"),
+        (["--to", "trc", "--names", "mixamo"], "TRC holds landmarks"),
+        (["--to", "trc", "--unit", "inch"], "--unit of trc is one of: m, cm, mm; not inch"),
+        (["--to", "usd", "--up", "x"], "USD knows y and z up. --up of usd is one of: y, z; not x"),
+        (["--to", "bvh", "--names", "maya"], "--names of bvh is one of: bvh, kinefit, mixamo"),
+        (["--to", "c3d", "--rest", "t"], "--rest is of bvh, glb, usd; not of c3d"),
         (["--to", "fbx"], "'bvh', 'glb'"),
         ([], "--to"),
     ],

@@ -75,6 +75,6 @@ def with_sets(body):
 
 
 def test_an_unknown_unit_is_refused(tmp_path):
-    with pytest.raises(ExportError, match="there are: mm, cm, m"):
+    with pytest.raises(ExportError, match="there are: m, cm, mm"):
         write_bvh(smooth_motion(2), tmp_path / "a.bvh", unit="inch")
     assert not list(tmp_path.iterdir())

@@ -103,8 +103,8 @@ def test_trc_holds_the_landmarks_y_up(tmp_path, unit, per_metre):
     table = np.array([line.split("\t") for line in lines[6:]], float)
     assert table[:, 1] == pytest.approx(motion.times)
     assert table[:, 2:] / per_metre == pytest.approx(motion.turned("y").positions().reshape(10, -1), abs=1e-7)
-    with pytest.raises(ExportError, match="there are: m, mm"):
-        write_trc(motion, tmp_path / "b.trc", unit="cm")
+    with pytest.raises(ExportError, match="there are: m, cm, mm"):
+        write_trc(motion, tmp_path / "b.trc", unit="inch")
 
 
 def test_trc_of_chosen_points(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -172,7 +173,7 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
         surface = s.surface and _Surface(
             end=(s.surface.end[0], s.surface.end[1], -s.surface.end[2]), radii=s.surface.radii
         )
-        names = {convention: _left(name) for convention, name in s.names.items()}
+        names = {k: _left(n) if _left(n) != n else re.sub("^r", "l", n) for k, n in s.names.items()}  # CMU: rfemur
         parent = _left(s.parent) if s.parent else None
         out.append(
             msgspec.structs.replace(s, name=_left(s.name), parent=parent, joint=joint, surface=surface, names=names)

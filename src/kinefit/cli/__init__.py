@@ -1,4 +1,4 @@
-"""The command line: `kinefit demo`, `track`, `export`, `retarget`, `warmup`; one file a command.
+"""The command line: `kinefit demo`, `init`, `check`, `track` and so on; one file a command.
 
 Heavy imports stand inside the commands, so that help comes at once.
 """
@@ -13,12 +13,14 @@ from kinefit import __version__
 from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
-COMMANDS = ("demo", "track", "export", "retarget", "warmup")
+COMMANDS = ("demo", "init", "calibrate", "detect", "check", "track", "view", "export", "retarget", "warmup")
 
 _EPILOG = """\b
 Examples:
   kinefit demo                          four videos of a person, done in a minute
-  kinefit track my_take/take.toml       the same for a recording of your own
+  kinefit init my_take                  a take file for a recording of your own
+  kinefit check my_take/take.toml       what is wrong with it, and what would mend it
+  kinefit track my_take/take.toml       angles, figures, videos and a report
   kinefit export motion.npz --to bvh    a result in another format
   kinefit COMMAND --help                what a command takes, with examples
 

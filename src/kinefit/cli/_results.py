@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
-    "mot": "motion.mot", "osim": "body.osim", "parquet": "tables",
+    "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
 }  # fmt: skip
 """What each format is called in a folder of results."""
 
-USUAL = tuple(name for name in NAMES if name != "parquet")
+USUAL = tuple(name for name in NAMES if name not in ("parquet", "c3d", "usd"))
 """Formats that are written where none are named."""
 
 ABOUT = {
@@ -33,8 +33,11 @@ ABOUT = {
     "trc": "landmarks over time for OpenSim",
     "mot": "angles over time for OpenSim",
     "osim": "the fitted body for OpenSim",
+    "c3d": "joint centres and landmarks for motion laboratories",
+    "usd": "animated figure for film and simulation programs",
     "overlays": "videos with the skeleton drawn on them",
     "montage": "one picture of all cameras",
+    "report": "what came out and how far to trust it, on one page for a browser",
 }
 """What each is for."""
 
@@ -57,7 +60,8 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
     writers: dict[str, Callable[..., Any]] = {
         "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
         "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
-        "mot": exporters.write_mot, "osim": lambda motion, path: exporters.write_osim(motion.body, path),
+        "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot,
+        "osim": lambda motion, path: exporters.write_osim(motion.body, path),
     }  # fmt: skip
     writers[format](motion, path, **options)
 

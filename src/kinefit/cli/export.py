@@ -3,40 +3,99 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
 from kinefit.cli import _results, _screen
 
-_SUFFIXES = {"csv": "-tables", "parquet": "-tables"}
+
+class Freedom(NamedTuple):
+    """What may be chosen of a format, the default first; `why` there is no more choice."""
+
+    unit: tuple[str, ...] = ()
+    up: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    rest: tuple[str, ...] = ()
+    why: str = ""
+
+
+_UPS = ("x", "y", "z", "-x", "-y", "-z")
+_Y_UPS = ("y", *(up for up in _UPS if up != "y"))
+_NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
+_RESTS = ("body", "t")
+_OF_BVH = ("bvh", *_NAMES[:-1])
+_OPENSIM = "OpenSim's files are in metres, y up, under the names of the body's coordinates"
+
+FREEDOM = {
+    "csv": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
+    "parquet": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
+    "bvh": Freedom(("cm", "m", "mm"), _Y_UPS, _OF_BVH, _RESTS),
+    "glb": Freedom((), (), _NAMES, _RESTS, "GLB is in metres and y up by its specification"),
+    "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD knows y and z up"),
+    "c3d": Freedom(("mm", "cm", "m"), _UPS, _NAMES),
+    "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC holds landmarks, which bear the names of H-Anim"),
+    "mot": Freedom(why=_OPENSIM),
+    "osim": Freedom(why=_OPENSIM),
+}
+"""Choices of every format."""
+
+KEYS = ("unit", "up", "names", "rest")
+
+_ENDINGS = {"csv": "-tables", "parquet": "-tables", "usd": ".usdc"}
 
 _EXAMPLES = """\b
 Examples:
-  kinefit export take-kinefit/motion.npz --to bvh --unit m --up z
+  kinefit export take-kinefit/motion.npz --to bvh --unit m            upright and of the right size in Blender
+  kinefit export motion.npz --to glb --names mixamo                   retargets by name in Blender, Unity, Unreal
+  kinefit export motion.npz --to usd --up z --out walk.usda
   kinefit export motion.npz --to trc --out walk.trc --unit mm
   kinefit export motion.npz --to parquet --out tables
-"""
+
+\b
+Choices, the default first (csv, parquet and c3d keep the take's vertical axis; --names mixamo rests as t):
+""" + "".join(
+    f"  {format:<8} "
+    + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
+    + ("none" if not any(getattr(free, key) for key in KEYS) else "")
+    + "\n"
+    for format, free in FREEDOM.items()
+)
 
 
 @click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
 @click.argument("motion", type=click.Path(path_type=Path))
 @click.option(
-    "--to", "format", required=True, type=click.Choice([name for name in _results.NAMES if name != "motion"]),
+    "--to", "format", required=True, type=click.Choice(list(FREEDOM)),
     help="Format; csv and parquet are a folder of tables.",
 )
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: beside MOTION]")
-@click.option("--unit", type=click.Choice(["mm", "cm", "m"]), help="Length, of bvh (default cm) and trc (m, mm).")
-@click.option("--up", type=click.Choice(["x", "y", "z", "-x", "-y", "-z"]), help="Vertical axis, of bvh (default y).")
+@click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
+@click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
+@click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
+@click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
 @_screen.verbose_option
-def export(motion: Path, format: str, out: Path | None, unit: str | None, up: str | None, verbose: bool) -> None:
+def export(motion: Path, format: str, out: Path | None, verbose: bool, **choices: str | None) -> None:
     """Write a motion file, as `kinefit track` leaves it, in another format."""
-    options = {name: value for name, value in (("unit", unit), ("up", up)) if value}
-    for name, formats in (("unit", ("bvh", "trc")), ("up", ("bvh",))):
-        if name in options and format not in formats:
-            raise click.UsageError(f"--{name} is of {' and '.join(formats)}, not of {format}.")
+    options = {key: value for key, value in choices.items() if value is not None}
+    for key, value in options.items():
+        _check_choice(format, key, value)
     from kinefit.readers.motion import read_motion
 
     recorded = read_motion(motion)
-    out = out or motion.with_name(f"{motion.stem}{_SUFFIXES.get(format, '.' + format)}")
+    out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
     _results.write_format(recorded, format, out, **options)
-    _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames")
+    told = ", ".join(f"{key} {value}" for key, value in options.items())
+    _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+
+
+def _check_choice(format: str, key: str, value: str) -> None:
+    """Refuse an option that the format has no freedom for, and say why and what there is."""
+    valid = getattr(FREEDOM[format], key)
+    if value in valid:
+        return
+    why = f"{FREEDOM[format].why}. " if FREEDOM[format].why else ""
+    if valid:
+        raise click.UsageError(f"{why}--{key} of {format} is one of: {', '.join(valid)}; not {value}.")
+    others = [name for name, free in FREEDOM.items() if getattr(free, key)]
+    raise click.UsageError(f"{why}--{key} is of {', '.join(others)}; not of {format}.")

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from kinefit.cli import _results, _screen
+
+if TYPE_CHECKING:
+    from kinefit.readers.take import Take
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -21,6 +26,7 @@ _EXAMPLES = """\b
 Examples:
   kinefit track my_take/take.toml
   kinefit track take.toml --out results --no-overlays --formats bvh,csv
+  kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
   kinefit track take.toml -v            also how well every point of every camera fits
 """
 
@@ -31,25 +37,51 @@ Examples:
 @click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video.")
 @click.option(
     "--formats", default=",".join(_results.USUAL), show_default=True, callback=chosen_formats, metavar="LIST",
-    help="What to write; parquet is there too.",
+    help="What to write; parquet, c3d and usd are there too.",
 )
+@click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
+@click.option("--realtime", is_flag=True, help="Do not smooth over the whole take.")
 @_screen.verbose_option
 @click.pass_context
 def track(
-    ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], verbose: bool
+    ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
+    realtime: bool, verbose: bool,
 ) -> None:
     """Track the person of a take file and write all results.
 
-    TAKE is one TOML file that names calibration, cameras, videos and keypoints: see docs/take-file.md; `kinefit demo`
-    leaves a complete one to copy. Ctrl-C stops the tracking and writes the frames that are done.
+    TAKE is one TOML file that names calibration, cameras, videos and keypoints: `kinefit init` writes a first one,
+    `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
+    the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done.
     """
     out = out or take.with_name(f"{take.stem}-kinefit")
-    ctx.exit(run(take, out, overlays=overlays, formats=formats, verbose=verbose))
+    code = run(take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, verbose=verbose)
+    ctx.exit(code)
 
 
-def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verbose: bool) -> int:
+def with_detections(take: Take, step: _screen.Step) -> Take:
+    """The take with the built-in detector's keypoints where it asks for them, or names none and has videos."""
+    from kinefit.readers.take import KeypointsEntry
+
+    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
+    videos = any(camera.video for camera in take.cameras)
+    if not asked and (take.keypoints or not videos):
+        return take
+    from kinefit.cli._detecting import ensure_detections
+
+    files = ensure_detections(take, progress=step)
+    if take.keypoints:
+        return take
+    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
+    return replace(take, keypoints=entries)
+
+
+def run(
+    path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
+    verbose: bool = False,
+) -> int:
     """Track a take and write what comes of it; returns the exit code."""
     from kinefit.cli._agreement import print_agreement
+    from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TrackingError
     from kinefit.readers.take import read_take
@@ -62,14 +94,20 @@ def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verb
     total = 0
     try:
         with _screen.bars() as step:
+            take = with_detections(take, step)
             step("reading", 0, 0)
             try:
-                motion, seen = track_take(take, progress=lambda *told: (step("reading", 1, 1), step(*told))[1])
+                motion, seen = track_take(
+                    take, smooth=smooth, progress=lambda *told: (step("reading", 1, 1), step(*told))[1]
+                )
             except TrackingInterrupted as stopped:
-                motion, total, overlays = stopped.motion, stopped.total, False
+                motion, total, overlays, report = stopped.motion, stopped.total, False, False
+            motion = replace(motion, provenance=provenance(take, **motion.provenance))
             _results.write_results(motion, out, formats, step, files)
             if overlays:
                 _results.write_overlays(motion, take, seen, out, step, files)
+            if report:
+                write_track_report(motion, take, seen, out, step, files)
     except BaseException as error:
         if files:
             print_files(files)
@@ -81,6 +119,6 @@ def run(path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], verb
     print_summary(motion, points=verbose)
     print_files(files)
     if total:
-        _screen.tell_interrupted(f"{len(motion)} of {total} frames are done and written; no overlay video was begun.")
+        _screen.tell_interrupted(f"{len(motion)} of {total} frames are done and written; no video or report was begun.")
         return _screen.INTERRUPTED
     return 0

@@ -1,27 +1,26 @@
-"""What all skeleton formats need: poses relative to the parent, Euler angles without jumps, names without blanks."""
+"""What all skeleton formats need: names and units of choice, Euler angles and quaternions without jumps."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
+from kinefit.errors import ExportError, choices
 from kinefit.geometry import se3
-from kinefit.motion import Motion
+from kinefit.motion import UP_AXES, Motion
+
+NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
+"""Conventions of names: the body's own, then its aliases."""
+
+UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+"""Units of length in a metre."""
 
 _LOCKED = 1e-7  # cosine of the middle angle below which the outer two turn about one axis
-
-
-def local_poses(motion: Motion) -> NDArray:
-    """T_parent_segment (F, S, 4, 4) of every segment; of the root T_world_root."""
-    Ts_world = motion.segment_poses()
-    parents = motion.body.tree.parents
-    out = se3.inverse(Ts_world[:, np.maximum(parents, 0)]) @ Ts_world
-    out[:, parents < 0] = Ts_world[:, parents < 0]
-    return out
 
 
 def slides(body: Body) -> NDArray:
@@ -68,6 +67,34 @@ def continuous_quaternions(rotations: NDArray) -> NDArray:
     flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
     q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
     return q
+
+
+def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
+    """Name of every segment in one of `NAMES`, each once; `path` for messages.
+
+    A segment without a counterpart there keeps its own name; a body without any is refused, unless for "bvh".
+    """
+    if names not in NAMES:
+        raise ExportError(choices("convention of names", names, NAMES), file=path)
+    if names not in ("kinefit", "bvh") and not body.aliases.get(names):
+        known = ", ".join(["kinefit", *(name for name in NAMES if body.aliases.get(name))])
+        remedy = f"It has those of: {known}. Or write them into its body file: names = {{ {names} = ... }}."
+        raise ExportError(f"body '{body.name}' has no names of {names}", file=path, remedy=remedy)
+    return plain_names(body.alias(names, segment) for segment in body.tree.segments)
+
+
+def length_factor(unit: str, units: Mapping[str, float], path: str | PathLike[str]) -> float:
+    """Units of length in a metre; ExportError where the format has no such unit."""
+    if unit not in units:
+        raise ExportError(choices("unit of length", unit, units), file=path)
+    return units[unit]
+
+
+def turned(motion: Motion, up: str, path: str | PathLike[str], allowed: Iterable[str] = UP_AXES) -> Motion:
+    """The motion in a world whose vertical axis is `up`; ExportError where the format has no such axis."""
+    if up not in allowed:
+        raise ExportError(choices("vertical axis of this format", up, allowed), file=path)
+    return motion.turned(up)
 
 
 def plain_names(names: Iterable[str]) -> list[str]:

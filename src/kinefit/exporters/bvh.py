@@ -8,21 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.errors import ExportError, choices
 from kinefit.exporters._atomic import write_text
-from kinefit.exporters._skeleton import euler_zxy, local_poses, plain_names, slides
+from kinefit.exporters._rest import Rest, rest_pose
+from kinefit.exporters._skeleton import UNITS, bone_names, euler_zxy, length_factor, slides, turned
 from kinefit.motion import Motion
 
-UNITS = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 _ROTATIONS = "Zrotation Xrotation Yrotation"
 _POSITIONS = "Xposition Yposition Zposition"
 
 
-def write_bvh(motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up: str = "y") -> None:
+def write_bvh(
+    motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up: str = "y", names: str = "bvh",
+    rest: str | None = None,
+) -> None:
     """Write a motion as BVH.
 
-    Joints bear the names of the body's alias "bvh". Rotations are Euler angles Z, X, Y without jumps. The root has six
-    channels, every other joint three; a joint that slides has six, its position standing instead of its OFFSET.
+    Rotations are Euler angles Z, X, Y without jumps. The root has six channels, every other joint three; a joint that
+    slides has six, its position standing instead of its OFFSET.
 
     Parameters
     ----------
@@ -32,23 +34,25 @@ def write_bvh(motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up
         Unit of length in the file; the format does not state it.
     up : str
         Vertical axis of the file's world.
+    names : "bvh", "mixamo", "cmu", "opensim", "hanim" or "kinefit"
+        Names of the joints; "bvh": the usual ones (Hips, RightUpLeg ...).
+    rest : "body" or "t", optional
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
 
     Raises
     ------
     ExportError
-        Unknown unit, or the file cannot be written.
+        Unknown unit, axis, names or rest pose, or the file cannot be written.
     """
-    if unit not in UNITS:
-        raise ExportError(choices("unit of length", unit, UNITS), file=path)
-    body, scale = motion.body, UNITS[unit]
-    Ts = local_poses(motion.turned(up))
+    body, scale, joints = motion.body, length_factor(unit, UNITS, path), bone_names(motion.body, names, path)
+    pose = rest_pose(body, rest, names, path)
+    Ts = pose.local_poses(turned(motion, up, path))
     with_position = slides(body)
     with_position[0] = True
     degrees = np.degrees(euler_zxy(Ts[..., :3, :3]))
     columns: list[NDArray] = []
     order: list[int] = []
-    lines = ["HIERARCHY"] + _hierarchy(body, plain_names(body.alias("bvh", s) for s in body.tree.segments),
-                                       with_position, scale, order)
+    lines = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
     for s in order:
         columns += [scale * Ts[:, s, :3, 3]] * bool(with_position[s]) + [degrees[:, s]]
     table = np.concatenate(columns, axis=1) + 0.0
@@ -58,17 +62,19 @@ def write_bvh(motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _hierarchy(body: Body, names: list[str], with_position: NDArray, scale: float, order: list[int]) -> list[str]:
+def _hierarchy(
+    body: Body, pose: Rest, names: list[str], with_position: NDArray, scale: float, order: list[int]
+) -> list[str]:
     """Lines of the hierarchy; fills `order` with the segments in the order of their channels."""
     tree = body.tree
-    ends = {c.segment: scale * np.array(c.end) for c in body.surfaces}
+    ends = {c.segment: scale * pose.turns[c.segment] @ np.array(c.end) for c in body.surfaces}
 
     def joint(s: int, depth: int) -> list[str]:
         order.append(s)
         indent, inner = "\t" * depth, "\t" * (depth + 1)
         channels = f"6 {_POSITIONS} {_ROTATIONS}" if with_position[s] else f"3 {_ROTATIONS}"
         lines = [f"{indent}{'JOINT' if depth else 'ROOT'} {names[s]}", f"{indent}{{"]
-        lines += [f"{inner}OFFSET {_numbers(scale * tree.offsets[s])}", f"{inner}CHANNELS {channels}"]
+        lines += [f"{inner}OFFSET {_numbers(scale * pose.offsets[s])}", f"{inner}CHANNELS {channels}"]
         children = np.flatnonzero(tree.parents == s)
         for child in children:
             lines += joint(int(child), depth + 1)

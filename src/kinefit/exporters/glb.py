@@ -11,49 +11,59 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters._atomic import write_bytes
-from kinefit.exporters._skeleton import continuous_quaternions, local_poses, plain_names, slides
-from kinefit.exporters._tubes import body_mesh
+from kinefit.exporters._rest import Rest, rest_pose
+from kinefit.exporters._skeleton import bone_names, continuous_quaternions, plain_names, slides
+from kinefit.exporters._tubes import SkinnedMesh, body_mesh
 from kinefit.motion import Motion
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}
 
 
-def write_glb(motion: Motion, path: str | PathLike[str]) -> None:
-    """Write a motion as GLB, in metres, y up, time starting at 0.
+def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None) -> None:
+    """Write a motion as GLB, in metres and y up, as the format prescribes; time starts at 0.
 
-    One mesh of rounded tubes about the body's surfaces hangs on one skin, whose joints bear the names of the segments.
-    The bind pose is the body at rest; the animation turns every joint that can turn and moves the root.
+    One mesh of rounded tubes about the body's surfaces hangs on one skin. The bind pose is the rest pose; the
+    animation turns every joint that can turn and moves the root.
+
+    Parameters
+    ----------
+    motion : Motion
+    path : path
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+        Names of the joints.
+    rest : "body" or "t", optional
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
 
     Raises
     ------
     ExportError
-        A motion without frames, or the file cannot be written.
+        A motion without frames, unknown names or rest pose, or the file cannot be written.
     """
     if not len(motion):
         raise ExportError("a motion without frames cannot be animated", file=path)
     body, tree = motion.body, motion.body.tree
     gltf, buffer = gl.GLTF2(asset=gl.Asset(version="2.0", generator="kinefit")), _Buffer()
-    names = plain_names(tree.segments)
+    joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
     gltf.nodes = [
         gl.Node(
             name=name,
-            translation=[float(v) for v in tree.offsets[s]],
+            translation=[float(v) for v in pose.offsets[s]],
             children=[int(c) for c in np.flatnonzero(tree.parents == s)],
         )
-        for s, name in enumerate(names)
+        for s, name in enumerate(joints)
     ]
     roots = [0]
     if body.surfaces:
-        gltf.meshes, gltf.materials = [_mesh(motion, buffer)], [_material()]
-        inverse_bind = np.tile(np.eye(4), (len(names), 1, 1))
-        inverse_bind[:, :3, 3] = -tree.rest
+        gltf.meshes, gltf.materials = [_mesh(pose.posed(body_mesh(body), body), buffer)], [_material()]
+        inverse_bind = np.tile(np.eye(4), (len(joints), 1, 1))
+        inverse_bind[:, :3, 3] = -pose.positions
         matrices = buffer.add(inverse_bind.transpose(0, 2, 1))  # column after column
-        gltf.skins = [gl.Skin(inverseBindMatrices=matrices, joints=list(range(len(names))), skeleton=0)]
+        gltf.skins = [gl.Skin(inverseBindMatrices=matrices, joints=list(range(len(joints))), skeleton=0)]
         gltf.nodes.append(gl.Node(name=plain_names([body.name])[0], mesh=0, skin=0))
-        roots.append(len(names))
+        roots.append(len(joints))
     gltf.scenes, gltf.scene = [gl.Scene(name=motion.name, nodes=roots)], 0
-    gltf.animations = [_animation(motion, buffer)]
+    gltf.animations = [_animation(motion, pose, buffer)]
     gltf.accessors, gltf.bufferViews = buffer.accessors, buffer.views
     gltf.buffers = [gl.Buffer(byteLength=len(buffer.data))]
     gltf.set_binary_blob(bytes(buffer.data))
@@ -78,8 +88,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def _mesh(motion: Motion, buffer: _Buffer) -> gl.Mesh:
-    mesh = body_mesh(motion.body)
+def _mesh(mesh: SkinnedMesh, buffer: _Buffer) -> gl.Mesh:
     four = ((0, 0), (0, 2))
     weights = np.pad(mesh.weights, four).astype(np.float32)
     segments = np.where(weights > 0, np.pad(mesh.segments, four), 0).astype(np.uint16)
@@ -100,9 +109,9 @@ def _material() -> gl.Material:
     return gl.Material(name="skin", pbrMetallicRoughness=look, alphaMode="OPAQUE", alphaCutoff=None)
 
 
-def _animation(motion: Motion, buffer: _Buffer) -> gl.Animation:
+def _animation(motion: Motion, pose: Rest, buffer: _Buffer) -> gl.Animation:
     tree = motion.body.tree
-    Ts = local_poses(motion.turned("y"))
+    Ts = pose.local_poses(motion.turned("y"))
     turning = np.zeros(len(tree.segments), bool)
     turning[tree.owners[~tree.prismatic]] = turning[0] = True
     moving = slides(motion.body)

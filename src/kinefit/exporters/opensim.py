@@ -1,7 +1,7 @@
 """OpenSim: landmarks over time (.trc), angles over time (.mot) and the fitted body as a model (.osim).
 
-All three stand in OpenSim's world, y up. The root's coordinates are those of OpenSim's ground_pelvis joint: the way of
-its origin, then turns about its own z (tilt), x (list) and y (rotation).
+All three stand in OpenSim's world, y up (TRC unless told otherwise). The root's coordinates are those of OpenSim's
+ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x (list) and y (rotation).
 """
 
 from __future__ import annotations
@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from kinefit.bodies import Body, PointSet
-from kinefit.errors import ExportError, choices
 from kinefit.exporters._atomic import write_text
 from kinefit.exporters._opensim_model import model
-from kinefit.exporters._skeleton import euler_zxy, plain_names
+from kinefit.exporters._skeleton import UNITS, euler_zxy, length_factor, plain_names, turned
 from kinefit.motion import Motion
 
-TRC_UNITS = {"m": 1.0, "mm": 1000.0}
 
-
-def write_trc(motion: Motion, path: str | PathLike[str], points: PointSet | None = None, *, unit: str = "m") -> None:
-    """Write points of the fitted body over time as TRC, y up.
+def write_trc(
+    motion: Motion, path: str | PathLike[str], points: PointSet | None = None, *, unit: str = "m", up: str = "y"
+) -> None:
+    """Write points of the fitted body over time as TRC.
 
     Parameters
     ----------
@@ -31,18 +30,19 @@ def write_trc(motion: Motion, path: str | PathLike[str], points: PointSet | None
     path : path
     points : PointSet, optional
         By default the body's landmarks, which `write_osim` puts into the model's marker set.
-    unit : "m" or "mm"
+    unit : "m", "cm" or "mm"
+    up : str
+        Vertical axis of the file's world, which the format does not state; OpenSim's is y.
 
     Raises
     ------
     ExportError
-        Unknown unit, or the file cannot be written.
+        Unknown unit or axis, or the file cannot be written.
     """
-    if unit not in TRC_UNITS:
-        raise ExportError(choices("unit of length", unit, TRC_UNITS), file=path)
+    factor = length_factor(unit, UNITS, path)
     points = motion.body.landmarks if points is None else points
     names = plain_names(points.names)
-    values = TRC_UNITS[unit] * motion.turned("y").positions(points).reshape(len(motion), -1) + 0.0
+    values = factor * turned(motion, up, path).positions(points).reshape(len(motion), -1) + 0.0
     axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",

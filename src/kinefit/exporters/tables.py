@@ -7,8 +7,8 @@
     quality     of the frame and of every segment, 0..1
     residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight
 
-Every table starts with `frame` (from 0) and `time [s]`; the world is the motion's own. A deviation "inf" means that
-nothing observed it.
+Every table starts with `frame` (from 0) and `time [s]`; metres and the motion's own world unless told otherwise. A
+deviation "inf" means that nothing observed it.
 """
 
 from __future__ import annotations
@@ -24,14 +24,22 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters._atomic import writing
-from kinefit.exporters._skeleton import continuous_quaternions
+from kinefit.exporters._skeleton import UNITS, bone_names, continuous_quaternions, length_factor, turned
 from kinefit.motion import Motion, Residuals
 
 Table = dict[str, NDArray]  # column -> (rows,)
 
 
-def write_csv(motion: Motion, folder: str | PathLike[str]) -> tuple[Path, ...]:
+def write_csv(
+    motion: Motion, folder: str | PathLike[str], *, unit: str = "m", up: str | None = None, names: str | None = None
+) -> tuple[Path, ...]:
     """Write angles.csv, joints.csv, landmarks.csv, quality.csv and residuals.csv; all of them or none.
+
+    Parameters
+    ----------
+    motion : Motion
+    folder : path
+    unit, up, names : as in `tables`.
 
     Returns
     -------
@@ -40,18 +48,20 @@ def write_csv(motion: Motion, folder: str | PathLike[str]) -> tuple[Path, ...]:
     Raises
     ------
     ExportError
-        A file cannot be written.
+        Unknown unit, axis or names, or a file cannot be written.
     """
-    return _write(motion, Path(folder), ".csv", _to_csv)
+    return _write(tables(motion, unit=unit, up=up, names=names), Path(folder), ".csv", _to_csv)
 
 
-def write_parquet(motion: Motion, folder: str | PathLike[str]) -> tuple[Path, ...]:
-    """Write the same tables as Parquet; name, rate [Hz] and vertical axis of the take stand in each file's metadata.
+def write_parquet(
+    motion: Motion, folder: str | PathLike[str], *, unit: str = "m", up: str | None = None, names: str | None = None
+) -> tuple[Path, ...]:
+    """Write the same tables as Parquet; name, rate [Hz] and vertical axis stand in each file's metadata.
 
     Raises
     ------
     ExportError
-        The extra "parquet" is not installed, or a file cannot be written.
+        The extra "parquet" is not installed; and as `write_csv`.
     """
     try:
         import pyarrow
@@ -60,63 +70,89 @@ def write_parquet(motion: Motion, folder: str | PathLike[str]) -> tuple[Path, ..
         raise ExportError(
             "Parquet needs the package pyarrow", file=folder, remedy="Install it: pip install 'kinefit[parquet]'."
         ) from error
-    about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": motion.up}
+    about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": up or motion.up}
 
     def to_parquet(table: Table, file: Path) -> None:
         content = pyarrow.table({name: pyarrow.array(column) for name, column in table.items()})
         pyarrow.parquet.write_table(content.replace_schema_metadata(about), file)
 
-    return _write(motion, Path(folder), ".parquet", to_parquet)
+    return _write(tables(motion, unit=unit, up=up, names=names), Path(folder), ".parquet", to_parquet)
 
 
-def tables(motion: Motion) -> dict[str, Table]:
-    """The tables by name, each column -> (rows,), in the units that the column's name tells."""
-    body = motion.body
+def tables(
+    motion: Motion, *, unit: str = "m", up: str | None = None, names: str | None = None
+) -> dict[str, Table]:
+    """The tables by name, each column -> (rows,), in the units that the column's name tells.
+
+    Parameters
+    ----------
+    motion : Motion
+    unit : "m", "cm" or "mm"
+        Of all lengths.
+    up : str, optional
+        Vertical axis of the tables' world; default: the motion's own.
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh", optional
+        Joints and segments under these names (a joint bears its segment's); default: the body's own for both.
+
+    Raises
+    ------
+    ExportError
+        Unknown unit, axis or names.
+    """
+    place = f"tables of {motion.name}"
+    factor, motion, body = length_factor(unit, UNITS, place), turned(motion, up or motion.up, place), motion.body
+    segments = bone_names(body, names or "kinefit", place)
+    bones = tuple(segments) if names else body.joints
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
-    joints, stds = _xyz(body.joints, motion.segment_poses()[..., :3, 3]), _xyz(body.joints, motion.joint_std, " std")
-    quality = {name: motion.segment_quality[:, s] for s, name in enumerate(body.tree.segments)}
+    centres = _xyz(bones, factor * motion.segment_poses()[..., :3, 3], unit)
+    quality = {name: motion.segment_quality[:, s] for s, name in enumerate(segments)}
+    residuals = [_residuals(motion, sensor, r, factor, unit, segments) for sensor, r in motion.residuals.items()]
     return {
-        "angles": start | _angles(motion),
-        "joints": start | joints | stds,
-        "landmarks": start | _xyz(body.landmarks.names, motion.positions()),
+        "angles": start | _angles(motion, factor, unit),
+        "joints": start | centres | _xyz(bones, factor * motion.joint_std, unit, " std"),
+        "landmarks": start | _xyz(body.landmarks.names, factor * motion.positions(), unit),
         "quality": start | {"quality": motion.quality} | quality,
-        "residuals": _long([_residuals(motion, sensor, r) for sensor, r in motion.residuals.items()]),
+        "residuals": _long(residuals),
     }
 
 
-def _angles(motion: Motion) -> Table:
+def _angles(motion: Motion, factor: float, unit: str) -> Table:
     body = motion.body
-    units = ["m"] * 3 + ["deg"] * 3 + ["m" if slides else "deg" for slides in body.tree.prismatic]
-    stds = motion.dof_std * [1.0 if unit == "m" else np.degrees(1.0) for unit in units]
-    angles = np.where(body.tree.prismatic, motion.angles, np.degrees(motion.angles))
+    units = [unit] * 3 + ["deg"] * 3 + [unit if slides else "deg" for slides in body.tree.prismatic]
+    factors = np.array([np.degrees(1.0) if u == "deg" else factor for u in units])
+    stds, angles = motion.dof_std * factors, motion.angles * factors[6:]
     quaternions = continuous_quaternions(motion.Ts_world_root[:, :3, :3])
-    out = {f"root_t{axis} [m]": motion.Ts_world_root[:, i, 3] for i, axis in enumerate("xyz")}
+    out = {f"root_t{axis} [{unit}]": factor * motion.Ts_world_root[:, i, 3] for i, axis in enumerate("xyz")}
     out |= {f"root_q{part}": quaternions[:, i] for i, part in enumerate("wxyz")}
     out |= {f"{name} [{unit}]": angles[:, d] for d, (name, unit) in enumerate(zip(body.tree.coordinates, units[6:]))}
     return out | {f"{name} std [{unit}]": stds[:, d] for d, (name, unit) in enumerate(zip(body.dof_names, units))}
 
 
-def _xyz(names: tuple[str, ...], positions: NDArray, suffix: str = "") -> Table:
-    return {f"{n} {axis}{suffix} [m]": positions[:, k, i] for k, n in enumerate(names) for i, axis in enumerate("xyz")}
+def _xyz(names: tuple[str, ...], positions: NDArray, unit: str, suffix: str = "") -> Table:
+    axes = list(enumerate("xyz"))
+    return {f"{n} {axis}{suffix} [{unit}]": positions[:, k, i] for k, n in enumerate(names) for i, axis in axes}
 
 
-def _residuals(motion: Motion, sensor: str, r: Residuals) -> Table:
+def _residuals(
+    motion: Motion, sensor: str, r: Residuals, factor: float, unit: str, bones: list[str]
+) -> Table:
     frames, points = np.nonzero(np.isfinite(r.norms))
-    segments = np.array([motion.body.tree.segments[s] for s in r.segments], dtype=np.str_)
+    segments = np.array([bones[s] for s in r.segments], dtype=np.str_)
     pixels = r.unit == "px"
+    factor, unit = (1.0, "px") if pixels else (factor, unit)
     out: Table = {
         "frame": frames,
         "time [s]": motion.times[frames],
         "sensor": np.full(len(frames), sensor),
         "point": np.array(r.names, dtype=np.str_)[points],
         "segment": segments[points],
-        "unit": np.full(len(frames), r.unit),
+        "unit": np.full(len(frames), unit),
     }
     for i, axis in enumerate(("u", "v") if pixels else ("x", "y", "z")):
-        out[f"measured {axis} [{r.unit}]"] = r.measured[frames, points, i]
-        out[f"residual {axis} [{r.unit}]"] = r.values[frames, points, i]
+        out[f"measured {axis} [{unit}]"] = factor * r.measured[frames, points, i]
+        out[f"residual {axis} [{unit}]"] = factor * r.values[frames, points, i]
     return out | {
-        "residual": r.norms[frames, points],
+        "residual": factor * r.norms[frames, points],
         "weight": np.asarray(r.weights, float)[frames, points],
         "left_right_swapped": np.asarray(r.swapped, bool)[frames],
     }
@@ -134,10 +170,12 @@ def _long(parts: list[Table]) -> Table:
     return {name: np.concatenate([column(part, name) for part in parts]) for name in columns}
 
 
-def _write(motion: Motion, folder: Path, suffix: str, write: Callable[[Table, Path], Any]) -> tuple[Path, ...]:
+def _write(
+    content: Mapping[str, Table], folder: Path, suffix: str, write: Callable[[Table, Path], Any]
+) -> tuple[Path, ...]:
     files = []
     with ExitStack() as stack:  # every file takes its place only when all are complete
-        for name, table in tables(motion).items():
+        for name, table in content.items():
             files.append(folder / f"{name}{suffix}")
             write(table, stack.enter_context(writing(files[-1])))
     return tuple(files)

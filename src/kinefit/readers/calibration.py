@@ -34,7 +34,11 @@ _FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measur
 
 
 def read_calibration(
-    path: str | PathLike[str], *, unit: str | float = "auto", image_size: tuple[int, int] | None = None
+    path: str | PathLike[str],
+    *,
+    unit: str | float = "auto",
+    image_size: tuple[int, int] | None = None,
+    exteriors: bool = True,
 ) -> Rig:
     """Read the cameras of a calibration; its format is recognised from its content.
 
@@ -49,6 +53,8 @@ def read_calibration(
         its format defines (Qualisys: mm), else metres unless that cannot be.
     image_size : (width, height) [px], optional
         Size of the images, for files that do not state it.
+    exteriors : bool
+        False: cameras without a pose are taken too, and stand at the origin.
 
     Returns
     -------
@@ -66,17 +72,17 @@ def read_calibration(
     if not path.exists():
         raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
     if path.is_dir():
-        return _read_folder(path, unit, image_size)
+        return _read_folder(path, unit, image_size, exteriors)
     if path.name in ("cameras.txt", "images.txt"):
-        return _read_folder(path.parent, unit, image_size)
+        return _read_folder(path.parent, unit, image_size, exteriors)
     text = _read_text(path)
-    kind = _recognise(text, path)
+    kind = recognise(text, path)
     if kind == "qualisys":
         cameras = qualisys_cameras(ElementTree.fromstring(text), path)
         return _rig(cameras, path, "mm" if unit == "auto" else unit)
     tree = read_table(text, kind, path)
-    tables = [(name, table, path) for name, table in _tables(tree, path.stem, path)]
-    return _rig_of(tables, path, _chosen_unit(tree, unit), image_size)
+    tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
+    return _rig_of(tables, path, _chosen_unit(tree, unit), image_size, exteriors)
 
 
 def read_opencv_stereo(
@@ -141,25 +147,18 @@ def _toml(camera: Camera, path: Path) -> str:
     return f"[{key}]\n" + "".join(f"{entry} = {value}\n" for entry, value in entries.items())
 
 
-def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | None) -> Rig:
+def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | None, exteriors: bool) -> Rig:
     if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
         return _rig(colmap_cameras(folder), folder, unit)
-    files = _calibration_files(folder)
-    if len(files) == 1:
-        return read_calibration(files[0], unit=unit, image_size=image_size)
-    if {"intrinsics", "extrinsics"} <= {file.stem for file in files}:
-        sources = [(folder.name, [file for file in files if file.stem in ("intrinsics", "extrinsics")])]
-    elif files:
-        sources = [(file.stem, [file]) for file in files]
-    else:
-        inner = [(sub.name, _calibration_files(sub)) for sub in sorted(folder.iterdir()) if sub.is_dir()]
-        sources = [(name, group) for name, group in inner if group]
+    sources = calibration_sources(folder)
+    if len(sources) == 1 and len(sources[0][1]) == 1:
+        return read_calibration(sources[0][1][0], unit=unit, image_size=image_size, exteriors=exteriors)
     tables, units = [], set()
     for name, group in sources:
         tree: dict = {}
         for file in group:
             tree |= _tree(file)
-        found = _tables(tree, name, group[0])
+        found = tables_of(tree, name, group[0], exteriors)
         tables += [(camera, table, group[0]) for camera, table in found]
         units |= {_chosen_unit(tree, unit)} if found else set()
     if len(units) > 1:
@@ -168,7 +167,20 @@ def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | 
             file=folder,
             remedy="Pass the unit that all of them have.",
         )
-    return _rig_of(tables, folder, units.pop() if units else unit, image_size)
+    return _rig_of(tables, folder, units.pop() if units else unit, image_size, exteriors)
+
+
+def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
+    """Name and files of each camera, or group of cameras, of a file or folder of tables."""
+    if path.is_file():
+        return [(path.stem, [path])]
+    files = _calibration_files(path)
+    if {"intrinsics", "extrinsics"} <= {file.stem for file in files}:
+        return [(path.name, [file for file in files if file.stem in ("intrinsics", "extrinsics")])]
+    if files:
+        return [(file.stem, [file]) for file in files]
+    inner = [(sub.name, _calibration_files(sub)) for sub in sorted(path.iterdir()) if sub.is_dir()]
+    return [(name, group) for name, group in inner if group]
 
 
 def _calibration_files(folder: Path) -> list[Path]:
@@ -176,15 +188,22 @@ def _calibration_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
 
 
-def _tables(tree: dict, name: str, path: Path) -> list[tuple[str, dict]]:
-    return stereo_tables(tree, path) if "M1" in tree else camera_tables(tree, name)
+def tables_of(tree: dict, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, dict]]:
+    """All tables of a parsed file that hold a camera, with the camera's name."""
+    if "M1" in tree:
+        return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
+    return camera_tables(tree, name)
 
 
 def _rig_of(
-    tables: list[tuple[str, dict, Path]], path: Path, unit: str | float, image_size: tuple[int, int] | None
+    tables: list[tuple[str, dict, Path]],
+    path: Path,
+    unit: str | float,
+    image_size: tuple[int, int] | None,
+    exteriors: bool = True,
 ) -> Rig:
     cameras = [
-        camera_from_table(name, table, file, image_size=image_size, pose_needed=len(tables) > 1)
+        camera_from_table(name, table, file, image_size=image_size, pose_needed=exteriors and len(tables) > 1)
         for name, table, file in tables
     ]
     return _rig(cameras, path, unit)
@@ -192,7 +211,7 @@ def _rig_of(
 
 def _tree(path: Path) -> dict:
     text = _read_text(path)
-    kind = _recognise(text, path)
+    kind = recognise(text, path)
     if kind == "qualisys":
         raise CalibrationError("a Qualisys file", file=path, remedy="Give the path of this file itself.")
     return read_table(text, kind, path)
@@ -205,7 +224,7 @@ def _read_text(path: Path) -> str:
         raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
 
 
-def _recognise(text: str, path: Path) -> str:
+def recognise(text: str, path: Path) -> str:
     """Tell "toml", "json", "yaml", "xml" (OpenCV) or "qualisys" from the content."""
     start = text.lstrip()
     if start.startswith("<"):
@@ -230,6 +249,11 @@ def _recognise(text: str, path: Path) -> str:
 
 def _chosen_unit(tree: dict, unit: str | float) -> str | float:
     return unit if unit != "auto" else (stated_unit(tree) or "auto")
+
+
+def metres_per_unit(tree: dict, unit: str | float, path: Path) -> float:
+    """Metres per unit of length of a parsed file; 1 where nothing tells it."""
+    return _factor(_chosen_unit(tree, unit), path) or 1.0
 
 
 def _factor(unit: str | float, path: Path) -> float | None:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError, choices
-from kinefit.geometry.camera import Camera
-from kinefit.geometry.se3 import rotation_from_quaternion
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import quaternion, rotation_from_quaternion
 from kinefit.readers.calibration_tables import build_camera, rigid
 
 # Parameters of every model, in COLMAP's order.
@@ -53,17 +53,63 @@ def colmap_cameras(folder: Path) -> list[Camera]:
                 + ".",
             )
         entries.append((place, values, intrinsics[parts[8]], PurePosixPath(parts[9])))
-    stems = [image.stem for *_, image in entries]
-    unique = len(set(stems)) == len(stems)
+    names = _names([image for *_, image in entries])
     cameras = []
-    for place, values, (size, K, k, model), image in entries:
-        name = image.stem if unique else str(image.with_suffix(""))
+    for name, (place, values, (size, K, k, model), _) in zip(names, entries):
         quaternion = values[1:5]
         if not np.linalg.norm(quaternion) > 0:
             raise CalibrationError("a zero quaternion", file=path, place=place, remedy="Export the model again.")
         T = rigid(rotation_from_quaternion(quaternion), values[5:8], path, place)
         cameras.append(build_camera(name, size, K, k, model, T, path))
     return cameras
+
+
+def _names(images: list[PurePosixPath]) -> list[str]:
+    """Names of the cameras: of the images without folder and ending, where these differ."""
+    stems = [image.stem for image in images]
+    return stems if len(set(stems)) == len(stems) else [str(image.with_suffix("")) for image in images]
+
+
+def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, str]:
+    """cameras.txt and images.txt of a model with the cameras of a rig, by the names of its images; all else is kept.
+
+    A lens that the camera's model cannot hold gets the smallest model that can.
+    """
+    path = folder / "images.txt"
+    images = [(number, line.split(maxsplit=9)) for number, line in _lines(path)[::2]]
+    texts = {name: (folder / name).read_text(encoding="utf-8").splitlines() for name in ("cameras.txt", "images.txt")}
+    owners: dict[str, Camera] = {}
+    for name, (number, parts) in zip(_names([PurePosixPath(parts[9]) for _, parts in images]), images):
+        if name not in rig:
+            continue
+        camera, owner = rig[name], owners.setdefault(parts[8], rig[name])
+        if not (np.array_equal(camera.matrix, owner.matrix) and np.array_equal(camera.distortion, owner.distortion)):
+            raise CalibrationError(
+                f"images {owner.name} and {name} share camera {parts[8]}, but now differ in their lens", file=path,
+                place=f"line {number}", remedy="Give each its own camera in cameras.txt.",
+            )
+        T = camera.T_camera_world
+        pose = [*quaternion(T[:3, :3]), *(T[:3, 3] / metres_per_unit)]
+        texts["images.txt"][number - 1] = " ".join([parts[0], *(repr(float(v)) for v in pose), *parts[8:]])
+    for number, line in _lines(folder / "cameras.txt"):
+        parts = line.split()
+        if parts and parts[0] in owners:
+            texts["cameras.txt"][number - 1] = _camera_line(parts[0], parts[1], owners[parts[0]])
+    return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
+
+
+def _camera_line(number: str, model: str, camera: Camera) -> str:
+    K, k = camera.matrix, camera.distortion
+    fisheye = camera.model == "fisheye"
+    given = {"f": K[0, 0], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
+    lens = dict(zip(_FISHEYE if fisheye else _RADTAN, k))
+    for name in (model, "OPENCV_FISHEYE") if fisheye else (model, "PINHOLE", "OPENCV", "FULL_OPENCV"):
+        keys = _MODELS[name].split()
+        square = "f" not in keys or given["fx"] == given["fy"]
+        if square and all(key in keys for key, value in lens.items() if value) and ("FISHEYE" in name) == fisheye:
+            break
+    values = [repr(float((given | lens).get(key, 0.0))) for key in keys]
+    return " ".join([number, name, *map(str, camera.size), *values])
 
 
 def _cameras(path: Path) -> dict[str, Intrinsics]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from kinefit.errors import CalibrationError
-from kinefit.geometry.camera import Camera
+from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration_tables import build_camera, rigid
 
 _SUBPIXELS = 64.0  # focal lengths and centres are in 1/64 px; distortion coefficients are not scaled
@@ -73,3 +74,39 @@ def _camera(element: Element, path: Path) -> Camera:
     position = np.array([value("transform", axis) for axis in "xyz"])
     R = _FLIP @ r
     return build_camera(name, size, K, k, "radtan", rigid(R, -R @ position, path, f"camera {name}, transform"), path)
+
+
+def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> str:
+    """The text of a file with the cameras of a rig, by serial; everything else is kept."""
+    head, mark, rest = text.partition("<calibration")
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    root = ElementTree.fromstring(mark + rest, parser)
+    for element in root.iterfind("cameras/camera"):
+        if element.get("active", "1") not in ("0", "false") and element.get("serial", "?") in rig:
+            _replace(element, rig[element.get("serial", "?")], metres_per_unit, path)
+    return head + ElementTree.tostring(root, encoding="us-ascii").decode("ascii") + "\n"
+
+
+def _replace(element: Element, camera: Camera, metres_per_unit: float, path: Path) -> None:
+    if camera.model != "radtan" or camera.distortion[5:].any():
+        raise CalibrationError(
+            "a lens model that Qualisys files lack", file=path, place=f"camera {camera.name}",
+            remedy="Calibrate it with k1, k2, p1, p2, k3 alone, or write another format.",
+        )
+    fov, K = element.find("fov_video"), camera.matrix
+    left, top = (float(fov.get(side, 0)) for side in ("left", "top")) if fov is not None else (0.0, 0.0)
+    r, position = _FLIP @ camera.T_camera_world[:3, :3], camera.centre_world / metres_per_unit
+    intrinsic = {
+        "focalLengthU": K[0, 0] * _SUBPIXELS,
+        "focalLengthV": K[1, 1] * _SUBPIXELS,
+        "centerPointU": (K[0, 2] + left) * _SUBPIXELS,
+        "centerPointV": (K[1, 2] + top) * _SUBPIXELS,
+        "skew": K[0, 1] * _SUBPIXELS,
+    }
+    intrinsic |= dict(zip(_DISTORTION, np.pad(camera.distortion[:5], (0, 5 - camera.distortion[:5].size))))
+    transform = {f"r{i + 1}{j + 1}": r[i, j] for i in range(3) for j in range(3)} | dict(zip("xyz", position))
+    for group, values in (("intrinsic", intrinsic), ("transform", transform)):
+        found = element.find(group)
+        for key, value in values.items():
+            if found is not None and (key in found.keys() or value != 0):
+                found.set(key, repr(float(value)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError, choices
-from kinefit.observations import Keypoints
+from kinefit.observations import MEDIAPIPE_33, Keypoints
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 _FACE_ARMS_LEGS = (
     "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
 )
-_FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
-_PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
 
 KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     "BODY_25B": (
@@ -38,10 +37,7 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
         *_FACE_ARMS_LEGS.split(),
         *"Head Neck Hip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split(),
     ),
-    "MEDIAPIPE_33": (
-        *_FACE.split(), "mouth_left", "mouth_right",
-        *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
-    ),
+    "MEDIAPIPE_33": MEDIAPIPE_33,
 }  # names in each detector's own order
 _NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
 
@@ -232,8 +228,8 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     Parameters
     ----------
     path : path
-    format : "openpose" or "mediapipe", optional
-        Default: a folder is OpenPose's, a .npy file MediaPipe's.
+    format : "openpose", "mediapipe" or "caliscope", optional
+        Default: a folder is OpenPose's, a .npy file MediaPipe's. Of caliscope the port of the camera's last number.
     **options
         Of `read_openpose` or `read_mediapipe`.
 
@@ -242,13 +238,24 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     ObservationError, FileError
         An unknown format; and what those raise.
     """
-    formats = {"openpose": read_openpose, "mediapipe": read_mediapipe}
+    formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
     if format is None:
         format = "openpose" if Path(path).is_dir() else "mediapipe"
     if format not in formats:
         raise ObservationError(choices("keypoint format", format, formats), file=path)
     reader: Any = formats[format]
     return reader(path, **options)
+
+
+def _caliscope_camera(
+    path: Path, *, camera: str, rate: float, time_offset: float = 0.0, image_frame: ImageFrame | None = None
+) -> Keypoints:
+    ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
+    port = ports.get(f"cam_{int(numbers[-1])}" if numbers else "")
+    if port is None:
+        raise ObservationError(choices("camera in this table named", camera, ports), file=path)
+    points = port.points if image_frame is None else image_frame.to_calibration(port.points)
+    return replace(port, camera=camera, points=points, time_offset=time_offset)
 
 
 def _numbered_files(folder: Path) -> list[Path]:

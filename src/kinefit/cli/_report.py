@@ -1,0 +1,101 @@
+"""The report of a track: its pictures from the videos, what was done, report.html."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kinefit.cli._screen import Step
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from kinefit.motion import Motion
+    from kinefit.readers.load import Observations
+    from kinefit.readers.take import Take
+
+_PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
+
+
+def write_track_report(
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
+) -> None:
+    """Write report.html into a folder of results, with links to what lies there already; enter it into `files`."""
+    from kinefit.cli._results import ABOUT
+    from kinefit.exporters.report import write_report
+
+    pictures = take_pictures(motion, take, seen, step)
+    step("report", 0, 1)
+    links = {path.relative_to(folder).as_posix(): ABOUT.get(name, name) for name, path in files.items()}
+    files["report"] = write_report(motion, folder / "report.html", rig=seen.rig, pictures=pictures, files=links)
+    step("report", 1, 1)
+
+
+def take_pictures(
+    motion: Motion, take: Take, seen: Observations, step: Step
+) -> dict[str, dict[int, NDArray[np.uint8]]]:
+    """{camera: {frame: picture of the person with the fit drawn on it}} of the frames that a report shows.
+
+    Frames that a video does not reach are left out.
+    """
+    from kinefit.cli._results import _residuals
+    from kinefit.exporters._report_pictures import close_up, report_frames
+    from kinefit.readers.video import Video
+
+    out: dict[str, dict[int, NDArray[np.uint8]]] = {}
+    if seen.rig is None:
+        return out
+    frames = sorted(report_frames(motion))
+    for number, (name, path) in enumerate(seen.videos.items()):
+        step("pictures", number, len(seen.videos))
+        offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+        with Video(path) as video:
+            for frame in frames:
+                shown = round((motion.times[frame] - offset) * video.rate)
+                if 0 <= shown < len(video):
+                    picture = close_up(video.read(shown), motion, frame, seen.rig[name], **given)
+                    out.setdefault(name, {})[frame] = picture
+    step("pictures", len(seen.videos), len(seen.videos))
+    return out
+
+
+def provenance(take: Take, **more: Any) -> dict[str, Any]:
+    """What a track of a take was made from, as `Motion.provenance` holds it: files, accuracies, versions.
+
+    `more` is what else is to be told, such as smoothing={...} or tracking={...}.
+    """
+    out: dict[str, Any] = {
+        "kinefit": metadata.version("kinefit"),
+        "python": platform.python_version(),
+        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "take": take.path.name,
+    }
+    if take.calibration is not None:
+        out["calibration"] = {"file": take.calibration.file.name, "unit": take.calibration.unit}
+        if take.calibration.file.is_file():
+            out["calibration"]["sha256"] = hashlib.sha256(take.calibration.file.read_bytes()).hexdigest()
+    out["cameras"] = [
+        {"name": c.name, "video": c.video.name if c.video else None, "image": c.image, "rotation": c.rotation,
+         "time_offset": c.time_offset}
+        for c in take.cameras
+    ]  # fmt: skip
+    out["keypoints"] = [
+        {"camera": k.camera, "file": k.file.name if k.file else None, "format": k.format, "set": k.set,
+         "accuracy": k.accuracy}
+        for k in take.keypoints
+    ]  # fmt: skip
+    if take.height:
+        out["height"] = take.height
+    return out | more
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,318 @@
+"""One self-contained HTML page: every picture, plot and script lies in the file, nothing is ever fetched.
+
+A page is made of parts of type `Html`; plain text is escaped wherever it is given. A rule in the head of the page (its
+content security policy) forbids the browser to load anything from elsewhere. Plots are drawn by plotly.js, which is put
+in once, compressed, and only where there is a plot.
+
+    text = page("Balancing", [
+        section("Quality", paragraph("All frames were tracked."), plot([{"x": times, "y": quality}])),
+    ])
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from html import escape
+from itertools import chain
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote as urlquote
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+
+# Okabe and Ito's colours, which common kinds of colour blindness tell apart; left blue, right orange as in overlays.
+LEFT, RIGHT, CENTRE = "#0072b2", "#d55e00", "#009e73"
+SERIES = (LEFT, RIGHT, CENTRE, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
+SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
+
+_POLICY = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'unsafe-eval'; font-src data:; base-uri 'none'; form-action 'none'"
+)
+
+
+class Html(str):
+    """Text that is HTML already and not escaped again."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page with a heading, named in the contents; `anchor` is what links point to."""
+
+    title: str
+    anchor: str
+    html: Html
+
+
+def page(title: str, sections: Iterable[Section | str], *, subtitle: str = "", contents: bool = True) -> str:
+    """The text of a whole page.
+
+    Parameters
+    ----------
+    title, subtitle : str
+        Heads the page.
+    sections : Section, Html, or text
+        In this order; the sections are listed in the contents.
+    contents : bool
+        Whether there is a list of links to the sections.
+    """
+    parts = list(sections)
+    links = [f'<a href="#{p.anchor}">{escape(p.title)}</a>' for p in parts if isinstance(p, Section)]
+    body = "\n".join(_section_html(p) if isinstance(p, Section) else inline(p) for p in parts)
+    scripts = [f"<script>{_resource('page.js')}</script>"]
+    if 'class="player"' in body:
+        scripts.append(f"<script>{_resource('player.js')}</script>")
+    if 'class="plot"' in body:
+        scripts.insert(0, f'<script type="text/plain" id="plotly-gzip">{_plotly()}</script>')
+    return "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{escape(title)}</title>\n<style>{_resource('page.css')}</style>\n</head>\n<body>",
+            f"<header><h1>{escape(title)}</h1>" + (f'<p class="sub">{inline(subtitle)}</p>' if subtitle else ""),
+            (f"<nav>{''.join(links)}</nav>" if contents and links else "") + "</header>\n<main>",
+            "<noscript><p>The plots and the moving figure of this page need JavaScript.</p></noscript>",
+            f"{body}\n</main>",
+            *scripts,
+            "</body>\n</html>\n",
+        ]
+    )
+
+
+def inline(content: str) -> Html:
+    """The content as HTML: `Html` as it is, other text escaped."""
+    return content if isinstance(content, Html) else Html(escape(str(content)))
+
+
+def joined(*parts: str) -> Html:
+    """Parts one after the other."""
+    return Html("".join(inline(part) for part in parts))
+
+
+def section(title: str, *parts: str, anchor: str | None = None) -> Section:
+    """A section of the page; plain text becomes a paragraph each."""
+    return Section(title, anchor or slug(title), joined(*(_block(part) for part in parts)))
+
+
+def slug(text: str) -> str:
+    """Name for an anchor: small letters, digits and dashes."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-") or "part"
+
+
+def heading(text: str, level: int = 3) -> Html:
+    """A heading within a section."""
+    return Html(f'<h{level} id="{slug(text)}">{inline(text)}</h{level}>')
+
+
+def paragraph(*texts: str, small: bool = False) -> Html:
+    """A paragraph of text and inline parts."""
+    return Html(f"<p{' class=small' if small else ''}>{joined(*texts)}</p>")
+
+
+def strong(text: str) -> Html:
+    """Text that stands out."""
+    return Html(f"<strong>{inline(text)}</strong>")
+
+
+def link(anchor: str, text: str) -> Html:
+    """Link to a place in this page."""
+    return Html(f'<a href="#{escape(anchor)}">{inline(text)}</a>')
+
+
+def moment(seconds: float, text: str) -> Html:
+    """Link that moves the page's 3D figure to a time [s]."""
+    return Html(f'<a class="seek" href="#figure" data-time="{float(seconds):.6g}">{inline(text)}</a>')
+
+
+def bullets(items: Iterable[str]) -> Html:
+    """A list of points."""
+    return Html("<ul>" + "".join(f"<li>{inline(item)}</li>" for item in items) + "</ul>")
+
+
+def callout(severity: str, title: str, *parts: str) -> Html:
+    """A box that stands out; severity "good", "note", "warning" or "bad" (told by sign and colour)."""
+    sign = SEVERITIES[severity]
+    body = "".join(_block(part) for part in parts)
+    return Html(
+        f'<div class="callout {severity}"><div class="sign" aria-hidden="true">{sign}</div>'
+        f'<div><p class="head">{inline(title)}</p>{body}</div></div>'
+    )
+
+
+def folded(title: str, *parts: str, opened: bool = False) -> Html:
+    """Parts that unfold at a click."""
+    body = "".join(_block(part) for part in parts)
+    return Html(f"<details{' open' if opened else ''}><summary>{inline(title)}</summary>{body}</details>")
+
+
+def chooser(label: str, choices: Mapping[str, str]) -> Html:
+    """A menu of parts {name: part} of which one is shown; all are printed."""
+    options = "".join(f"<option>{escape(name)}</option>" for name in choices)
+    parts = "".join(
+        f'<div class="choice"{"" if first else " hidden"}><p class="name">{escape(name)}</p>{_block(part)}</div>'
+        for first, (name, part) in zip(chain([True], iter(lambda: False, True)), choices.items())
+    )
+    return Html(f'<div class="chooser"><label>{inline(label)} <select>{options}</select></label>{parts}</div>')
+
+
+def facts(pairs: Mapping[str, str]) -> Html:
+    """Names with their values, in a compact grid."""
+    items = "".join(f"<div><dt>{inline(k)}</dt><dd>{inline(v)}</dd></div>" for k, v in pairs.items())
+    return Html(f'<dl class="facts">{items}</dl>')
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str = "", first_left: int = 1) -> Html:
+    """A table; the first `first_left` columns are set left, the others right as numbers are.
+
+    A cell may be text, `Html`, or what `shaded` gives.
+    """
+
+    def cell(tag: str, at: int, content: str) -> str:
+        if content.startswith("<td") and isinstance(content, Html):
+            return content
+        return f"<{tag}{' class=l' if at < first_left else ''}>{inline(content)}</{tag}>"
+
+    head = "".join(cell("th", i, name) for i, name in enumerate(columns))
+    body = "".join("<tr>" + "".join(cell("td", i, c) for i, c in enumerate(row)) + "</tr>" for row in rows)
+    told = f"<caption>{inline(caption)}</caption>" if caption else ""
+    return Html(f'<div class="wide"><table>{told}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+
+
+def shaded(text: str, share: float) -> Html:
+    """Cell of a table whose ground is the darker the nearer `share` is to 1; none where it is not finite."""
+    if not math.isfinite(share):
+        return Html(f"<td>{inline(text)}</td>")
+    share = min(max(share, 0.0), 1.0)  # white to the right side's orange; text stays dark on all of them
+    red, green, blue = (round(255 + (end - 255) * 0.75 * share) for end in (213, 94, 0))
+    return Html(f'<td style="background:rgb({red},{green},{blue})">{inline(text)}</td>')
+
+
+def quote(text: str) -> Html:
+    """A text to take over as it stands."""
+    return Html(f"<blockquote>{inline(text)}</blockquote>")
+
+
+def file_link(path: str, text: str | None = None) -> Html:
+    """Link to a file that lies beside the page, by its relative path."""
+    return Html(f'<a href="{escape(urlquote(path))}">{inline(path if text is None else text)}</a>')
+
+
+def code(text: str) -> Html:
+    """Text set as it is, line by line."""
+    return Html(f"<pre>{escape(text)}</pre>")
+
+
+def picture(
+    image: NDArray[np.uint8], *, caption: str = "", width: int = 900, quality: int = 80, lossless: bool = False
+) -> Html:
+    """A picture (H, W, 3) uint8 RGB with its caption, put in as JPEG (or PNG) at most `width` px wide and high.
+
+    Raises
+    ------
+    ExportError
+        Where the array is no picture.
+    """
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] != 3 or array.dtype != np.uint8 or 0 in array.shape:
+        raise ExportError(f"a picture of shape {array.shape}, {array.dtype}", remedy="Give (H, W, 3) uint8 RGB.")
+    shrink = min(1.0, width / max(array.shape[:2]))
+    size = (max(1, round(array.shape[1] * shrink)), max(1, round(array.shape[0] * shrink)))
+    if shrink < 1:
+        array = cv2.resize(array, size, interpolation=cv2.INTER_AREA)
+    kind, options = ("png", []) if lossless else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    encoded, data = cv2.imencode(f".{kind}", cv2.cvtColor(array, cv2.COLOR_RGB2BGR), options)
+    if not encoded:
+        raise ExportError("a picture cannot be encoded", remedy="Give (H, W, 3) uint8 RGB.")
+    text = base64.b64encode(data.tobytes()).decode("ascii")
+    told = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
+    return Html(
+        f'<figure><img alt="{escape(re.sub("<[^>]*>", "", caption))}" width="{size[0]}" height="{size[1]}" '
+        f'src="data:image/{kind};base64,{text}">{told}</figure>'
+    )
+
+
+def gallery(pictures: Iterable[Html], *, smallest: int = 220) -> Html:
+    """Pictures side by side, none narrower than `smallest` px."""
+    return Html(f'<div class="gallery" style="--least:{smallest}px">{"".join(pictures)}</div>')
+
+
+def plot(
+    traces: Any, layout: Mapping[str, Any] | None = None, *, height: int = 320, label: str = "", seeks: bool = False
+) -> Html:
+    """A plot by plotly.js.
+
+    Parameters
+    ----------
+    traces : list of dicts, or a plotly Figure
+        As plotly.js takes them; arrays may hold NaN, which become gaps.
+    layout : dict, optional
+        What differs from the page's own layout.
+    height : int [px]
+    label : str
+        What the plot shows, for readers who do not see it.
+    seeks : bool
+        Whether x is the time [s], so that a click moves the page's 3D figure there.
+    """
+    if hasattr(traces, "to_plotly_json"):
+        given = traces.to_plotly_json()
+        traces = given["data"]
+        layout = {k: v for k, v in given["layout"].items() if k != "template"} | dict(layout or {})
+    data = to_json({"data": list(traces), "layout": {**dict(layout or {}), "height": height}})
+    marks = " data-seeks" if seeks else ""
+    return Html(
+        f'<div class="plot" role="img" aria-label="{escape(label)}" style="height:{height}px"{marks}>'
+        f'<script type="application/json">{data}</script></div>'
+    )
+
+
+def to_json(value: Any) -> str:
+    """JSON to stand in a script: floats to six digits, what is not finite as null, no "</" that would end it."""
+    text = json.dumps(_plain(value), separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def _block(part: str) -> Html:
+    return part if isinstance(part, Html) else paragraph(part)
+
+
+def _section_html(part: Section) -> Html:
+    return Html(f'<section id="{escape(part.anchor)}"><h2>{escape(part.title)}</h2>{part.html}</section>')
+
+
+@lru_cache(maxsize=8)
+def _resource(name: str) -> str:
+    return Path(__file__).with_name(name).read_text("utf-8")
+
+
+@lru_cache(maxsize=1)
+def _plotly() -> str:
+    """plotly.js compressed, 2 MB where it has 5; the page unpacks it."""
+    from plotly.offline import get_plotlyjs
+
+    return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), 9, mtime=0)).decode("ascii")

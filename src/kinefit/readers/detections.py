@@ -1,0 +1,92 @@
+"""The file of the built-in detector, `*.npz`, version 1: people of one video, their landmarks and masks.
+
+A compressed archive of numpy arrays (`numpy.load(path, allow_pickle=False)` reads it); F frames, P people, pixels of
+the video's picture, the centre of the first pixel is (0, 0):
+
+    format ()                  text "kinefit detections"
+    version ()                 1
+    key ()                     text that tells the video, the networks and the settings: another key, another result
+    camera ()                  text
+    rate ()                    [Hz]
+    size (2,)                  width, height [px]
+    points (F, P, 33, 2)       float32 [px], landmarks of MEDIAPIPE_33; NaN where a person is not seen
+    confidence (F, P, 33)      float32, 0..1; 0 where a person is not seen
+    mask_runs (N,)             uint32, run lengths down the columns, beginning outside of the person (COCO's code)
+    mask_starts (F * P + 1,)   where each mask begins in mask_runs, by frame, then person; the same twice: no mask
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, KinefitError
+from kinefit.observations import Detections
+
+FORMAT, VERSION = "kinefit detections", 1
+_REMEDY = "Make it anew: kinefit detect --force."
+_DAMAGE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
+
+
+def detections_file(take: str | PathLike[str], camera: str) -> Path:
+    """Where `kinefit detect` leaves what it saw in a camera of a take: TAKE-detect/CAMERA.npz beside the take file."""
+    take = Path(take)
+    safe = "".join(c if c.isalnum() or c in " ._-" else "_" for c in camera)
+    return take.with_name(f"{take.stem}-detect") / f"{safe}.npz"
+
+
+def read_detections(path: str | PathLike[str]) -> Detections:
+    """Read what the built-in detector saw in one video.
+
+    Raises
+    ------
+    FileError
+        No such file, not one of the detector's, damaged, or of a later version.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileError("no such file of detections", file=file, remedy="Run: kinefit detect TAKE.")
+    try:
+        arrays = _load(file)
+    except _DAMAGE as error:
+        problem = f"not a file of the built-in detector, or damaged ({error})"
+        raise FileError(problem, file=file, remedy=_REMEDY) from error
+    try:
+        width, height = (int(n) for n in arrays["size"])
+        found = Detections(
+            str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
+            arrays["mask_runs"], arrays["mask_starts"], str(file),
+        )
+    except (KinefitError, KeyError, ValueError, TypeError, IndexError) as error:
+        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=_REMEDY) from error
+    if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
+        raise FileError("numbers that cannot be", file=file, remedy=_REMEDY)
+    return found
+
+
+def detections_key(path: str | PathLike[str]) -> str | None:
+    """What a file of detections was made from and how; None where there is no such file, or it is damaged."""
+    try:
+        return str(_load(Path(path), "key")["key"])
+    except (FileError, *_DAMAGE):
+        return None
+
+
+def _load(file: Path, *names: str) -> dict[str, NDArray]:
+    """Arrays of these names, default all, of a file that is whole and of the right kind."""
+    if not zipfile.is_zipfile(file):
+        raise ValueError("no whole archive of arrays")
+    with np.load(file, allow_pickle=False) as archive:
+        if str(archive["format"]) != FORMAT:
+            raise ValueError("another format")
+        if int(archive["version"]) != VERSION:
+            raise FileError(
+                f"detections of version {int(archive['version'])}; this kinefit reads version {VERSION}", file=file,
+                remedy="Use the kinefit that wrote it, or a newer one; or make it anew: kinefit detect --force.",
+            )
+        return {name: archive[name] for name in names or archive.files}

@@ -1,0 +1,186 @@
+"""Which file belongs to which camera, told by names, numbers, sizes of pictures, and by order as the last resort."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+# Words after which a number tells a camera: "Camera 1", "port_0", "GoPro3", "c2". Longer words first.
+_CAMERA_WORD = r"(?:camera|cam|kamera|port|view|gopro|kinect|miqus|webcam|device|dev|c|v|k)"
+_NUMBERED = re.compile(rf"(?<![a-z]){_CAMERA_WORD}[\s_.#-]*(\d+)", re.IGNORECASE)
+
+HOW = {
+    "name": ("sure", "by its name"),
+    "number": ("likely", "by the number in its name"),
+    "shifted": ("guess", "by the number in its name, which counts from another start"),
+    "size": ("likely", "by the size of its picture"),
+    "order": ("guess", "by order only: nothing in the names tells it"),
+}
+"""How sure each way of matching is, and how it is told."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Files of one kind that were recorded together, one for each camera.
+
+    Parameters
+    ----------
+    files : {camera: Path}
+        In the order of the calibration.
+    how : str
+        The least sure way, of `HOW`, by which a file found its camera.
+    place : str
+        Path within the folder, "*" where the cameras stood: "walk/videos/*".
+    """
+
+    files: Mapping[str, Path]
+    how: str
+    place: str
+
+
+def common_words(place: str, other: str) -> int:
+    """Number of words that two places share: what was recorded together mostly has some."""
+    words = [set(re.findall(r"[a-z0-9]+", text.lower())) for text in (place, other)]
+    return len(words[0] & words[1])
+
+
+def natural(text: str) -> list[tuple[int, int, str]]:
+    """Sorting key by which "cam2" stands before "cam10"."""
+    parts = re.findall(r"\d+|\D+", text.lower())
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+
+
+def trials(
+    paths: Sequence[Path], folder: Path, names: Sequence[str], sizes: Mapping[Path, object] | None = None,
+    wanted: Mapping[str, object] | None = None,
+) -> tuple[list[Trial], list[Path]]:
+    """Sort files into recordings, and within each to cameras.
+
+    Parameters
+    ----------
+    paths : files or folders, each of one camera
+    folder : above all of them
+    names : of the calibration's cameras
+    sizes : {path: size of its picture}, optional
+    wanted : {camera: size of the calibration's picture}, optional
+
+    Returns
+    -------
+    trials : the one with most cameras first; files that fit no camera.
+    """
+    groups: dict[str, dict[str, Path]] = defaultdict(dict)
+    ways: dict[str, str] = {}
+    left: list[Path] = []
+    for path in sorted(paths, key=lambda p: natural(str(p))):
+        found = _camera_of(path, folder, names)
+        if found is None or found[0] in groups[found[2]]:
+            left.append(path)
+            continue
+        camera, how, place = found
+        groups[place][camera] = path
+        ways[place] = max(how, ways.get(place, how), key=list(HOW).index)
+    groups = _joined({place: files for place, files in groups.items() if files}, ways)
+    out = [Trial(_ordered(files, names), ways[place], place) for place, files in groups.items()]
+    if not any(len(trial.files) > 1 for trial in out):
+        whole, rest = _unnamed(list(paths), folder, names, sizes or {}, wanted or {})
+        if whole:
+            out, left = whole, rest
+    return sorted(out, key=lambda t: (-len(t.files), natural(t.place))), left
+
+
+def _camera_of(path: Path, folder: Path, names: Sequence[str]) -> tuple[str, str, str] | None:
+    """Camera, way and place of one file: from its own name, else from the folders above it."""
+    parts = list(path.relative_to(folder).parts)
+    parts[-1] = PurePath(parts[-1]).stem if path.is_file() else parts[-1]
+    for find, how in ((_by_name, "name"), (_by_number, "number")):
+        for level in range(len(parts) - 1, -1, -1):
+            found = find(parts[level], names)
+            if found:
+                camera, (start, stop) = found
+                star = f"{parts[level][:start]}*{parts[level][stop:]}"
+                return camera, how, "/".join([*parts[:level], star, *parts[level + 1 :]])
+    return None
+
+
+def _by_name(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | None:
+    """The longest camera's name that stands in a text as a word of its own, or after "cam": "vid1-camA" for "A"."""
+    for name in sorted(names, key=len, reverse=True):
+        word = rf"{_CAMERA_WORD}[\s_-]*"
+        short = len(name) < (3 if name.isdigit() else 2) and name.lower() != text.lower()
+        word = word if short else f"(?:{word})?"  # a short one alone may be of a date, or an article
+        match = re.search(rf"(?<![A-Za-z0-9]){word}{re.escape(name)}(?![A-Za-z0-9])", text, re.IGNORECASE)
+        if match:
+            return name, match.span()
+    return None
+
+
+def camera_number(name: str) -> int | None:
+    """The last number in a camera's name."""
+    found = re.findall(r"\d+", name)
+    return int(found[-1]) if found else None
+
+
+def _by_number(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | None:
+    numbers = {camera_number(name): name for name in names}
+    if None in numbers or len(numbers) < len(names):
+        return None
+    for match in _NUMBERED.finditer(text):
+        if int(match[1]) in numbers:
+            return numbers[int(match[1])], match.span()
+    return None
+
+
+def _joined(groups: dict[str, dict[str, Path]], ways: dict[str, str]) -> dict[str, dict[str, Path]]:
+    """Join places that differ only in the file's own name, where no camera would be there twice."""
+    above: dict[str, list[str]] = defaultdict(list)
+    for place in groups:
+        above[place.rpartition("/")[0]].append(place)
+    out: dict[str, dict[str, Path]] = {}
+    for parent, places in above.items():
+        cameras = [camera for place in places for camera in groups[place]]
+        if len(places) == 1 or len(set(cameras)) < len(cameras):
+            out |= {place: groups[place] for place in places}  # several recordings
+            continue
+        key = parent if "*" in parent else f"{parent}/*".lstrip("/")
+        out[key] = {camera: path for place in places for camera, path in groups[place].items()}
+        ways[key] = max((ways[place] for place in places), key=list(HOW).index)
+    return out
+
+
+def _unnamed(
+    paths: list[Path], folder: Path, names: Sequence[str], sizes: Mapping[Path, object], wanted: Mapping[str, object]
+) -> tuple[list[Trial], list[Path]]:
+    """Files whose names tell no camera: by numbers that count from another start, by size, by order."""
+    by_folder: dict[Path, list[Path]] = defaultdict(list)
+    for path in sorted(paths, key=lambda p: natural(str(p))):
+        by_folder[path.parent].append(path)
+    whole, rest = [], []
+    for parent, group in by_folder.items():
+        place = "/".join([*parent.relative_to(folder).parts, "*"])
+        if len(group) != len(names):
+            rest += group
+            continue
+        if len(set(wanted.values())) == len(names) == len({sizes.get(p) for p in group} & set(wanted.values())):
+            files = {camera: next(p for p in group if sizes.get(p) == size) for camera, size in wanted.items()}
+            whole.append(Trial(_ordered(files, names), "size", place))
+            continue
+        shifted = _shifted([camera_number(path.stem) for path in group], [camera_number(name) for name in names])
+        if shifted:
+            group = sorted(group, key=lambda path: camera_number(path.stem) or 0)
+        cameras = sorted(names, key=(lambda name: camera_number(name) or 0) if shifted else natural)
+        files = dict(zip(cameras, group))
+        whole.append(Trial(_ordered(files, names), "shifted" if shifted else "order", place))
+    return whole, rest
+
+
+def _shifted(found: Sequence[int | None], there: Sequence[int | None]) -> bool:
+    """Whether two lists of numbers are the same but for where they begin to count."""
+    a, b = sorted(n for n in found if n is not None), sorted(n for n in there if n is not None)
+    return len(a) == len(found) and len(b) == len(there) and len({m - n for m, n in zip(a, b)}) == 1
+
+
+def _ordered(files: Mapping[str, Path], names: Sequence[str]) -> dict[str, Path]:
+    return {name: files[name] for name in names if name in files}

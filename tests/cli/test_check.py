@@ -1,0 +1,157 @@
+"""`kinefit check`, whole: the page, the refined calibration beside the old one, bad takes."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit.cli.check import check, free_name, with_calibration
+from kinefit.errors import KinefitError
+from kinefit.readers.calibration import read_calibration
+from kinefit.readers.take import read_take
+
+
+def run(*args):
+    return CliRunner().invoke(check, [str(arg) for arg in args])
+
+
+def swap(path, old, new, count=0):
+    assert re.search(old, path.read_text(), re.M)
+    path.write_text(re.sub(old, new, path.read_text(), count=count, flags=re.M))
+
+
+def late(take, camera, frames):
+    path = take.with_name(f"mediapipe_{camera}.npy")
+    array = np.load(path)
+    np.save(path, np.concatenate([array[frames:], np.repeat(array[-1:], frames, axis=0)]))
+
+
+def exchange(take, a, b):
+    one, other = (take.with_name(f"mediapipe_{name}.npy") for name in (a, b))
+    first, second = np.load(one), np.load(other)
+    np.save(one, second)
+    np.save(other, first)
+
+
+def test_a_good_take_has_no_fault_and_gets_a_page(take):
+    told = run(take, "--strict")
+    assert told.exit_code == 0, told.output
+    assert "No fault and no doubt." in told.stdout
+    page = take.with_name("take-check.html").read_text("utf-8")
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", page)
+    assert page.count("data:image/jpeg;base64,") == 8  # of each camera the points and the map
+    assert all(name in page for name in ("cam01", "cam02", "cam03", "cam04"))
+    assert not re.search(r">[^<]*\bnan\b", re.sub(r"<script.*?</script>", "", page, flags=re.S), re.I)
+
+
+def cut_calibration(take):
+    path = take.with_name("calibration.toml")
+    path.write_text(re.sub(r"(?ms)^\[cam03\].*?(?=^\[)", "", path.read_text()))
+
+
+def without_video(take):
+    path = take.with_name("cam02.mp4")
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+BAD = {
+    "exchanged": (lambda t: exchange(t, "cam01", "cam03"), "cam01 and cam03 are exchanged", "rename cam01 to cam03"),
+    "five frames": (lambda t: late(t, "cam02", 5), r"cam02 runs (4\.9|5\.0)\d .* later", "time_offset = 0.1"),
+    "upside down": (lambda t: swap(t, 'up = "z"', 'up = "-z"'), "the floor would be the ceiling", 'up = "z"'),
+    "size": (
+        lambda t: swap(t.with_name("calibration.toml"), "^size = .*", "size = [1088.0, 1920.0]", count=1),
+        "cam01 has another picture", 'image = "scaled"',
+    ),
+    "lengths": (
+        lambda t: np.save(t.with_name("mediapipe_cam02.npy"), np.load(t.with_name("mediapipe_cam02.npy"))[:-7]),
+        "streams of different length", "frames = [0, 53]",
+    ),
+    "not calibrated": (cut_calibration, "cam03 is not in the calibration", "Correct its name"),
+    "broken video": (without_video, "cam02.mp4", "re-encode"),
+    "nobody": (
+        lambda t: np.save(t.with_name("mediapipe_cam02.npy"), np.zeros_like(np.load(t.with_name("mediapipe_cam02.npy")))),
+        "nobody is seen", "detector",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_take_is_told_in_words_and_the_rest_is_checked(case, take):
+    damage, words, remedy = BAD[case]
+    damage(take)
+    told = run(take)
+    assert told.exit_code == 0, told.output
+    assert re.search(f"fault: .*{words}", told.stdout)
+    assert remedy in told.stdout
+    assert take.with_name("take-check.html").exists()
+    assert run(take, "--strict").exit_code == 2
+
+
+def test_a_calibration_that_cannot_be_read_is_a_finding(take):
+    take.with_name("calibration.toml").write_text("nothing")
+    told = run(take)
+    assert told.exit_code == 0
+    assert "fault: " in told.stdout
+    assert "not a calibration" in told.stdout
+
+
+def test_no_take_is_an_error_and_writes_nothing(tmp_path):
+    told = run(tmp_path / "none.toml")
+    assert isinstance(told.exception, KinefitError)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_belongs_to_refining_is_refused_without_it(take):
+    told = run(take, "--focal")
+    assert told.exit_code == 2
+    assert "--refine" in told.output
+
+
+def test_refining_is_refused_before_gross_faults_are_mended(take):
+    exchange(take, "cam01", "cam03")
+    told = run(take, "--refine")
+    assert isinstance(told.exception, KinefitError)
+    assert "before the faults are mended" in str(told.exception)
+    assert take.with_name("take-check.html").exists()
+    assert not take.with_name("calibration_refined.toml").exists()
+
+
+@pytest.mark.slow
+def test_a_turned_camera_is_refined_beside_the_old_calibration(take):
+    path = take.with_name("calibration.toml")
+    text = path.read_text()
+    pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
+    path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.01}", text, count=1))
+    before = path.read_bytes()
+    told = run(take, "--refine", "--take")
+    assert told.exit_code == 0, told.output
+    assert path.read_bytes() == before
+    assert 'write file = "calibration_refined.toml"' in told.stdout
+    old, new = read_calibration(path), read_calibration(take.with_name("calibration_refined.toml"))
+    assert new.names == old.names
+    copy = take.with_name("take_refined.toml")
+    assert read_take(copy).calibration.file.name == "calibration_refined.toml"
+    assert "No fault and no doubt." in run(copy).stdout
+
+
+def test_a_refined_calibration_never_takes_a_name_that_is_there(tmp_path):
+    old = tmp_path / "Calib.qca.txt"
+    for name in ("Calib.qca.txt", "Calib_refined.qca.txt"):
+        (tmp_path / name).touch()
+    assert free_name(old).name == "Calib_refined2.qca.txt"
+    assert free_name(tmp_path).name == f"{tmp_path.name}_refined"
+
+
+def test_a_copy_of_the_take_differs_in_what_was_refined_only(take):
+    text = take.read_text()
+    new = with_calibration(text, "calibration_refined.toml", {"cam02": 0.0125})
+    shutil.copy(take.with_name("calibration.toml"), take.with_name("calibration_refined.toml"))
+    take.write_text(new)
+    read = read_take(take)
+    assert read.calibration.file.name == "calibration_refined.toml"
+    assert [camera.time_offset for camera in read.cameras] == [0.0, 0.0125, 0.0, 0.0]
+    again = with_calibration(new, "calibration.toml", {"cam02": 0.02})
+    assert again.count("time_offset") == 1
+    assert text.splitlines()[0] == new.splitlines()[0]

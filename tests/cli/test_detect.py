@@ -1,0 +1,254 @@
+"""`kinefit detect`: what it leaves, what it does not do twice, and what it says when it cannot."""
+
+import shutil
+import threading
+
+import av
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit.cli import _detecting
+from kinefit.cli.detect import detect
+from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
+from kinefit.images.person_detector import Person
+from kinefit.images.pose_model import SIZE, Pose
+from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.load import load_observations
+from kinefit.readers.take import read_take
+
+CAMERAS = ("cam01", "cam02", "cam03", "cam04")
+
+
+class Networks:
+    """See one person in the middle of every picture that is not quite black; count the pictures."""
+
+    pictures = 0
+    lock = threading.Lock()
+
+    def __init__(self, folder):
+        pass
+
+    def find_people(self, image):
+        height, width = image.shape[:2]
+        middle = np.array([width / 2, height / 2])
+        painted = (image == 128).all(axis=2).any()
+        return [] if painted or not image.any() else [Person(np.array([middle, middle - (0, height / 4)]), 0.9)]
+
+    def search(self, image):
+        return []
+
+    def pose(self, crop):
+        with self.lock:
+            Networks.pictures += 1
+        mask = np.zeros((SIZE, SIZE), np.float32)
+        mask[64:192, 64:192] = 1
+        middle = np.array([128.0, 128.0])
+        return Pose(np.full((33, 2), 128.0), np.ones(33), np.ones(33), middle, middle - (0, 102.4), 1.0, mask)
+
+
+def write_video(path, frames):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 544, 960, "yuv420p"
+        for _ in range(frames):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((960, 544, 3), 250, np.uint8), "rgb24")))
+        container.mux(stream.encode())
+
+
+@pytest.fixture(scope="module")
+def white_video(tmp_path_factory):
+    path = tmp_path_factory.mktemp("white") / "white.mp4"
+    write_video(path, 12)
+    return path
+
+
+@pytest.fixture
+def take(take, white_video):
+    """The drawn take with short white videos in place of its own."""
+    for camera in CAMERAS:
+        shutil.copy(white_video, take.with_name(f"{camera}.mp4"))
+    return take
+
+
+@pytest.fixture(autouse=True)
+def networks(monkeypatch, tmp_path):
+    monkeypatch.setattr("kinefit.images.models.Models", Networks)
+    monkeypatch.setattr(_detecting, "_networks", lambda progress: tmp_path)
+    monkeypatch.setattr(Networks, "pictures", 0)
+    return Networks
+
+
+def run(*args):
+    """The command as it stands; an error of kinefit's becomes exit code 2 and a message, as the group makes it."""
+    told = CliRunner().invoke(detect, [str(arg) for arg in args])
+    if told.exception and not isinstance(told.exception, SystemExit | KinefitError):
+        raise told.exception
+    return told
+
+
+def test_every_video_of_a_take_is_looked_through_once(take, networks):
+    told = run(take)
+    assert told.exit_code == 0, told.output
+    assert {path.name for path in (take.parent / "take-detect").iterdir()} == {f"{c}.npz" for c in CAMERAS}
+    assert "cam03: 12 pictures, person 1 in 12\n" in told.stdout
+    found = read_detections(detections_file(take, "cam03"))
+    assert len(found) == 12 and found.rate == 30 and found.size == (544, 960) and found.mask(5, 0).any()
+    done = networks.pictures
+    again = run(take)
+    assert again.exit_code == 0 and networks.pictures == done
+    assert again.stdout.count("(already there)") == 4
+    assert run(take, "--force").exit_code == 0 and networks.pictures == 2 * done
+
+
+def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
+    run(take)
+    write_video(take.with_name("cam02.mp4"), 9)
+    told = run(take)
+    assert told.stdout.count("(already there)") == 3
+    assert "cam02: 9 pictures, person 1 in 9\n" in told.stdout
+    assert run(take, "--people", 1).stdout.count("(already there)") == 0
+    assert run(take, "--people", 1, "--no-masks").stdout.count("(already there)") == 0
+    assert read_detections(detections_file(take, "cam02")).mask(0, 0) is None
+    before = networks.pictures
+    assert set(_detecting.ensure_detections(read_take(take))) == set(CAMERAS)
+    assert networks.pictures == before, "whoever does not care about the settings takes what is there"
+
+
+def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
+    monkeypatch.setattr(_detecting, "_cores", lambda: 1)
+
+    def stop(camera, done, total):
+        if camera == "cam02" and done == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _detecting.ensure_detections(read_take(take), progress=stop)
+    assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
+    told = run(take)
+    assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
+
+
+def test_one_damaged_video_stops_all_and_leaves_whole_files_only(take):
+    path = take.with_name("cam02.mp4")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 7 // 10])
+    with pytest.raises(FileError, match=r"cam02\.mp4"):
+        _detecting.ensure_detections(read_take(take))
+    folder = take.parent / "take-detect"
+    assert all(read_detections(file).seen.all() for file in (folder.iterdir() if folder.exists() else ()))
+
+
+def see_nobody_in(monkeypatch, *videos):
+    """Let the pictures of some videos be black."""
+    from kinefit.readers.video import Video
+
+    frames = Video.frames
+
+    def black(self, *args):
+        return (image * (self.path.name not in videos) for image in frames(self, *args))
+
+    monkeypatch.setattr(Video, "frames", black)
+
+
+def test_a_camera_that_sees_nobody_is_left_out_with_a_note(take, monkeypatch):
+    see_nobody_in(monkeypatch, "cam02.mp4")
+    told = run(take)
+    assert told.exit_code == 0
+    assert "cam02: 12 pictures, nobody" in told.stdout
+    assert "finds nobody in camera cam02 (12 pictures)" in told.stderr and "left out" in told.stderr
+    assert set(_detecting.ensure_detections(read_take(take))) == {"cam01", "cam03", "cam04"}
+
+
+def test_nobody_at_all_is_an_error_that_names_the_cameras(take, monkeypatch):
+    see_nobody_in(monkeypatch, *(f"{name}.mp4" for name in CAMERAS))
+    told = run(take)
+    assert isinstance(told.exception, ObservationError)
+    assert "finds nobody in cam01 (12 pictures), cam02" in str(told.exception) and told.exception.remedy
+
+
+def test_videos_alone_go_beside_themselves_or_where_they_are_wanted(take, tmp_path):
+    videos = [take.with_name("cam01.mp4"), take.with_name("cam02.mp4")]
+    assert run(*videos).exit_code == 0
+    assert take.with_name("cam01-detect.npz").is_file() and take.with_name("cam02-detect.npz").is_file()
+    assert run(*videos, "--out", tmp_path / "there").exit_code == 0
+    assert {path.name for path in (tmp_path / "there").iterdir()} == {"cam01-detect.npz", "cam02-detect.npz"}
+
+
+def test_a_take_reads_what_was_found(take):
+    run(take)
+    text, _, _ = take.read_text().partition("[[keypoints]]")
+    entries = [f'[[keypoints]]\ncamera = "{c}"\nformat = "detect"\nfile = "take-detect/{c}.npz"\n' for c in CAMERAS]
+    take.write_text("\n".join([text, *entries]))
+    keypoints = load_observations(read_take(take)).keypoints
+    assert [k.camera for k in keypoints] == list(CAMERAS)
+    assert all(k.points.shape == (12, 1, 33, 2) and k.keypoint_set == "MEDIAPIPE_33" for k in keypoints)
+    assert np.allclose(keypoints[0].points[3, 0], read_detections(detections_file(take, "cam01")).points[3, 0])
+
+
+@pytest.mark.parametrize(
+    ("args", "error", "message"),
+    [
+        (("none.toml",), FileError, "no such take"),
+        (("none.mp4",), FileError, "none.mp4.*cannot be read"),
+        (("take.toml", "more.mp4"), click.UsageError, "one take alone"),
+        (("a/x.mp4", "b/x.mp4", "--out", "c"), click.UsageError, "two videos of one name"),
+    ],
+)
+def test_wrong_inputs_are_told(args, error, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = run(*args)
+    assert told.exit_code != 0
+    if issubclass(error, KinefitError):
+        assert isinstance(told.exception, error)
+        with pytest.raises(error, match=message):
+            raise told.exception
+    else:
+        assert told.exit_code == 2 and message in told.stderr
+
+
+def test_a_take_without_videos_is_told(take):
+    lines = take.read_text().splitlines()
+    take.write_text("\n".join(line for line in lines if not line.startswith("video")))
+    told = run(take)
+    assert isinstance(told.exception, TakeError) and "no camera of this take has a video" in str(told.exception)
+
+
+def test_the_missing_extra_is_told_before_anything_is_fetched(monkeypatch):
+    monkeypatch.undo()
+    import sys
+
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
+    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: pytest.fail("fetched"))
+    with pytest.raises(ObservationError, match=r"pip install 'kinefit\[detect\]'"):
+        _detecting._networks(None)
+
+
+def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, capsys, tmp_path):
+    monkeypatch.undo()
+    pytest.importorskip("ai_edge_litert")
+
+    def fetch(progress):
+        progress(0, 36_000_000)
+        progress(36_000_000, 36_000_000)
+        return tmp_path
+
+    monkeypatch.setattr("kinefit.assets.detector_models", fetch)
+    steps = []
+    assert _detecting._networks(lambda *step: steps.append(step)) == tmp_path
+    told = capsys.readouterr().err
+    assert told.count("Apache-2.0") == 1 and "MediaPipe" in told
+    assert steps == [("fetching MB", 0, 36), ("fetching MB", 36, 36)]
+    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
+    _detecting._networks(None)
+    assert capsys.readouterr().err == "", "nothing is said when they are there already"
+
+
+def test_networks_that_cannot_be_had_are_told(monkeypatch, take):
+    def offline(progress):
+        raise AssetError("pip could not fetch mediapipe 0.10.21")
+
+    monkeypatch.setattr(_detecting, "_networks", offline)
+    with pytest.raises(AssetError, match="mediapipe"):
+        _detecting.ensure_detections(read_take(take))
+    assert not take.with_name("take-detect").exists()

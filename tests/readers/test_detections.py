@@ -1,0 +1,111 @@
+"""The file of the built-in detector: written whole, read back, refused when damaged."""
+
+import numpy as np
+import pytest
+
+from kinefit.errors import ExportError, FileError
+from kinefit.exporters.detections import draw_people, write_detections
+from kinefit.observations import Detections
+from kinefit.readers.detections import detections_file, detections_key, read_detections
+
+
+@pytest.fixture
+def found():
+    """Three frames of a picture 6 px wide and 4 high: person 1 always there, person 2 in the last frame."""
+    rng = np.random.default_rng(0)
+    points, confidence = rng.uniform(0, 4, (3, 2, 33, 2)), rng.uniform(size=(3, 2, 33))
+    points[:2, 1], confidence[:2, 1] = np.nan, 0
+    runs = [[5, 2, 17], [0, 24], [24], [23, 1]]  # of (0, 0), (1, 0), (2, 0), (2, 1)
+    starts = np.cumsum([0, 3, 0, 2, 0, 1, 2])
+    return Detections("left", 50.0, (6, 4), points, confidence, np.concatenate(runs), starts, "left.mp4")
+
+
+def test_what_is_written_is_read(found, tmp_path):
+    path = tmp_path / "there" / "left.npz"
+    write_detections(found, path, key="the key")
+    read = read_detections(path)
+    assert (read.camera, read.rate, read.size, read.source) == ("left", 50.0, (6, 4), str(path))
+    assert np.allclose(read.points, found.points, equal_nan=True, atol=1e-5)
+    assert np.allclose(read.confidence, found.confidence, atol=1e-6)
+    assert read.seen.tolist() == [[True, False], [True, False], [True, True]]
+    for f in range(3):
+        for p in range(2):
+            assert np.array_equal(read.mask(f, p), found.mask(f, p))
+    assert detections_key(path) == "the key"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_masks_run_down_the_columns(found):
+    mask = found.mask(0, 0)
+    assert mask.shape == (4, 6) and np.argwhere(mask).tolist() == [[1, 1], [2, 1]]
+    assert found.mask(1, 0).all() and not found.mask(2, 0).any()
+    assert np.argwhere(found.mask(-1, 1)).tolist() == [[3, 5]]
+    assert found.mask(0, 1) is None
+
+
+def change(path, **arrays):
+    with np.load(path) as archive:
+        content = {key: archive[key] for key in archive.files}
+    for key, value in arrays.items():
+        content.pop(key, None)
+        if value is not None:
+            content[key] = np.asarray(value)
+    np.savez(path, **content)
+
+
+DAMAGE = {
+    "cut": (lambda p: p.write_bytes(p.read_bytes()[:400]), "damaged"),
+    "text": (lambda p: p.write_text("hello"), "not a file of the built-in detector"),
+    "empty": (lambda p: p.write_bytes(b""), "damaged"),
+    "other npz": (lambda p: np.savez(p, a=1), "not a file of the built-in detector"),
+    "one array": (lambda p: p.write_bytes(b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, "
+                                           b"'shape': (1,), }".ljust(117) + b"\n" + bytes(8)), "built-in detector"),
+    "version": (lambda p: change(p, version=2), "version 2; this kinefit reads version 1"),
+    "no points": (lambda p: change(p, points=None), "do not fit.*points"),
+    "points": (lambda p: change(p, points=np.zeros((3, 2, 32, 2))), "do not fit"),
+    "starts": (lambda p: change(p, mask_starts=[0, 3, 2, 5, 5, 6, 8]), "do not fit"),
+    "infinite": (lambda p: change(p, points=np.full((3, 2, 33, 2), np.inf)), "cannot be"),
+    "rate": (lambda p: change(p, rate=0.0), "cannot be"),
+    "folder": (lambda p: (p.unlink(), p.mkdir()), "no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DAMAGE)
+def test_a_damaged_file_is_told(case, found, tmp_path):
+    damage, message = DAMAGE[case]
+    path = tmp_path / "left.npz"
+    write_detections(found, path, key="k")
+    damage(path)
+    with pytest.raises(FileError, match=message) as told:
+        read_detections(path)
+    assert str(path) in str(told.value) and told.value.remedy
+
+
+def test_a_key_is_had_only_of_a_whole_file(found, tmp_path):
+    path = tmp_path / "left.npz"
+    assert detections_key(path) is None
+    write_detections(found, path, key="k")
+    path.write_bytes(path.read_bytes()[:-30])
+    assert detections_key(path) is None
+
+
+def test_only_npz_is_written(found, tmp_path):
+    with pytest.raises(ExportError, match=r"left\.npz"):
+        write_detections(found, tmp_path / "left.json")
+
+
+def test_files_lie_beside_the_take(tmp_path):
+    assert detections_file(tmp_path / "walk.toml", "cam 1") == tmp_path / "walk-detect" / "cam 1.npz"
+    assert detections_file(tmp_path / "walk.toml", "a/../b").parent == tmp_path / "walk-detect"
+
+
+def test_the_drawing_shows_everybody_and_leaves_the_picture_alone():
+    points = np.full((1, 2, 33, 2), np.nan)
+    points[0, 0] = np.linspace([20, 20], [80, 180], 33)
+    points[0, 1] = np.linspace([1e9, -1e9], [120, 180], 33)
+    runs = [100 * 200, 50, 150, 50, 100 * 200 - 250]
+    found = Detections("c", 1.0, (200, 200), points, np.ones((1, 2, 33)), runs, [0, 5, 5])
+    image = np.zeros((200, 200, 3), np.uint8)
+    drawn = draw_people(image, found, 0)
+    assert not image.any() and drawn.shape == image.shape
+    assert drawn[15:185, 15:85].any() and drawn[0:50, 100:102].any(), "a person, and the outline of the mask"
