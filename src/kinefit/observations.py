@@ -11,6 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.geometry.camera import ImageFrame
+
+_FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
+_PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
+MEDIAPIPE_33 = (
+    *_FACE.split(), "mouth_left", "mouth_right",
+    *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
+)  # fmt: skip
+"""Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector gives the same."""
 
 
 def _frozen(array: NDArray, dtype: type = float) -> NDArray:
@@ -69,6 +78,100 @@ class Keypoints:
     def times(self) -> NDArray:
         """(F,) [s] time of every frame in the take."""
         return np.arange(len(self)) / self.rate + self.time_offset
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """What kinefit's own detector saw in one video: people, each the same in one column, with their outlines.
+
+    Parameters
+    ----------
+    camera : str
+    rate : float [Hz]
+    size : (width, height) [px] of the video's picture.
+    points : (F, P, 33, 2) [px]
+        Landmarks of MEDIAPIPE_33 in the video's picture; NaN where a person is not seen. P may be 0.
+    confidence : (F, P, 33)
+        Probability that a landmark is in the picture and not hidden; 0 where a person is not seen.
+    mask_runs : (N,)
+        Lengths of the runs of all masks, one mask after the other by frame, then person: down the columns of the
+        picture, beginning outside of the person (COCO's uncompressed run-length code).
+    mask_starts : (F * P + 1,)
+        Where each mask begins in `mask_runs`; a mask without runs was not made.
+    source : str
+    """
+
+    camera: str
+    rate: float
+    size: tuple[int, int]
+    points: NDArray
+    confidence: NDArray
+    mask_runs: NDArray
+    mask_starts: NDArray
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        points, confidence = _frozen(self.points), _frozen(self.confidence)
+        starts, runs = _frozen(self.mask_starts, int), _frozen(self.mask_runs, np.uint32)
+        cells = points.shape[0] * points.shape[1] if points.ndim == 4 else -1
+        fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3] and len(starts) == cells + 1
+        if not fits or starts[0] != 0 or starts[-1] != len(runs) or np.any(np.diff(starts) < 0):
+            raise ObservationError(
+                f"detections of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}, "
+                f"{len(starts)} starts of masks and {len(runs)} runs", file=self.source or None,
+                remedy="Give (frames, people, 33, 2), (frames, people, 33) and frames * people + 1 starts.",
+            )
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "confidence", confidence)
+        object.__setattr__(self, "mask_runs", runs)
+        object.__setattr__(self, "mask_starts", starts)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def seen(self) -> NDArray:
+        """(F, P) bool, whether a person is seen in a frame."""
+        return np.isfinite(self.points).all(axis=(2, 3))
+
+    def mask(self, frame: int, person: int) -> NDArray | None:
+        """(height, width) bool, the pixels of a person; None where there is no mask."""
+        cell = range(len(self))[frame] * self.points.shape[1] + range(self.points.shape[1])[person]
+        runs = self.mask_runs[self.mask_starts[cell] : self.mask_starts[cell + 1]]
+        if not len(runs):
+            return None
+        width, height = self.size
+        return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
+
+    def keypoints(
+        self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0
+    ) -> Keypoints:
+        """The landmarks of all people as a detector's keypoints.
+
+        Parameters
+        ----------
+        camera : str, optional
+            Its name in the rig; default: the video's.
+        image_frame : ImageFrame, optional
+            The video's image frame, where it is not the calibration's.
+        time_offset : float [s]
+
+        Raises
+        ------
+        ObservationError
+            Nobody is seen in any frame.
+        """
+        if not self.seen.any():
+            raise ObservationError(
+                f"nobody is seen in any of the {len(self)} frames of camera {camera or self.camera}",
+                file=self.source or None,
+                remedy="The detector wants a person of a tenth of the picture's height or more; leave this camera out.",
+            )
+        points = self.points if image_frame is None else image_frame.to_calibration(self.points)
+        return Keypoints(
+            camera or self.camera, "MEDIAPIPE_33", MEDIAPIPE_33, self.rate, points, self.confidence,
+            time_offset=time_offset, source=self.source,
+        )
 
 
 @dataclass(frozen=True, eq=False)

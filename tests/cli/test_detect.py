@@ -123,11 +123,23 @@ def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatc
         if camera == "cam02" and done == 6:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt):  # of a worker here: it stops the others as an error does
         _detecting.ensure_detections(read_take(take), progress=stop)
     assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
     told = run(take)
     assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
+
+
+def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
+    def interrupted(futures, return_when):
+        futures[0].result()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_detecting, "_cores", lambda: 1)
+    monkeypatch.setattr(_detecting, "wait", interrupted)
+    with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done and kept"):
+        _detecting.ensure_detections(read_take(take))
+    assert detections_file(take, "cam01").is_file()
 
 
 def test_one_damaged_video_stops_all_and_leaves_whole_files_only(take):

@@ -77,6 +77,35 @@ def test_one_of_two_alike_is_followed_throughout(seed):
     assert np.all(np.array(who) == who[0][0])
 
 
+def blind(record, places, person, frames):
+    """The record without a person in some frames."""
+    points, confidence = np.array(record.points), np.array(record.confidence)
+    frames = np.arange(len(record))[frames]
+    points[frames, places[frames, person]], confidence[frames, places[frames, person]] = np.nan, 0.0
+    return Keypoints(record.camera, SET, NAMES, record.rate, points, confidence)
+
+
+@pytest.mark.parametrize("when", [slice(18, 50), slice(0, 32), slice(12, 38)])
+def test_who_is_there_longer_is_followed_throughout(when):
+    """Another person who is better seen for a while does not stand in for the one who is seen all the time."""
+    people = walker((0.0, 0.0, 0.0), frames=50), walker((0.9, 0.1, -0.8), frames=50, seed=3)
+    keypoints, truth = records(people, sure=(0.8, 1.0))
+    keypoints = [blind(k, places, 1, when) for k, places in zip(keypoints, truth, strict=True)]
+    for chosen, places in zip(choose_people(RIG, keypoints), truth, strict=True):
+        np.testing.assert_array_equal(chosen, places[:, 0])
+
+
+def test_who_comes_back_after_a_gap_is_followed_on():
+    """And nobody is followed while the person is away, as a bystander far off is somebody else."""
+    people = walker((0.0, 0.0, 0.0), frames=50), walker((1.5, 0.5, -1.5), frames=50, seed=3)
+    keypoints, truth = records(people, sure=(1.0, 0.6))
+    keypoints = [blind(k, places, 0, slice(20, 24)) for k, places in zip(keypoints, truth, strict=True)]
+    for chosen, places in zip(choose_people(RIG, keypoints), truth, strict=True):
+        away = np.arange(50)[20:24]
+        np.testing.assert_array_equal(chosen[away], -1)
+        np.testing.assert_array_equal(np.delete(chosen, away), np.delete(places[:, 0], away))
+
+
 def test_a_poster_that_one_camera_sees_is_left_out():
     keypoints, truth = records([MAIN, OTHER], sure=(0.7, 1.0), hidden=[(1, 1), (1, 2), (1, 3)])
     for chosen, places in zip(choose_people(RIG, keypoints), truth, strict=True):

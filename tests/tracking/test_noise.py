@@ -55,7 +55,8 @@ def test_outliers_are_not_noise():
 
 def test_what_the_fit_follows_is_counted_back():
     channels, values = residuals(noise_px=3.0)
-    half = estimate_noise(channels, values * np.sqrt(0.5), factors(values), MOTION.rate, leverage=np.full(values.shape[1], 0.5))
+    hidden = np.full(values.shape[1], 0.5)
+    half = estimate_noise(channels, values * np.sqrt(0.5), factors(values), MOTION.rate, leverage=hidden)
     assert np.median(half.white) == pytest.approx(3.0, rel=0.1)
 
 

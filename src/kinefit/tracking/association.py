@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +16,20 @@ from kinefit.observations import Keypoints
 
 _ENOUGH = 4  # points of a person that must be seen
 _SOME = 13  # points, spread over the set, that decide whether two detections are of one person
-_STRIDE = 0.3  # [m] people stay about where they are from frame to frame
+_STRIDE = 0.6  # [m] by which the middle of a person leaps at most from frame to frame: half of the body may be unseen
+_SPEED = 3.0  # [m/s] people do not go further while they are unseen
+_SWITCH = 1.0  # [s] going on with somebody else must show that much more of a person, seen by all cameras
+_SWAY = 0.1  # frames of the same that a leap of one stride must show more: of two who stand close, the same one
+_PATHS = 16  # how many people and gaps are borne in mind at a time
 _AGREE = 0.04  # two views of one person differ by less than this share of the person's height in the picture
 
 
 def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     """For each record the index (F,) of the person to follow in each frame, -1 for none.
 
-    In every frame people of different records are paired when their keypoints meet in space; the largest consistent
-    group is the person, by the number of keypoints seen and how sure the detector was of them; among equals the one
-    nearest to where the person was.
+    In every frame people of different records are grouped when their keypoints meet in space. The person is the one of
+    whom the groups show most over the whole take, by the number of keypoints seen and how sure the detector was of
+    them; gone after from frame to frame, so that nobody else stands in for a moment (dynamic programming).
 
     Raises
     ------
@@ -39,11 +44,13 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
             c[sure[:, 0] > 0] = 0
     else:
         meetings = _meetings(rig, keypoints, surety, frames)
-        last: NDArray | None = None
+        everybody = len(keypoints) * max(len(k.names) for k in keypoints)
+        groups = []
         for f in range(frames):
             ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(surety) for p in np.flatnonzero(s[f] > 0)]
             people = [(q, p) for _, q, p in sorted(ranked, reverse=True)]
-            group, last = _best_group(people, meetings, surety, f, last)
+            groups.append(_groups(people, meetings, surety, f, everybody))
+        for f, group in enumerate(_one_person(groups, keypoints[0].rate)):
             for q, p in group:
                 chosen[q][f] = p
     if all(np.all(c < 0) for c in chosen):
@@ -98,28 +105,70 @@ def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArr
         return np.where(agree[:, None], np.nanmedian(x, axis=1), np.nan)
 
 
-def _best_group(
-    people: list[Node],
-    meetings: dict[tuple[Node, Node], NDArray],
-    surety: Sequence[NDArray],
-    frame: int,
-    last: NDArray | None,
-) -> tuple[list[Node], NDArray | None]:
-    """The surest set of people of different records that all meet, and where; `last` is where the person was."""
+@dataclass(frozen=True)
+class _Group:
+    """Detections of one frame that are of one person."""
+
+    nodes: tuple[Node, ...]
+    score: float  # 1: all cameras see all keypoints, quite sure
+    centre: NDArray  # (3,) [m], NaN where one camera alone sees the person
+
+
+def _groups(
+    people: list[Node], meetings: dict[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int, full: float
+) -> list[_Group]:
+    """Largest sets of people of different records that all meet; single ones where nobody meets."""
     links = {
         pair: centre[frame]
         for pair, centre in meetings.items()
         if np.isfinite(centre[frame, 0]) and pair[0] in people and pair[1] in people
     }
-    best: tuple[float, list[Node], NDArray | None] = (-1.0, [], last)
-    seeds = [(list(pair), centre) for pair, centre in links.items()] or [([node], None) for node in people]
-    for group, centre in seeds:
+    found: dict[frozenset[Node], _Group] = {}
+    for pair, centre in links.items():
+        group = list(pair)
         for node in people:
             if all(node[0] != m[0] and ((node, m) in links or (m, node) in links) for m in group):
                 group.append(node)
-        score = sum(surety[q][frame, p] for q, p in group)
-        if last is not None and centre is not None:
-            score *= 1.0 + np.exp(-0.5 * (np.linalg.norm(centre - last) / _STRIDE) ** 2)
-        if score > best[0]:
-            best = (score, group, last if centre is None else centre)
-    return best[1], best[2]
+        score = sum(float(surety[q][frame, p]) for q, p in group) / full
+        found.setdefault(frozenset(group), _Group(tuple(group), score, centre))
+    nowhere = np.full(3, np.nan)
+    return list(found.values()) or [_Group(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people]
+
+
+def _one_person(groups: Sequence[Sequence[_Group]], rate: float) -> list[tuple[Node, ...]]:
+    """The detections of one person in each frame, none where unseen: the path through the groups that shows most."""
+    value, centre, unseen = np.zeros(1), np.full((1, 3), np.nan), np.zeros(1)  # of every path that is borne in mind
+    history: list[tuple[NDArray, NDArray]] = []  # for each path the one it goes on from, and its group or -1
+    for there in groups:
+        at = np.array([g.centre for g in there]).reshape(-1, 3)
+        apart = np.linalg.norm(at[:, None] - centre, axis=-1)  # (groups, paths); NaN where a place is not known
+        far = apart > _STRIDE + _SPEED * (unseen + 1) / rate
+        cost = np.where(far, _SWITCH * rate, _SWAY * np.nan_to_num(np.minimum(apart / _STRIDE, 1)) ** 2)
+        total = value - cost
+        before = total.argmax(axis=1)
+        gained = total.max(axis=1) + [g.score for g in there]
+        at = np.where(np.isfinite(at), at, centre[before])
+        value, centre = np.concatenate([gained, value]), np.concatenate([at, centre])
+        before = np.concatenate([before, np.arange(len(unseen))])
+        group = np.concatenate([np.arange(len(there)), np.full(len(unseen), -1)])
+        unseen = np.concatenate([np.zeros(len(there)), unseen + 1])
+        kept = _distinct(value, centre, unseen)
+        value, centre, unseen = value[kept], centre[kept], unseen[kept]
+        history.append((before[kept], group[kept]))
+    path, chosen = 0, []
+    for (before, group), there in zip(reversed(history), reversed(groups)):
+        chosen.append(there[group[path]].nodes if group[path] >= 0 else ())
+        path = int(before[path])
+    return chosen[::-1]
+
+
+def _distinct(value: NDArray, centre: NDArray, unseen: NDArray) -> list[int]:
+    """The best paths that end at different places, the best first."""
+    kept: list[int] = []
+    for path in np.argsort(-value, kind="stable"):
+        beside = np.linalg.norm(centre[kept] - centre[path], axis=-1) < _STRIDE
+        if not np.any(beside & (unseen[kept] <= unseen[path])):
+            kept.append(int(path))
+        if len(kept) == _PATHS:
+            break
+    return kept

@@ -1,0 +1,272 @@
+"""Bundle adjustment of cameras and a board that stands elsewhere in every frame (Triggs et al., 1999, with Schur).
+
+Cameras seldom take their pictures at exactly one time, and a board in a hand moves. So every view may see the board a
+little off its pose in the frame: x_camera = T_camera_world T_world_board exp(η) x_board with η ~ N(0, Σ) of each view,
+Σ (one variance of shift, one of turn) found from the data. η is taken out of each view's equations first; what the
+shape of a board within one picture says of the lens keeps its full weight, what pictures say of each other does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+
+_POSE = 6
+_HUBER = 1.345  # standard deviations: 95 % efficient where errors are normal (Huber, 1981)
+_NOISE = 0.25  # [px] of a corner along one axis, as its detectors find it in sharp to slightly blurred pictures
+_FIRST_JITTER = (3e-3, 6e-3)  # [m, rad] of a board in a hand and cameras some milliseconds apart; found anew
+_LEAST_JITTER = (1e-5, 2e-5)  # [m, rad] no board is flatter
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """M corners seen.
+
+    Parameters
+    ----------
+    camera, frame : (M,) int, places in the rig and in the stack of board poses.
+    x_board : (M, 3) [m]
+    uv : (M, 2) [px]
+    """
+
+    camera: NDArray
+    frame: NDArray
+    x_board: NDArray
+    uv: NDArray
+
+    def only(self, keep: NDArray) -> Corners:
+        """Some of them."""
+        return Corners(self.camera[keep], self.frame[keep], self.x_board[keep], self.uv[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class BoardBundle:
+    """Cameras and board poses that agree best.
+
+    Parameters
+    ----------
+    rig : Rig
+    Ts_world_board : (F, 4, 4) [m]
+    residuals : (M, 2) [px] measured minus seen, the board being where the frame has it.
+    within : (M, 2) [px] the same, the board being where the view has it.
+    jitter : (shift [m], turn [rad]) standard deviations of the board in a view about its pose in the frame.
+    position_std : (C,) [m] of each camera's place, relative to the first; NaN where the boards leave it open.
+    focal_std : (C,) [px], zero where the interior was kept.
+    """
+
+    rig: Rig
+    Ts_world_board: NDArray
+    residuals: NDArray
+    within: NDArray
+    jitter: tuple[float, float]
+    position_std: NDArray
+    focal_std: NDArray
+
+
+def adjust_boards(
+    rig: Rig, Ts_world_board: NDArray, corners: Corners, *, interiors: bool, max_iterations: int = 40, rounds: int = 6
+) -> BoardBundle:
+    """Cameras and board poses of least robust pixel error; the first camera stays where it is.
+
+    Parameters
+    ----------
+    corners : Corners
+        Those of one view beside each other.
+    interiors : bool
+        Whether focal lengths, centres and distortion change too (lens model "radtan" only).
+    rounds : int
+        At most so many estimates of Σ (by expectation maximisation), each with its solve.
+    """
+    jitter = _FIRST_JITTER
+    for _ in range(rounds):
+        problem = _Problem(corners, interiors, jitter)
+        rig, Ts_world_board = problem.solve(rig, Ts_world_board, max_iterations)
+        before, jitter = jitter, problem.jitter_of(rig, Ts_world_board)
+        if all(abs(new / old - 1) < 0.05 for new, old in zip(jitter, before)):
+            break
+    problem = _Problem(corners, interiors, jitter)
+    system = problem.system(rig, Ts_world_board)
+    position_std, focal_std = _deviations(system)
+    left = residuals(rig, Ts_world_board, corners)
+    return BoardBundle(rig, Ts_world_board, left, system.within, jitter, position_std, focal_std)
+
+
+def residuals(rig: Rig, Ts_world_board: NDArray, corners: Corners) -> NDArray:
+    """(M, 2) [px] measured minus seen; NaN behind a camera."""
+    T = Ts_world_board[corners.frame]
+    x_world = (T[:, :3, :3] @ corners.x_board[..., None])[..., 0] + T[:, :3, 3]
+    seen = np.empty(corners.uv.shape)
+    for c, camera in enumerate(rig):
+        mine = corners.camera == c
+        seen[mine] = camera.project(x_world[mine])
+    return corners.uv - seen
+
+
+def interior_parameters(camera: Camera) -> int:
+    """How many numbers of an interior may change: fx, fy, cx, cy and the distortion."""
+    return 4 + camera.distortion.size
+
+
+def _moved(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
+    T = se3.exp(delta[:_POSE]) @ camera.T_camera_world
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    T[:3, :3] = u @ vt
+    if not interiors:
+        return camera.with_pose(T)
+    d, K = delta[_POSE : _POSE + interior_parameters(camera)], np.array(camera.matrix)
+    K[[0, 1, 0, 1], [0, 1, 2, 2]] += d[:4]
+    return replace(camera, matrix=K, distortion=camera.distortion + d[4:], T_camera_world=T)
+
+
+def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[NDArray, NDArray, NDArray]:
+    """Pixels (M, 2), their derivatives by the point in the camera's frame (M, 2, 3) and by the interior (M, 2, P)."""
+    if not interiors:
+        at_origin = camera.with_pose(np.eye(4))
+        uv, J = at_origin.project_with_jacobian(x_camera)
+        return uv, J, np.zeros((len(x_camera), 2, 0))
+    k = camera.distortion if camera.distortion.size else np.zeros(4)
+    uv, jacobian = cv2.projectPoints(x_camera, np.zeros(3), np.zeros(3), camera.matrix, k)
+    J = jacobian.reshape(len(x_camera), 2, -1)
+    return uv.reshape(-1, 2), J[..., 3:6], J[..., 6 : 6 + interior_parameters(camera)]
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations: cameras' H (C, P, C, P), b; boards' Hb (F, 6, 6), bb; cross (F, 6, C, P); what is free."""
+
+    H: NDArray
+    b: NDArray
+    Hb: NDArray
+    bb: NDArray
+    cross: NDArray
+    free: NDArray
+    cost: float
+    within: NDArray
+    eta: NDArray  # (V, 6)
+    spread: NDArray  # (V, 6) variances of η
+
+    def reduced(self, damping: float) -> tuple[NDArray, NDArray, NDArray]:
+        """The cameras' equations with the boards taken out, and the boards' inverses."""
+        n = self.free.size
+        cross = self.cross.reshape(-1, 6, n)
+        diagonal = np.einsum("fii->fi", self.Hb)
+        inverse = np.linalg.inv(self.Hb + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max() + 1e-12)[:, None, :])
+        H = self.H.reshape(n, n)
+        S = H + np.diag(damping * np.diag(H) + ~self.free.ravel()) - np.einsum("fij,fik->jk", cross, inverse @ cross)
+        return S, self.b.ravel() - np.einsum("fij,fi->j", inverse @ cross, self.bb), inverse
+
+    def step(self, damping: float) -> tuple[NDArray, NDArray]:
+        """Change of the cameras (C, P) and of the boards (F, 6)."""
+        S, b, inverse = self.reduced(damping)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # coefficients and metres differ by many orders
+        delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
+        right = self.bb - self.cross.reshape(*self.bb.shape, -1) @ delta
+        return delta.reshape(self.free.shape), (inverse @ right[..., None])[..., 0]
+
+
+class _Problem:
+    """The corners, what may change, and Σ; views are runs of corners of one camera and frame."""
+
+    def __init__(self, corners: Corners, interiors: bool, jitter: tuple[float, float]) -> None:
+        self.corners, self.interiors = corners, interiors
+        self.precision = np.repeat(1.0 / np.square(jitter), 3)
+        change = np.flatnonzero(np.diff(corners.camera) | np.diff(corners.frame)) + 1
+        starts = np.concatenate([[0], change])
+        self.views = list(zip(starts, np.append(change, len(corners.camera))))
+        self.camera, self.frame = corners.camera[starts], corners.frame[starts]
+        self.sigma = _NOISE
+
+    def solve(self, rig: Rig, Ts_world_board: NDArray, max_iterations: int) -> tuple[Rig, NDArray]:
+        """Damped Gauss-Newton to the least cost."""
+        system, damping = self.system(rig, Ts_world_board), 1e-3
+        for _ in range(max_iterations):
+            before = system.cost
+            while damping < 1e8:
+                d_cameras, d_boards = system.step(damping)
+                new_rig = Rig(tuple(_moved(camera, d, self.interiors) for camera, d in zip(rig, d_cameras)))
+                new_boards = np.stack([T @ se3.exp(d) for T, d in zip(Ts_world_board, d_boards)])
+                new = self.system(new_rig, new_boards)
+                if new.cost < system.cost:
+                    rig, Ts_world_board, system, damping = new_rig, new_boards, new, max(0.1 * damping, 1e-9)
+                    break
+                damping *= 10.0
+            if not before - system.cost > 1e-6 * system.cost:
+                break
+        return rig, Ts_world_board
+
+    def jitter_of(self, rig: Rig, Ts_world_board: NDArray) -> tuple[float, float]:
+        """Standard deviations (shift, turn) of η over the views of frames that two or more cameras saw."""
+        system = self.system(rig, Ts_world_board)
+        count = np.bincount(self.frame, minlength=len(Ts_world_board))[self.frame]
+        if not (count > 1).any():
+            return _LEAST_JITTER
+        # The frame's pose took up one view's share of the freedom. Medians: a wrong view must not loosen all others.
+        second = (system.eta**2 + system.spread)[count > 1] * (count / np.maximum(count - 1, 1))[count > 1, None]
+        shift, turn = (float(np.sqrt(np.median(second[:, part].mean(axis=1)))) for part in (slice(0, 3), slice(3, 6)))
+        return max(shift, _LEAST_JITTER[0]), max(turn, _LEAST_JITTER[1])
+
+    def system(self, rig: Rig, Ts: NDArray) -> _System:
+        """Linearise at a rig and board poses."""
+        corners, C, F, V = self.corners, len(rig), len(Ts), len(self.views)
+        P = _POSE + max(interior_parameters(camera) for camera in rig) * self.interiors
+        free = np.zeros((C, P), bool)
+        free[1:, :_POSE] = True
+        G = np.zeros((len(corners.uv), 2, P + 7))  # camera, board, residual
+        for c, camera in enumerate(rig):
+            mine = corners.camera == c
+            x_board, T = corners.x_board[mine], camera.T_camera_world @ Ts[corners.frame[mine]]
+            x = (T[:, :3, :3] @ x_board[..., None])[..., 0] + T[:, :3, 3]
+            uv, J, J_interior = pixel_columns(camera, x, self.interiors)
+            free[c, _POSE : _POSE + J_interior.shape[2]] = True
+            JR, part = J @ T[:, :3, :3], np.zeros((len(x), 2, P + 7))
+            part[..., :_POSE] = np.concatenate([J, np.cross(x[:, None], J)], axis=2)
+            part[..., _POSE : _POSE + J_interior.shape[2]] = J_interior
+            part[..., :P] *= free[c]
+            part[..., P:-1] = np.concatenate([JR, np.cross(x_board[:, None], JR)], axis=2)
+            part[..., -1] = corners.uv[mine] - uv
+            G[mine] = np.where(np.isfinite(part).all(axis=(1, 2), keepdims=True) & (x[:, 2, None, None] > 0), part, 0.0)
+        H, Hb, cross = np.zeros((C, P, C, P)), np.zeros((F, 6, 6)), np.zeros((F, 6, C, P))
+        b, bb, cost, within = np.zeros((C, P)), np.zeros((F, 6)), 0.0, np.zeros(corners.uv.shape)
+        eta, spread = np.zeros((V, 6)), np.zeros((V, 6))
+        for v, (start, stop) in enumerate(self.views):
+            M, left, eta[v], spread[v], more = self._view(G[start:stop], P)
+            c, f = self.camera[v], self.frame[v]
+            H[c, :, c] += M[:P, :P]
+            b[c] += M[:P, -1]
+            Hb[f] += M[P:-1, P:-1]
+            bb[f] += M[P:-1, -1]
+            cross[f, :, c] += M[P:-1, :P]
+            within[start:stop], cost = left, cost + more
+        return _System(H, b, Hb, bb, cross, free, cost, within, eta, spread)
+
+    def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
+        """One view's equations with η taken out; its residuals at the best η, η itself, its variances, the cost."""
+        w, board, left = np.ones(len(G)), G[..., P:-1], G[..., -1]
+        for _ in range(2):
+            WG = (w / self.sigma**2)[:, None, None] * G
+            M = WG.reshape(-1, P + 7).T @ G.reshape(-1, P + 7)
+            inverse = np.linalg.inv(M[P:-1, P:-1] + np.diag(self.precision))
+            eta = inverse @ M[P:-1, -1]
+            rest = left - board @ eta
+            size = np.linalg.norm(rest, axis=1) / self.sigma
+            w = np.minimum(1.0, _HUBER / np.maximum(size, 1e-12))
+        M -= M[:, P:-1] @ inverse @ M[P:-1]
+        cost = np.sum(np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER))) + eta @ (self.precision * eta)
+        return M, rest, eta, np.diag(inverse), float(cost)
+
+
+def _deviations(system: _System) -> tuple[NDArray, NDArray]:
+    """Standard deviations of the cameras' places [m] and focal lengths [px]."""
+    free = system.free
+    S = system.reduced(0.0)[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    covariance = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    variance = np.where(free, np.diag(covariance).reshape(free.shape), 0.0)
+    focal = variance[:, _POSE] if free.shape[1] > _POSE else np.zeros(len(free))
+    return np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(focal)

@@ -1,0 +1,259 @@
+"""The built-in detector over the videos of a take: side by side, kept beside the take, not done twice."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kinefit.cli import _screen
+from kinefit.errors import ObservationError, TakeError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.readers.take import Take
+
+PEOPLE = 3
+"""How many people are followed at most in one camera, unless told otherwise."""
+
+_METHOD = "1"  # raise it when the detector gives other numbers for the same video
+_ENDS = 2**20  # [bytes] of a video's begin and end by which it is recognised
+
+
+@dataclass(frozen=True)
+class Job:
+    """One video to look through.
+
+    Parameters
+    ----------
+    camera : str
+    video : Path
+    file : Path
+        Of the detections.
+    """
+
+    camera: str
+    video: Path
+    file: Path
+
+
+def jobs_of_take(take: Take) -> list[Job]:
+    """Every camera of a take that has a video; TakeError where none has."""
+    from kinefit.readers.detections import detections_file
+
+    found = [Job(c.name, c.video, detections_file(take.path, c.name)) for c in take.cameras if c.video is not None]
+    if not found:
+        raise TakeError(
+            "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
+        )
+    return found
+
+
+def ensure_detections(
+    take: Take, *, people: int | None = None, masks: bool | None = None, force: bool = False,
+    progress: _screen.Step | None = None,
+) -> dict[str, Path]:
+    """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
+
+    Parameters
+    ----------
+    people : int, optional
+        How many are followed at most; default: as it was done, or `PEOPLE`.
+    masks : bool, optional
+        Whether outlines are wanted; default: as it was done, or yes.
+    force : bool
+        Make them anew.
+    progress : called with (camera, pictures done, pictures in all).
+
+    Returns
+    -------
+    {camera: Path}
+        For `[[keypoints]]` with format = "detect"; a camera that sees nobody is left out, with a note on stderr.
+
+    Raises
+    ------
+    TakeError, ObservationError
+        No camera has a video; nobody is seen by any; the extra `detect` is not installed.
+    AssetError, FileError, ExportError
+        What fetching the networks, reading a video and writing the file raise.
+    """
+    jobs = jobs_of_take(take)
+    detect(jobs, people=people, masks=masks, force=force, progress=progress)
+    return somebody(jobs)
+
+
+def somebody(jobs: Sequence[Job]) -> dict[str, Path]:
+    """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
+    from kinefit.readers.detections import read_detections
+
+    empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
+    remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
+    if len(empty) == len(jobs):
+        told = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
+        raise ObservationError(f"the detector finds nobody in {told}", file=jobs[0].video, remedy=remedy)
+    for camera, frames in empty.items():
+        _screen.note(f"note: the detector finds nobody in camera {camera} ({frames} pictures): left out. {remedy}")
+    return {job.camera: job.file for job in jobs if job.camera not in empty}
+
+
+def detect(
+    jobs: Sequence[Job], *, people: int | None = None, masks: bool | None = None, force: bool = False,
+    progress: _screen.Step | None = None,
+) -> list[Job]:
+    """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
+
+    Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
+    """
+    from kinefit.readers.detections import detections_key
+
+    keys = {job: _video_key(job.video) for job in jobs}
+    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks)]
+    if not todo:
+        return []
+    folder = _networks(progress)
+    number, outlines = people or PEOPLE, True if masks is None else masks
+    stop, lock = threading.Event(), threading.Lock()
+
+    def tell(camera: str, done: int, total: int) -> None:
+        if stop.is_set():
+            raise _Stopped
+        if progress:
+            with lock:
+                progress(camera, done, total)
+
+    def work(job: Job) -> None:
+        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines)}", tell)
+
+    _hush(folder)
+    with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
+        futures = [pool.submit(work, job) for job in todo]
+        try:
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+        except KeyboardInterrupt as stopped:
+            kept = len(jobs) - len(todo) + sum(future.done() for future in futures)
+            told = f"{kept} of {len(jobs)} videos are done and kept; the same command goes on with the others."
+            raise KeyboardInterrupt(told) from stopped
+        finally:  # after an error, or Ctrl-C: those that run end at their next picture
+            stop.set()
+            for future in futures:
+                future.cancel()
+    for future in done:
+        future.result()
+    return todo
+
+
+class _Stopped(Exception):
+    """Another camera failed, or Ctrl-C came."""
+
+
+def _look_through(
+    job: Job, networks: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None]
+) -> None:
+    from kinefit.exporters.detections import write_detections
+    from kinefit.images.detection import detect_people
+    from kinefit.images.models import Models
+    from kinefit.readers.video import Video
+
+    models = Models(networks)
+    with Video(job.video) as video:
+
+        def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
+            for number, image in enumerate(images):
+                tell(job.camera, number, len(video))
+                yield image
+            tell(job.camera, len(video), len(video))
+
+        found = detect_people(
+            counted(video.frames()), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
+            source=str(job.video),
+        )
+    write_detections(found, job.file, key=key)
+
+
+def _networks(progress: _screen.Step | None) -> Path:
+    """Folder with the networks; their licence is shown when they are fetched."""
+    from kinefit.assets import MODELS_CREDIT, detector_models
+    from kinefit.images.models import check_runtime
+
+    check_runtime()
+    fetched: list[int] = []
+
+    def told(done: int, total: int) -> None:
+        if not fetched:
+            _screen.note(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
+        fetched.append(done)
+        if progress:
+            progress("fetching MB", done // 10**6, total // 10**6)
+
+    return detector_models(told)
+
+
+def _video_key(video: Path) -> str:
+    """Text that another video, or another detector, does not have."""
+    from kinefit.assets import MODELS_PACKAGE
+    from kinefit.errors import FileError
+
+    digest = hashlib.sha256()
+    try:
+        with video.open("rb") as file:
+            size = file.seek(0, os.SEEK_END)
+            for start in (0, max(0, size - _ENDS)):
+                file.seek(start)
+                digest.update(file.read(_ENDS))
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=video, remedy="Check the path.") from error
+    return f"{digest.hexdigest()[:32]} {size} {MODELS_PACKAGE} {_METHOD}"
+
+
+def _settings(people: int, masks: bool) -> str:
+    return f"people={people} masks={masks}"
+
+
+def _fits(found: str | None, key: str, people: int | None, masks: bool | None) -> bool:
+    """Whether what was found is of this video and of the settings that matter."""
+    if found is None or not found.startswith(key + " "):
+        return False
+    settings = dict(part.split("=") for part in found[len(key) + 1 :].split())
+    wanted = {"people": people, "masks": masks}
+    return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
+
+
+def _cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _hush(networks: Path) -> None:
+    """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
+    from kinefit.images.models import Models
+
+    sys.stderr.flush()
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        Models(networks)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """OpenCV without threads of its own: the cameras run side by side."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,70 @@
+"""`kinefit detect`: keypoints and outlines of the people in videos, with nothing but the videos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _detecting, _screen
+
+_EXAMPLES = """\b
+Examples:
+  kinefit detect my_take/take.toml      every video of a take, into my_take/take-detect
+  kinefit detect left.mp4 right.mp4     videos alone, into left-detect.npz and right-detect.npz
+  kinefit detect take.toml --people 1   faster where nobody else is in view
+"""
+
+
+@click.command(short_help="Find people, their keypoints and outlines in the videos of a take.", epilog=_EXAMPLES)
+@click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=click.Path(path_type=Path))
+@click.option(
+    "--people", type=click.IntRange(1, 20), default=_detecting.PEOPLE, show_default=True,
+    help="How many are followed at most in one camera.",
+)
+@click.option("--masks/--no-masks", default=True, show_default=True, help="Keep everybody's outline too.")
+@click.option("--force", is_flag=True, help="Do it again where it is done already.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
+@_screen.verbose_option
+def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out: Path | None, verbose: bool) -> None:
+    """Find people, their 33 keypoints and their outlines in every picture of the videos.
+
+    Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
+    there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
+    pip install 'kinefit[detect]'. The networks (36 MB) are fetched once, through pip, and kept.
+    """
+    jobs = _jobs(inputs, out)
+    with _screen.bars() as step:
+        done = _detecting.detect(jobs, people=people, masks=masks, force=force, progress=step)
+    _show(jobs, done)
+    _detecting.somebody(jobs)
+
+
+def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[_detecting.Job]:
+    from kinefit.readers.take import read_take
+
+    takes = [path for path in inputs if path.suffix.lower() == ".toml"]
+    if takes:
+        if len(inputs) > 1 or out is not None:
+            raise click.UsageError("give one take alone, without --out; or video files")
+        return _detecting.jobs_of_take(read_take(takes[0]))
+    names = [path.stem for path in inputs]
+    if out is not None and len(set(names)) < len(names):
+        raise click.UsageError("two videos of one name cannot go into one folder: leave --out away")
+    return [
+        _detecting.Job(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
+        for path in inputs
+    ]
+
+
+def _show(jobs: list[_detecting.Job], done: list[_detecting.Job]) -> None:
+    """One line for each video, one picture for all."""
+    from kinefit.readers.detections import read_detections
+
+    for job in jobs:
+        found = read_detections(job.file)
+        seen = found.seen.sum(axis=0)
+        told = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "nobody"
+        state = "" if job in done else " (already there)"
+        _screen.say(f"{job.camera}: {len(found)} pictures, {told}{state}")
+        _screen.say(f"  {job.file}")

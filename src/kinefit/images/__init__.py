@@ -1,0 +1,1 @@
+"""From pixels to measurements: people, their keypoints and their masks."""

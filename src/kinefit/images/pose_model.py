@@ -1,0 +1,96 @@
+"""Landmarks and mask of one person in a region of a picture: the landmark network of BlazePose.
+
+Source: Bazarevsky et al., BlazePose, 2020; the refinement by heatmaps is that of its published pipeline.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIZE = 256  # [px] side of the network's picture
+_POINTS = 33  # landmarks of MEDIAPIPE_33; two more tell where the person is in the next picture
+_HEAT = 64  # [px] side of the heatmaps
+_WINDOW = np.arange(-3, 4)  # of a heatmap around a landmark
+_PEAK = 0.5  # least height of a heatmap that moves its landmark
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """What the network sees in a crop.
+
+    Parameters
+    ----------
+    points : (33, 2) [px of the crop]
+    visibility, presence : (33,) 0..1
+        That a point is not hidden; that it is in the crop.
+    middle, rim : (2,) [px of the crop]
+        Middle of the hips and a point above it on the circle around the body: the next region.
+    score : float, 0..1
+        That there is a person.
+    mask : (256, 256) float32, probability that a pixel of the crop is the person's.
+    """
+
+    points: NDArray
+    visibility: NDArray
+    presence: NDArray
+    middle: NDArray
+    rim: NDArray
+    score: float
+    mask: NDArray[np.float32]
+
+
+class PoseModel:
+    """Landmarks and mask in a crop.
+
+    Parameters
+    ----------
+    interpreter
+        Of `pose_landmark_full.tflite`.
+    """
+
+    def __init__(self, interpreter: Any) -> None:
+        self._interpreter = interpreter
+        self._input = interpreter.get_input_details()[0]["index"]
+        outputs = {tuple(int(n) for n in o["shape"]): o["index"] for o in interpreter.get_output_details()}
+        self._landmarks, self._score = outputs[1, 195], outputs[1, 1]
+        self._mask, self._heat = outputs[1, SIZE, SIZE, 1], outputs[1, _HEAT, _HEAT, 39]
+
+    def __call__(self, crop: NDArray[np.uint8]) -> Pose:
+        """Pose of the person in an RGB crop (256, 256, 3)."""
+        read = self._interpreter.get_tensor
+        self._interpreter.set_tensor(self._input, (crop * np.float32(1 / 255))[None])
+        self._interpreter.invoke()
+        landmarks = read(self._landmarks).reshape(39, 5).astype(float)
+        points = refine(landmarks[:, :2], read(self._heat)[0])
+        visibility, presence = _sigmoid(landmarks[:_POINTS, 3:].T)
+        return Pose(
+            points[:_POINTS], visibility, presence, points[_POINTS], points[_POINTS + 1],
+            float(read(self._score).item()), _sigmoid(read(self._mask)[0, :, :, 0]),
+        )
+
+
+def refine(points: NDArray, heat: NDArray) -> NDArray:
+    """Move points (K, 2) [px of the crop] to the centre of mass of their heatmap (64, 64, K) of logits near them.
+
+    Where the heatmap is flat or the point lies outside of it, the point stays.
+    """
+    step = SIZE / _HEAT
+    cell = np.floor(points / step).astype(int)
+    inside = ((cell >= 0) & (cell < _HEAT)).all(axis=1)
+    v, u = (cell[:, None, k] + _WINDOW for k in (1, 0))
+    in_map = ((v >= 0) & (v < _HEAT))[:, :, None] & ((u >= 0) & (u < _HEAT))[:, None, :]
+    vc, uc = np.clip(v, 0, _HEAT - 1), np.clip(u, 0, _HEAT - 1)
+    weight = _sigmoid(heat[vc[:, :, None], uc[:, None, :], np.arange(len(points))[:, None, None]]) * in_map
+    total = weight.sum(axis=(1, 2))
+    moved = inside & (weight.max(axis=(1, 2)) >= _PEAK) & (total > 0)
+    total = np.where(moved, total, 1.0)
+    mean = np.column_stack([(weight * u[:, None, :]).sum(axis=(1, 2)), (weight * v[:, :, None]).sum(axis=(1, 2))])
+    return np.where(moved[:, None], mean / total[:, None] * step, points)
+
+
+def _sigmoid(x: NDArray) -> NDArray:
+    return 0.5 * (1 + np.tanh(0.5 * x))  # which does not overflow
