@@ -1,9 +1,10 @@
 """`kinefit calibrate`: from pictures to a calibration that reads back; what it says when it cannot."""
 
+import cv2
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kinefit.cli import main
 from kinefit.cli.calibrate import calibrate
 from kinefit.errors import CalibrationError, ExportError, FileError
 from kinefit.readers.calibration import read_calibration
@@ -14,7 +15,6 @@ def call(*words):
 
 
 def test_help_names_both_ways_and_examples():
-    assert main is not None
     told = call("--help").output
     assert "board" in told and "people" in told
     told = call("board", "--help").output
@@ -64,7 +64,9 @@ def test_usage(words):
     assert call(*words).exit_code == 2
 
 
-def test_floor_is_a_frame_or_a_time(tmp_path):
+@pytest.mark.parametrize(("floor", "said"), [("soon", "is no frame"), ("2.5s", "pictures have no times")])
+def test_floor_is_a_frame_or_a_time(tmp_path, floor, said):
     (tmp_path / "a").mkdir()
-    told = call("board", tmp_path / "a", "--board", "checkerboard:9x6:0.025", "--floor", "soon")
-    assert told.exception is not None
+    (tmp_path / "a" / "1.png").write_bytes(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes())
+    told = call("board", tmp_path / "a", "--board", "checkerboard:9x6:0.025", "--floor", floor)
+    assert told.exit_code == 2 and said in " ".join(told.output.split())

@@ -68,6 +68,18 @@ def test_a_known_person_comes_back(shifted, lengths_within):
     np.testing.assert_allclose(shape.scales[limbs], scales[limbs], rtol=0.06 if shifted else 0.02)
 
 
+def test_a_length_that_nobody_sees_follows_the_others():
+    pixels, states, _ = seen(np.full(len(GROUPS), 1.12), np.zeros((len(SET), 3)), frames=8)
+    weight = np.array(pixels.weight)
+    weight[:, np.isin(pixels.column, [k for k, n in enumerate(SET.names) if "Knee" in n or "Ankle" in n])] = 0.0
+    weight[:, np.isin(pixels.column, [k for k, n in enumerate(SET.names) if "Toe" in n or "Heel" in n])] = 0.0
+    legless = PixelFrames(SET, pixels.camera, pixels.column, pixels.uv, weight)
+    scales = fit_shape(BODY, RIG, legless, states, np.ones(len(GROUPS))).scales
+    assert scales[GROUPS.index("shank")] == pytest.approx(1.12, abs=0.03)
+    told = fit_shape(BODY, RIG, legless, states, np.ones(len(GROUPS)), whole=1.05).scales
+    assert told[GROUPS.index("shank")] < scales[GROUPS.index("shank")]
+
+
 def test_left_and_right_are_alike():
     scales, shifts = person(1)
     pixels, states, _ = seen(scales, shifts, frames=6)

@@ -35,6 +35,13 @@ def robust(kind, scale, s2):
 
 
 @jit
+def robust_factors(kind, scale, s2, out):
+    """Robust factors of squared residuals s2 (N,) in variances."""
+    for i in range(s2.size):
+        out[i] = robust(kind, scale, s2[i])[1]
+
+
+@jit
 def weigh(data, group, count, kind, scale, factor):
     """Robust factor of every row, shared by the rows of one measurement; returns the cost Σ ρ(w r²)."""
     cost = 0.0

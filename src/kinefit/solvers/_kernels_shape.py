@@ -8,6 +8,7 @@ from kinefit._jit import jit
 from kinefit.correspondences._kernels import place
 from kinefit.geometry._kernels_camera import project_jacobian
 from kinefit.solvers._kernels import robust
+from kinefit.solvers._kernels_cameras import COLUMNS, camera_columns
 
 
 @jit
@@ -26,20 +27,23 @@ def scale_motion(parents, offsets, groups, frames, motion):
 @jit
 def frame_system(
     parents, dof_parent, last_dof, offsets, groups, n_groups,
-    owner, rest, base, shift, mirror, cameras, camera, column, target, weight,
-    frames, screws, centre, kind, scale, H, g,
+    owner, rest, base, shift, mirror, cameras, camera, column, target, weight, share,
+    frames, screws, centre, kind, scale, freedom, first, velocity, H, g,
 ):  # fmt: skip
-    """Add one frame's pixels to H (m, m; lower triangle) and g (m,), m = dofs, then scales, then point shifts.
+    """Add one frame's pixels to H (m, m; lower triangle) and g (m,): dofs, scales, point shifts, cameras.
 
     owner (K,), rest (K, 3): points of the body; base (K, 3): their place in the segment before scaling; shift (K,):
     first shift parameter of each point, -1 for none; mirror (K,): -1 where the shift counts mirrored in z.
-    Measurements: camera (N,), column (N,) point, target (N, 2) [px], weight (N,) [1/px²]. Returns the robust cost.
+    Measurements: camera (N,), column (N,) point, target (N, 2) [px], weight (N,) [1/px²],
+    share (N,) of it that counts beyond the loss. Cameras: freedom (C, 10) of
+    their parameters, first parameter's place (-1: cameras are fixed), velocity (N, 2) [px/s]. Returns the robust cost.
     """
     n = screws.shape[0] + 6
     motion = np.empty((parents.size, n_groups, 3))
     scale_motion(parents, offsets, groups, frames, motion)
-    index = np.empty(n + n_groups + 3, np.int64)
-    ju, jv = np.empty(n + n_groups + 3), np.empty(n + n_groups + 3)
+    index = np.empty(n + n_groups + 3 + COLUMNS, np.int64)
+    ju, jv = np.empty(index.size), np.empty(index.size)
+    cu, cv = np.empty(COLUMNS), np.empty(COLUMNS)
     cost = 0.0
     for m in range(camera.size):
         w = weight[m]
@@ -52,8 +56,8 @@ def frame_system(
             continue
         ru, rv = target[m, 0] - u, target[m, 1] - v
         rho, factor = robust(kind, scale, w * (ru * ru + rv * rv))
-        cost += rho
-        w *= factor
+        cost += share[m] * rho
+        w *= factor * share[m]
         if w <= 0.0:
             continue
         count = 0
@@ -94,6 +98,15 @@ def frame_system(
                 ju[count] = ux * mx + uy * my + uz * mz
                 jv[count] = vx * mx + vy * my + vz * mz
                 count += 1
+        if first >= 0:
+            c = camera[m]
+            camera_columns(
+                cameras[c], freedom[c], velocity[m], x, y, z, u, v, ux, uy, uz, vx, vy, vz, cu, cv
+            )
+            for i in range(COLUMNS):
+                if freedom[c, i] > 0.0:
+                    index[count], ju[count], jv[count] = first + c * COLUMNS + i, cu[i], cv[i]
+                    count += 1
         for a in range(count):
             ia = index[a]
             wu, wv = w * ju[a], w * jv[a]
@@ -106,7 +119,7 @@ def frame_system(
 
 
 @jit
-def frame_cost(owner, rest, cameras, camera, column, target, weight, frames, kind, scale):
+def frame_cost(owner, rest, cameras, camera, column, target, weight, share, frames, kind, scale):
     """Robust cost of one frame's pixels alone."""
     cost = 0.0
     for m in range(camera.size):
@@ -116,5 +129,5 @@ def frame_cost(owner, rest, cameras, camera, column, target, weight, frames, kin
         ok, u, v, _, _, _, _, _, _ = project_jacobian(cameras[camera[m]], x, y, z)
         if ok:
             du, dv = target[m, 0] - u, target[m, 1] - v
-            cost += robust(kind, scale, weight[m] * (du * du + dv * dv))[0]
+            cost += share[m] * robust(kind, scale, weight[m] * (du * du + dv * dv))[0]
     return cost

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from kinefit.errors import ObservationError
 from kinefit.solvers import _kernels
 
@@ -24,6 +27,13 @@ class Loss:
     def __post_init__(self) -> None:
         if not self.scale > 0:
             raise ObservationError(f"the scale of a loss must be positive, got {self.scale}")
+
+    def factor(self, s2: NDArray) -> NDArray:
+        """Robust factors, in 0..1, of squared residuals (...) in variances."""
+        s2 = np.ascontiguousarray(s2, float)
+        out = np.empty(s2.size)
+        _kernels.robust_factors(self.kind, self.scale, s2.ravel(), out)
+        return out.reshape(s2.shape)
 
 
 SQUARED = Loss()

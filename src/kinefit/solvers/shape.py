@@ -13,10 +13,18 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
-from kinefit.solvers import _kernels_linear, _kernels_shape
-from kinefit.solvers.losses import Loss, geman_mcclure
+from kinefit.solvers import _kernels, _kernels_linear, _kernels_shape
+from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure
 
 _MIDDLE = 0.002  # [m] spread of a point in the middle to either side
+PROPORTIONS = 0.05
+"""How far one length departs from the person's size, as a share.
+
+In the 1988 anthropometric survey of U.S. Army personnel (C. Gordon et al., 1989; J. Cheverud et al., 1990) segment
+lengths vary by 4 to 6 % and correlate with stature by 0.5 to 0.9, which leaves 2 to 4 %; and a detector's points are
+not quite the body's.
+"""
+_UNKNOWN_SIZE, _KNOWN_SIZE = 0.2, 0.02  # one standard deviation of a person's size, as a share; shoes, posture, a guess
 _POSTURE = 0.01  # share of the posture prior: here lengths matter, and it would bend them
 
 
@@ -31,6 +39,8 @@ class PixelFrames:
     column : (N,) int, which of the K points.
     uv : (F, N, 2) [px]
     weight : (F, N) [1/px²], 0 where unseen.
+    share : (N,) in 0..1, optional
+        How much of a measurement counts beyond the loss: below 1 for points whose errors come together.
     """
 
     points: PointSet
@@ -38,16 +48,30 @@ class PixelFrames:
     column: NDArray
     uv: NDArray
     weight: NDArray
+    share: NDArray | None = None
+
+    @property
+    def shares(self) -> NDArray:
+        """(N,) the share, 1 by default."""
+        return np.ones(len(self.column)) if self.share is None else self.share
 
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Scales (G,) of the body's groups, shifts (K, 3) [m] of its points in their segments, and the frames' states."""
+    """Scales (G,) of the body's groups, shifts (K, 3) [m] of its points in their segments, and the frames' states.
+
+    `parameters` tells what the shape's p parameters are, `theta` (p,) their values, `information` (p, p) what the
+    pixels alone tell of them (poses eliminated), `prior` (p, p) what was known before.
+    """
 
     scales: NDArray
     shifts: NDArray
     states: tuple[BodyState, ...]
     cost: float
+    parameters: ShapeParameters
+    theta: NDArray
+    information: NDArray
+    prior: NDArray
 
 
 def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, NDArray]:
@@ -72,14 +96,14 @@ def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, N
 
 
 @dataclass(frozen=True, eq=False)
-class _Parameters:
+class ShapeParameters:
     """What a shape consists of: scales (G,), then three shifts for each point that leads its mirror images."""
 
     body: Body
     points: PointSet
     shift: NDArray  # (K,) first shift parameter of each point
     mirror: NDArray  # (K,) ±1, sign of z
-    prior: NDArray  # (p,) 1/σ²
+    prior: NDArray  # (p, p) inverse covariance
     mean: NDArray  # (p,)
 
     def geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
@@ -93,14 +117,77 @@ class _Parameters:
         return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
 
 
-def _parameters(body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float) -> _Parameters:
+    def equations(
+        self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray, uv: NDArray,
+        weight: NDArray, *, loss: Loss = SQUARED, share: NDArray | None = None, freedom: NDArray | None = None,
+        velocity: NDArray | None = None,
+    ) -> tuple[NDArray, NDArray]:
+        """One frame's pixels as H (n + p, n + p; lower triangle) and g: degrees of freedom, then shape, then cameras.
+
+        camera, column (N,) int, uv (N, 2) [px] and weight (N,) [1/px²] as in `PixelFrames`. With `freedom` (C, 10) the
+        cameras' parameters follow (see `solvers.cameras`); velocity (N, 2) [px/s] of the pixels tells of their times.
+        """
+        tree, body = self.body.tree, self.body
+        moved, rest, _ = self.geometry(theta)
+        placed, screws = moved.forward(state.T_world_root, state.angles)
+        first = tree.n_dofs + len(self.mean)
+        size = first + (0 if freedom is None else freedom.size)
+        H, g = np.zeros((size, size)), np.zeros(size)
+        _kernels_shape.frame_system(
+            tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
+            self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, camera, column, uv,
+            weight, np.ones(len(weight)) if share is None else share, placed, screws,
+            np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
+            np.empty((0, 0)) if freedom is None else freedom, -1 if freedom is None else first,
+            np.zeros(uv.shape) if velocity is None else velocity, H, g,
+        )  # fmt: skip
+        return H, g
+
+
+    def pixels(self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray) -> NDArray:
+        """(N, 2) [px] where every measurement's point is seen; NaN where it cannot be."""
+        moved, rest, _ = self.geometry(theta)
+        f, _ = moved.forward(state.T_world_root, state.angles)
+        f = f[self.points.segments]
+        x = (f[:, :9].reshape(-1, 3, 3) @ rest[:, :, None])[..., 0] + f[:, 9:]
+        out = np.empty((len(column), 2))
+        for c, one in enumerate(rig):
+            out[camera == c] = one.project(x[column[camera == c]])
+        return out
+
+    def joint_moves(self, theta: NDArray, state: BodyState) -> tuple[NDArray, NDArray]:
+        """How joint centres move (S, 3, n) with the degrees of freedom, and (S, 3, p) with the shape."""
+        tree = self.body.tree
+        moved, _, _ = self.geometry(theta)
+        frames, screws = moved.forward(state.T_world_root, state.angles)
+        moves = np.empty((len(tree.segments), 3, tree.n_dofs))
+        _kernels.joint_moves(frames, screws, moved.rest, state.T_world_root, tree.dof_parent, tree.last_dof, moves)
+        stretch = np.empty((len(tree.segments), len(self.body.scale_groups), 3))
+        _kernels_shape.scale_motion(tree.parents, tree.offsets, self.body.segment_scale, frames, stretch)
+        shape = np.zeros((len(tree.segments), 3, len(self.mean)))
+        shape[:, :, : stretch.shape[1]] = stretch.swapaxes(1, 2)
+        return moves, shape
+
+
+def shape_parameters(
+    body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float, *, whole: float | None = None
+) -> ShapeParameters:
+    """What a body's shape consists of, and its prior: one scale a group, shifts of points [m].
+
+    All scales follow the person's size: `whole` (known to 2 %), or else the middle of `scales`, loosely; each differs
+    from it by the share `scale_sigma`. So a length that nothing measures goes with those that something does.
+    """
     lead, sign = mirror_points(points, body.tree.segments)
     leaders = np.unique(lead)
     shift = 3 * np.searchsorted(leaders, lead)
-    prior = np.concatenate([np.full(len(scales), scale_sigma**-2), np.full(3 * len(leaders), shift_sigma**-2)])
-    prior[len(scales) + shift[sign == 0.0] + 2] = _MIDDLE**-2
-    mean = np.concatenate([scales, np.zeros(3 * len(leaders))])
-    return _Parameters(body, points, shift, np.where(sign == 0.0, 1.0, sign), prior, mean)
+    groups, size = len(scales), float(np.median(scales)) if whole is None else whole
+    common = (_UNKNOWN_SIZE if whole is None else _KNOWN_SIZE) * size
+    prior = np.diag(np.full(groups + 3 * len(leaders), shift_sigma**-2))
+    middle = groups + shift[sign == 0.0] + 2
+    prior[middle, middle] = _MIDDLE**-2
+    prior[:groups, :groups] = np.linalg.inv(np.eye(groups) * (scale_sigma * size) ** 2 + common**2)
+    mean = np.concatenate([np.full(groups, size), np.zeros(3 * len(leaders))])
+    return ShapeParameters(body, points, shift, np.where(sign == 0.0, 1.0, sign), prior, mean)
 
 
 def fit_shape(
@@ -110,8 +197,9 @@ def fit_shape(
     states: Sequence[BodyState],
     scales: NDArray,
     *,
-    scale_sigma: float = 0.1,
+    scale_sigma: float = PROPORTIONS,
     shift_sigma: float = 0.01,
+    whole: float | None = None,
     loss: Loss | None = None,
     max_iterations: int = 12,
     tolerance: float = 1e-3,
@@ -122,9 +210,11 @@ def fit_shape(
     ----------
     body : Body, unscaled: `scales` and the result refer to it.
     states : one for each frame, near the truth.
-    scales : (G,) where to start, and the mean of the prior.
+    scales : (G,) where to start; their middle is the person's size, if `whole` is not given.
     scale_sigma : float
-        Spread of each scale about its start, as a share.
+        Spread of each scale about the person's size, as a share.
+    whole : float, optional
+        The person's size, as a share of the body's, where the stature is known.
     shift_sigma : float [m]
         Spread of a detector's point about the anatomical one, along each axis. It also decides what the data cannot: a
         point shifted along a joint's turn looks the same as the joint turned.
@@ -134,32 +224,28 @@ def fit_shape(
     """
     loss = loss or geman_mcclure()
     tree, n = body.tree, body.tree.n_dofs
-    model = _parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma)
+    model = shape_parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma, whole=whole)
     posture = _POSTURE * np.square(1.0 / tree.spread)
     p, groups = len(model.mean), len(body.scale_groups)
     owner, cameras = frames.points.segments, rig.packed
 
     def cost_of(theta: NDArray, states: Sequence[BodyState]) -> float:
         moved, rest, _ = model.geometry(theta)
-        total = float(model.prior @ np.square(theta - model.mean))
+        bent = theta - model.mean
+        total = float(bent @ model.prior @ bent)
         for f, state in enumerate(states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
             total += float(posture @ np.square(state.angles - tree.usual)) + _kernels_shape.frame_cost(
-                owner, rest, cameras, frames.camera, frames.column, frames.uv[f], frames.weight[f], placed,
-                loss.kind, loss.scale,
+                owner, rest, cameras, frames.camera, frames.column, frames.uv[f], frames.weight[f],
+                frames.shares, placed, loss.kind, loss.scale,
             )  # fmt: skip
         return total
 
     def system(theta: NDArray, state: BodyState, f: int) -> tuple[NDArray, NDArray]:
-        moved, rest, _ = geometry
-        placed, screws = moved.forward(state.T_world_root, state.angles)
-        H, g = np.zeros((n + p, n + p)), np.zeros(n + p)
-        _kernels_shape.frame_system(
-            tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, groups, owner, rest,
-            frames.points.points, model.shift, model.mirror, cameras, frames.camera, frames.column, frames.uv[f],
-            frames.weight[f], placed, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
-            H, g,
-        )  # fmt: skip
+        H, g = model.equations(
+            theta, state, rig, frames.camera, frames.column, frames.uv[f], frames.weight[f], loss=loss,
+            share=frames.shares,
+        )
         H[range(6, n), range(6, n)] += posture
         g[6:n] -= posture * (state.angles - tree.usual)
         if not tree.root_free:
@@ -168,24 +254,24 @@ def fit_shape(
         return H, g
 
     def step(theta: NDArray, states: Sequence[BodyState], damping: float) -> tuple[NDArray, list[BodyState]]:
-        S, b = np.diag(model.prior), model.prior * (model.mean - theta)
+        S, b = model.prior.copy(), model.prior @ (model.mean - theta)
         kept = np.empty((len(states), p + 1, n))
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
             if not _kernels_linear.eliminate(H, g, n, damping, tree.chain, tree.depth, S, b, kept[f]):
                 kept[f] = 0.0
-        S += np.tril(S, -1).T - np.triu(S, 1) + damping * np.diag(np.diag(S))
+        S = np.tril(S) + np.tril(S, -1).T
+        S += damping * np.diag(np.diag(S))
         delta = np.linalg.solve(S, b)
         moves = kept[:, p] - delta @ kept[:, :p]
         new = theta + delta
         new[:groups] = np.clip(new[:groups], 0.2, 5.0)
         return new, [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(states, moves, strict=True)]
 
-    theta, states = model.mean.copy(), list(states)
+    theta, states = np.concatenate([scales, np.zeros(p - groups)]), list(states)
     cost, damping = cost_of(theta, states), 1e-3
     for _ in range(max_iterations):
-        geometry = model.geometry(theta)
         systems = [system(theta, state, f) for f, state in enumerate(states)]
         new, moved = step(theta, states, damping)
         while not (new_cost := cost_of(new, moved)) < cost and damping < 1e4:
@@ -197,4 +283,13 @@ def fit_shape(
         damping = max(damping * 0.1, 1e-9)
         if fall < tolerance * cost:
             break
-    return Shape(theta[:groups].copy(), model.geometry(theta)[2], tuple(states), cost)
+    information = np.zeros((p, p))
+    for f, state in enumerate(states):
+        H, g = system(theta, state, f)
+        information += H[n:, n:]
+        _kernels_linear.eliminate(H, g, n, 1e-9, tree.chain, tree.depth, information, np.zeros(p), np.empty((p + 1, n)))
+    information += np.tril(information, -1).T - np.triu(information, 1)
+    return Shape(
+        theta[:groups].copy(), model.geometry(theta)[2], tuple(states), cost, model, theta, information,
+        model.prior,
+    )  # fmt: skip

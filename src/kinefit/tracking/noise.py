@@ -8,6 +8,7 @@ are told apart by how residuals change from frame to frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,15 @@ class DetectorNoise:
     drift: NDArray
     memory: float
     shift: NDArray
+
+    def as_told(self, sources: tuple[str, ...]) -> dict[str, Any]:
+        """The same in a few numbers: medians over all channels."""
+        return {
+            "jitter [px]": round(float(np.median(self.white)), 2),
+            "drift [px]": round(float(np.median(self.drift)), 2),
+            "drift lasts [s]": round(self.memory, 2),
+            "shift of a camera [px]": {q: s.round(2).tolist() for q, s in zip(sources, self.shift)},
+        }
 
 
 def estimate_noise(

@@ -20,6 +20,9 @@ Progress = Callable[[str, int, int], None]
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take tells
 _BELIEF = 5.0  # axes of points that this counts for
+_UNTOLD = 1.35  # variance of shapes found, over what they tell: limits, weights and spreads are taken for known there.
+# Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
+_MOST_HIDDEN = 0.75  # share of all errors that a fit may be thought to follow
 _ROUNDS = 3  # of fits with a better spread; it changes by less than a tenth from then on
 _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
 
@@ -28,8 +31,8 @@ _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a
 class Subject:
     """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
 
-    `shape` tells from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a body
-    that was given.
+    `shape` tells from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a
+    body that was given.
     """
 
     body: Body
@@ -79,7 +82,8 @@ def fit_subject(
         )
     weight = _weights(body.scaled(scales), sized, states)
     pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[list(states)], weight)
-    shape, covariance = _shape(body, channels, pixels, list(states.values()), scales)
+    whole = height / body.stature if height and body.stature else None
+    shape, covariance = _shape(body, channels, pixels, list(states.values()), scales, whole)
     fitted = body.scaled(shape.scales)
     for name, span in channels.sets.items():
         points = fitted.keypoints(name)
@@ -92,31 +96,32 @@ def fit_subject(
 
 
 def _shape(
-    body: Body, channels: Channels, pixels: PixelFrames, states: list[BodyState], scales: NDArray
+    body: Body, channels: Channels, pixels: PixelFrames, states: list[BodyState], scales: NDArray, whole: float | None
 ) -> tuple[Shape, NDArray]:
     """Shape, with as much freedom for a detector's points as this take asks for; and its covariance (p, p).
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's spread, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis.
     """
-    spread = _SHIFT
+    spread, known = _SHIFT, 0.0
     for _ in range(_ROUNDS):
-        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread)
-        covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels))
+        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole)
+        covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels, known))
         moved = shape.theta - shape.parameters.mean
         open_to = np.isclose(np.diag(shape.prior), spread**-2)
         told = 1.0 - np.diag(covariance)[open_to] / spread**2
-        spread = float(
-            np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (np.sum(np.maximum(told, 0.0)) + _BELIEF))
-        )
-    return shape, covariance
+        known = len(moved) - float(np.sum(shape.prior * covariance))  # how many parameters the pixels tell
+        told = float(np.sum(np.maximum(told, 0.0)))
+        spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
+    return shape, _UNTOLD * covariance
 
 
-def _excess(shape: Shape, channels: Channels, pixels: PixelFrames) -> float:
+def _excess(shape: Shape, channels: Channels, pixels: PixelFrames, known: float) -> float:
     """How many times larger than assumed a channel's variance is once all frames are averaged.
 
     A detector's errors last: the mean over F frames varies by more than 1/F of the variance of one. Both are taken from
-    the residuals that are no outliers, F times the first and the second, and the larger counts.
+    the residuals that are no outliers, F times the first and the second, and the larger counts. Of 2 N means of N
+    channels the poses hide as many as they have degrees of freedom, and the shape its `known` ones.
     """
     fitted = np.stack([
         shape.parameters.pixels(shape.theta, s, channels.rig, pixels.camera, pixels.column) for s in shape.states
@@ -130,7 +135,8 @@ def _excess(shape: Shape, channels: Channels, pixels: PixelFrames) -> float:
     r = np.where(np.abs(r) < 3.0 * size, r, np.nan)
     counts = np.isfinite(r).sum(axis=0)
     means = np.nansum(r, axis=0) / np.maximum(counts, 1)
-    lasting = float(np.sum(counts**2 * means**2) / max(counts.sum(), 1))
+    hidden = (shape.parameters.body.tree.n_dofs + known) / max(int(np.sum(counts > 0)), 1)
+    lasting = float(np.sum(counts**2 * means**2) / max(counts.sum(), 1)) / (1.0 - min(hidden, _MOST_HIDDEN))
     return max(lasting, float(size**2), 1e-3)
 
 

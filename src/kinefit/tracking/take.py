@@ -17,9 +17,10 @@ from kinefit.tracking.video import Progress, track
 
 
 def track_take(
-    take: Take | str | PathLike[str], *, settings: Settings | None = None, progress: Progress | None = None
+    take: Take | str | PathLike[str], *, smooth: bool = True, settings: Settings | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file.
+    """Track the person of a take file; `smooth` as in `track`.
 
     Returns the motion and what the sensors saw (for overlays).
 
@@ -39,6 +40,7 @@ def track_take(
         body,
         accuracy=[entry.accuracy for entry in take.keypoints],
         subject=subject_of(take),
+        smooth=smooth,
         settings=settings,
         height=take.height,
         up=take.up,

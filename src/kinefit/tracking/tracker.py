@@ -36,6 +36,12 @@ class Settings:
         How long a velocity lasts that nothing confirms.
     poor : float in 0..1
         Support below which a frame is started anew from its own keypoints.
+    smooth_memory : float [s]
+        The same as velocity_memory, where a whole take is smoothed.
+    acceleration_memory : float [s]
+        How long an acceleration lasts, where a whole take is smoothed.
+    smooth_rounds : int
+        How often the strength of the motion prior and the pixels' noise are estimated anew, at most.
     """
 
     loss: Loss = field(default_factory=geman_mcclure)
@@ -43,6 +49,9 @@ class Settings:
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
     poor: float = 0.5
+    smooth_memory: float = 1.0
+    acceleration_memory: float = 0.2
+    smooth_rounds: int = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +64,7 @@ class FrameResult:
     dof_std : (6 + D,) [m, rad]
     joint_std : (S, 3) [m]
     factor : (N,) robust factor of every channel, 0 where unseen.
+    weight : (N,) [1/px²] with which every channel took part, that factor included.
     uv, fitted : (N, 2) [px] measurements as used, and where the body is seen.
     swapped : (N,) bool, channels exchanged with their partner.
     quality : float, and segment_quality (S,), in 0..1.
@@ -65,6 +75,7 @@ class FrameResult:
     dof_std: NDArray
     joint_std: NDArray
     factor: NDArray
+    weight: NDArray
     uv: NDArray
     fitted: NDArray
     swapped: NDArray
@@ -170,25 +181,46 @@ class Tracker:
     def _judge(self, fit: Fit, uv: NDArray, weight: NDArray, fitted: NDArray, swapped: NDArray) -> FrameResult:
         factor = np.zeros(len(weight))
         factor[fit.equations.rows.group] = fit.equations.factor
-        seen = weight > 0
-        support = self._informs @ factor
-        cameras = np.stack(
-            [self._informs[:, self.channels.camera == c] @ (factor > 0.3)[self.channels.camera == c] > 0
-             for c in range(len(self.channels.rig))]
-        ).sum(axis=0)  # fmt: skip
-        share = support / np.maximum(self._informs @ seen, 1.0)
-        quality = share * np.minimum(cameras, 2) / 2.0
         own = normal_equations(
             self.body, fit.state, [fit.equations.rows, prior_rows(self.body, fit.state)], loss=self.settings.loss
         )
         cov = covariance(own)
-        blind = 6 + np.flatnonzero(cov.std[6:] > 0.95 * self.body.tree.spread)  # known from the prior alone
+        blind = 6 + np.flatnonzero(prior_alone(self.body, cov.std))
         if blind.size:
             cov = Covariance(cov.observed, np.concatenate([cov.free, np.eye(len(cov.observed))[:, blind]], axis=1))
-        return FrameResult(
-            fit.state, cov.std, joint_std(self.body, fit.state, cov), factor, uv, fitted, swapped,
-            float(np.mean(quality)), quality, float(factor.sum() / max(int(seen.sum()), 1)),
-        )  # fmt: skip
+        std = cov.std, joint_std(self.body, fit.state, cov)
+        return judged(self.channels, self._informs, fit.state, std, uv, weight, factor, fitted, swapped)
+
+
+def prior_alone(body: Body, dof_std: NDArray) -> NDArray:
+    """(..., D) bool: coordinates that are known from the prior alone, by standard deviations (..., 6 + D)."""
+    return np.asarray(dof_std[..., 6:] > 0.95 * body.tree.spread)
+
+
+def judged(
+    channels: Channels, informs: NDArray, state: BodyState, std: tuple[NDArray, NDArray],
+    uv: NDArray, weight: NDArray, factor: NDArray, fitted: NDArray, swapped: NDArray,
+) -> FrameResult:  # fmt: skip
+    """A fitted frame with its quality.
+
+    Parameters
+    ----------
+    informs : (S, N) from `informing`.
+    std : (n,) of the degrees of freedom and (S, 3) [m] of the joint centres.
+    uv, fitted : (N, 2) [px] measured as used, and where the body is seen.
+    weight, factor : (N,) [1/px²] and in 0..1, of every measurement, 0 where unseen; swapped (N,).
+    """
+    seen = weight > 0
+    support = informs @ factor
+    cameras = np.stack(
+        [informs[:, channels.camera == c] @ (factor > 0.3)[channels.camera == c] > 0 for c in range(len(channels.rig))]
+    ).sum(axis=0)
+    share = support / np.maximum(informs @ seen, 1.0)
+    quality = share * np.minimum(cameras, 2) / 2.0
+    return FrameResult(
+        state, *std, factor, weight * factor, uv, fitted, swapped, float(np.mean(quality)), quality,
+        float(factor.sum() / max(int(seen.sum()), 1)),
+    )  # fmt: skip
 
 
 def informing(body: Body, channels: Channels) -> NDArray:

@@ -12,17 +12,21 @@ camera as a whole.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.solvers.equations import inverse
-from kinefit.solvers.shape import ShapeParameters
+from kinefit.solvers.shape import ShapeParameters, shape_parameters
 from kinefit.tracking.channels import Channels
-from kinefit.tracking.noise import DetectorNoise
+from kinefit.tracking.noise import DetectorNoise, estimate_noise
+from kinefit.tracking.subject import Subject
+from kinefit.tracking.tracker import FrameResult
 
+_MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
 _ANYWHERE = 1.0  # [m, rad] spread of a root that nothing holds, as a prior
 
 
@@ -34,11 +38,42 @@ class Lasting:
     ----------
     dofs : (n, n) [m, rad] covariance of the degrees of freedom.
     joints : (S, 3) [m²] variance of the joint centres along the world's axes.
-    leverage : (N,) share of its own error that the fit of the frame alone follows in every channel.
     """
 
     dofs: NDArray
     joints: NDArray
+
+
+def with_lasting_errors(
+    frames: Sequence[FrameResult], subject: Subject, channels: Channels, rate: float
+) -> tuple[list[FrameResult], DetectorNoise]:
+    """The same results with the standard deviations that lasting errors and the shape add; and the noise found.
+
+    Parameters
+    ----------
+    frames : results of neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
+    subject : with the shape that the take told; without one it is taken for exact.
+    channels : of the subject's points.
+    """
+    body = subject.body
+    factor, values = np.stack([r.factor for r in frames]), np.stack([r.uv - r.fitted for r in frames])
+    seen = float(np.mean(np.sum(factor > 0, axis=1)))
+    hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
+    noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
+    if subject.shape is None or subject.covariance is None:
+        parameters = shape_parameters(body, channels.points, np.ones(len(body.scale_groups)), 0.1, 0.01)
+        theta, Sigma = parameters.mean, np.zeros((len(parameters.mean),) * 2)
+    else:
+        parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
+    out = []
+    for result in frames:
+        more = lasting(parameters, theta, Sigma, channels, result.state, result.weight, noise)
+        out.append(replace(
+            result,
+            dof_std=np.sqrt(np.square(result.dof_std) + np.diag(more.dofs)),
+            joint_std=np.sqrt(np.square(result.joint_std) + more.joints),
+        ))  # fmt: skip
+    return out, noise
 
 
 def lasting(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,10 @@ from kinefit.motion import Motion, Residuals
 from kinefit.observations import Keypoints
 from kinefit.tracking.association import choose_people
 from kinefit.tracking.channels import Channels, make_channels
+from kinefit.tracking.smoothing import smooth_results
 from kinefit.tracking.subject import Progress, Subject, fit_subject
 from kinefit.tracking.tracker import FrameResult, Settings, Tracker
+from kinefit.tracking.uncertainty import with_lasting_errors
 
 
 class TrackingInterrupted(KeyboardInterrupt):
@@ -40,6 +43,8 @@ def track(
     subject: Subject | None = None,
     height: float | None = None,
     settings: Settings | None = None,
+    smooth: bool = True,
+    contacts: bool = False,
     shape_frames: int = 25,
     up: str = "z",
     name: str = "motion",
@@ -60,6 +65,10 @@ def track(
         Known already; default: fitted from this take.
     height : float [m]
         Stature, where it is known: the length of bones that nobody sees follows it.
+    smooth : bool
+        Fit all frames together in the end; without it each frame knows only of those before it.
+    contacts : bool
+        Hold the soles still where they rest on a level floor, when smoothing.
     shape_frames : int, how many frames bone lengths are found from.
     progress : called with (what, done, total).
 
@@ -87,8 +96,18 @@ def track(
     if subject is None:
         subject = fit_subject(body, channels, frames=shape_frames, height=height, progress=progress)
     channels = channels.with_points(subject.body)
+    settings = settings or Settings()
     results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
-    motion = _motion(subject.body, channels, results, keypoints[0], up, name)
+    frames = [r for r in results if r is not None]
+    assert len(frames) == len(results)
+    provenance = {}
+    if smooth and len(frames) == len(channels.uv):
+        frames, provenance["smoothing"] = smooth_results(
+            subject.body, channels, frames, keypoints[0].rate, settings, contacts=contacts, up=up
+        )
+    frames, noise = with_lasting_errors(frames, subject, channels, keypoints[0].rate)
+    provenance["detector noise"] = noise.as_told(channels.sources)
+    motion = _motion(subject.body, channels, frames, keypoints[0], up, name, provenance)
     if len(motion) < len(channels.uv):
         raise TrackingInterrupted(motion, len(channels.uv))
     return motion
@@ -127,10 +146,9 @@ def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> lis
 
 
 def _motion(
-    body: Body, channels: Channels, results: list[FrameResult | None], record: Keypoints, up: str, name: str
-) -> Motion:
-    frames = [r for r in results if r is not None]
-    assert len(frames) == len(results)
+    body: Body, channels: Channels, frames: list[FrameResult], record: Keypoints, up: str, name: str,
+    provenance: dict[str, Any],
+) -> Motion:  # fmt: skip
     factor, uv = np.stack([r.factor for r in frames]), np.stack([r.uv for r in frames])
     fitted, swapped = np.stack([r.fitted for r in frames]), np.stack([r.swapped for r in frames])
     residuals = {}
@@ -159,4 +177,5 @@ def _motion(
         residuals=residuals,
         up=up,
         name=name,
+        provenance=provenance,
     )

@@ -1,0 +1,96 @@
+"""Bundle adjustment of cameras and free points (B. Triggs et al., Bundle Adjustment - A Modern Synthesis, 1999)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Rig
+from kinefit.solvers.cameras import (
+    COLUMNS,
+    TIME,
+    CameraPrior,
+    PointPixels,
+    moved_rig,
+    reduce_points,
+    residuals,
+    robust_cost,
+)
+from kinefit.solvers.losses import Loss, geman_mcclure
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Cameras and points that agree best.
+
+    Parameters
+    ----------
+    rig : Rig
+    offsets : (C,) [s]
+    x : (P, 3) [m]
+    cost : float
+    S : (C · 10, C · 10) information of the data about the cameras, the points taken out.
+    """
+
+    rig: Rig
+    offsets: NDArray
+    x: NDArray
+    cost: float
+    S: NDArray
+
+
+def bundle_adjust(
+    rig: Rig,
+    pixels: PointPixels,
+    x: NDArray,
+    prior: CameraPrior,
+    *,
+    offsets: NDArray | None = None,
+    loss: Loss | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Bundle:
+    """Cameras and points x (P, 3) [m] of least robust pixel error, by damped Gauss-Newton with the points taken out.
+
+    Parameters
+    ----------
+    rig, x : where to start.
+    prior : CameraPrior
+        What may change, and how far. Without a prior the gauge (place, turn, scale) stays where the damping leaves it.
+    offsets : (C,) [s] time offsets to start from; default 0.
+    tolerance : float
+        Stop when an iteration lowers the cost by less than this share.
+    """
+    loss = loss or geman_mcclure()
+    offsets = np.zeros(len(rig)) if offsets is None else offsets
+    precision, freedom = prior.precision, prior.freedom
+
+    def cost_of(rig: Rig, offsets: NDArray, x: NDArray) -> float:
+        away = prior.departure(rig, offsets)
+        return robust_cost(residuals(rig, offsets, pixels, x), pixels.weight, loss)[0] + float(precision @ away**2)
+
+    cost, damping, system = cost_of(rig, offsets, x), 1e-4, None
+    for _ in range(max_iterations):
+        before = cost
+        while damping < 1e6:
+            system = reduce_points(rig, offsets, freedom, pixels, x, loss, damping)
+            S = system.S + np.diag(precision)
+            b = system.b - precision * prior.departure(rig, offsets)
+            delta = np.linalg.solve(S + damping * np.diag(np.diag(S)) + 1e-12 * np.eye(len(S)), b)
+            by_camera = delta.reshape(-1, COLUMNS)
+            try:
+                new_rig = moved_rig(rig, by_camera)
+            except ValueError:
+                damping *= 10.0
+                continue
+            new_x, new_offsets = x + system.points_step(delta), offsets + by_camera[:, TIME]
+            new = cost_of(new_rig, new_offsets, new_x)
+            if new < cost:
+                rig, x, offsets, cost, damping = new_rig, new_x, new_offsets, new, max(0.1 * damping, 1e-9)
+                break
+            damping *= 10.0
+        if not before - cost > tolerance * cost:
+            break
+    return Bundle(rig, offsets, x, cost, reduce_points(rig, offsets, freedom, pixels, x, loss).S)

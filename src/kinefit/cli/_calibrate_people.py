@@ -1,0 +1,60 @@
+"""`kinefit calibrate people`: where the cameras stand, from the people in view alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _screen
+
+_EXAMPLES = """\b
+Examples:
+  kinefit calibrate people take.toml --height 1.78
+  kinefit calibrate people take.toml --focal --time-offsets -o cameras.toml
+"""
+
+
+@click.command(short_help="Find where the cameras stand from the people in view.", epilog=_EXAMPLES)
+@click.argument("take", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="File to write.  [default: TAKE-people.toml]")
+@click.option(
+    "--height", type=float, metavar="M", help="Stature of the person: it sets the scale.  [default: the take's]"
+)
+@click.option("--focal", is_flag=True, help="Find the focal lengths too.")
+@click.option("--time-offsets", is_flag=True, help="Find the time offset of each camera too.")
+@_screen.verbose_option
+def people(
+    take: Path, out: Path | None, height: float | None, focal: bool, time_offsets: bool, verbose: bool
+) -> None:
+    """Find where the cameras stand from the people in view.
+
+    TAKE names a calibration for the interiors of its cameras; where that says they stand is not used.
+    """
+    from statistics import median
+
+    from kinefit.bodies import load_body
+    from kinefit.calibration.people import calibrate_people
+    from kinefit.errors import ExportError
+    from kinefit.readers.calibration import write_calibration
+    from kinefit.readers.take import read_take
+    from kinefit.tracking.take import load_keypoints
+
+    entry = read_take(take)
+    out = out or take.with_name(f"{take.stem}-people.toml")
+    if out.exists():
+        raise ExportError("there is a file of this name already", file=out, remedy="Name another one with --out.")
+    with _screen.bars() as step:
+        step("reading", 0, 0)
+        seen = load_keypoints(entry)
+        step("reading", 1, 1)
+        assert seen.rig is not None
+        found = calibrate_people(
+            tuple(seen.rig), seen.keypoints, load_body(entry.body), height=height or entry.height, focal=focal,
+            time_offsets=time_offsets, up=entry.up, progress=step,
+            accuracy=median(source.accuracy for source in entry.keypoints),
+        )  # fmt: skip
+    write_calibration(found.rig, out)
+    for line in found.told():
+        _screen.say(line)
+    _screen.say(f"Written: {out}")

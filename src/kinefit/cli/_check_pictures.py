@@ -1,0 +1,145 @@
+"""Pictures for the page of `kinefit check`: points seen and told by the other cameras, and errors by place."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.calibration.bias import CameraBias
+from kinefit.calibration.check import Check
+from kinefit.calibration.views import from_others
+from kinefit.errors import KinefitError
+from kinefit.exporters import page as p
+from kinefit.geometry.camera import Camera, ImageFrame
+from kinefit.readers.video import Video
+
+_SEEN, _TOLD, _DARK, _ARROW = (255, 240, 60), (90, 200, 255), (15, 15, 15), (255, 90, 60)  # RGB
+_MAGNIFIED = 10  # times: bias arrows
+_CELLS = (6, 10)  # of the picture along its shorter and longer side, in the map of residuals
+_FEWEST = 15  # points in a cell that tell something
+_MARGIN = 0.12  # of the person's size, shown around the person
+_EDGE = 1100  # [px] longer side of the pictures for which lines are drawn as wide as told
+
+
+def picture_section(check: Check) -> p.Section:
+    """Of every camera one frame with its points, and a map of the mean errors."""
+    pictures, maps = [], []
+    assert check.views is not None
+    for b in check.biases:
+        c = check.views.rig.index(b.camera)
+        camera = check.views.rig.cameras[c]
+        seen = np.isfinite(check.views.uv[:, :, c]).all(-1).sum(axis=1)
+        middle = np.abs(np.arange(len(seen)) - len(seen) / 2)
+        frame = int(np.argmax(seen - 1e-3 * middle))
+        ground, image = _ground(check, camera, frame)
+        others = from_others(check.views.at(np.array([frame])), c)[0]
+        pictures.append(
+            p.picture(_points(ground, image, check.views.uv[frame, :, c], others, b), caption=_caption(b, frame))
+        )
+        maps.append(p.picture(_map(check, c, ground, image), caption=f"{b.camera}: mean error by place"))
+    first = (
+        "One frame of each camera. Yellow rings: the points as the detector saw them. Blue dots: where the other "
+        f"cameras say they are. The red arrow shows the bias against the others, {_MAGNIFIED} times as long."
+    )
+    second = (
+        f"The mean of (calibration minus seen) in each part of the picture, {_MAGNIFIED} times as long. Arrows that "
+        "are alike: the camera was turned or moved. Arrows towards the middle or away from it: focal length. Curved ones: "
+        "distortion."
+    )
+    return p.section(
+        "Pictures", first, p.gallery(pictures, smallest=240), p.paragraph(second), p.gallery(maps, smallest=240),
+        anchor="pictures",
+    )  # fmt: skip
+
+
+def pair(values: NDArray) -> str:
+    """Two numbers [px] as text."""
+    return f"{values[0]:+.1f}, {values[1]:+.1f}" if np.isfinite(values).all() else "-"
+
+
+def _caption(b: CameraBias, frame: int) -> str:
+    off = b.alone if np.isfinite(b.alone).all() else b.bias
+    return f"{b.camera}, frame {frame}: {pair(off)} px against the other cameras"
+
+
+def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFrame]:
+    """A frame of the camera's video (grey where there is none), and how it relates to the calibration's picture."""
+    seen = check.observations
+    entry = next((e for e in check.take.cameras if e.name == camera.name), None) if check.take else None
+    if seen is not None and entry is not None and camera.name in seen.videos:
+        at = frame + seen.frames[0] - round(entry.time_offset * seen.rate) - check.frames_late.get(camera.name, 0)
+        try:
+            with Video(seen.videos[camera.name]) as video:
+                return np.array(video.read(min(max(at, 0), len(video) - 1))), seen.images[camera.name]
+        except KinefitError:
+            pass
+    return np.full((camera.size[1], camera.size[0], 3), 70, np.uint8), ImageFrame.identity()
+
+
+def _points(ground: NDArray, image: ImageFrame, seen: NDArray, others: NDArray, b: CameraBias) -> NDArray:
+    scale = max(ground.shape) / _EDGE
+    out = (ground * 0.75).astype(np.uint8)
+    for uv, told in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
+        if np.isfinite(uv).all() and np.isfinite(told).all():
+            cv2.line(out, _at(uv), _at(told), _TOLD, max(1, round(1.5 * scale)), cv2.LINE_AA)
+    for uv, told in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
+        if np.isfinite(told).all():
+            cv2.circle(out, _at(told), round(4.5 * scale), _DARK, -1, cv2.LINE_AA)
+            cv2.circle(out, _at(told), round(3.5 * scale), _TOLD, -1, cv2.LINE_AA)
+        if np.isfinite(uv).all():
+            cv2.circle(out, _at(uv), round(6 * scale), _DARK, round(4 * scale), cv2.LINE_AA)
+            cv2.circle(out, _at(uv), round(6 * scale), _SEEN, round(2 * scale), cv2.LINE_AA)
+    bias = b.alone if np.isfinite(b.alone).all() else b.bias
+    person = image.from_calibration(seen)[np.isfinite(seen).all(-1)]
+    start = np.median(person, axis=0) if len(person) else np.array(out.shape[1::-1]) / 2
+    _arrow(out, start, start + _MAGNIFIED * bias, 3 * scale)
+    return _cropped(out, np.concatenate([person, [start, start + _MAGNIFIED * bias]]))
+
+
+def _cropped(picture: NDArray, shown: NDArray) -> NDArray:
+    """The part of a picture about some points (N, 2)."""
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = max(40.0, _MARGIN * float(np.max(high - low)))
+    (left, top), (right, bottom) = (np.rint(edge).astype(int) for edge in (low - margin, high + margin))
+    return picture[max(top, 0) : max(bottom, 1), max(left, 0) : max(right, 1)]
+
+
+def _map(check: Check, c: int, ground: NDArray, image: ImageFrame) -> NDArray:
+    assert check.views is not None and check.x_world is not None
+    camera, scale = check.views.rig.cameras[c], max(ground.shape) / _EDGE
+    uv = check.views.uv[:, :, c].reshape(-1, 2)
+    error = camera.project(check.x_world.reshape(-1, 3)) - uv
+    fine = np.linalg.norm(error, axis=-1) < check.views.limit
+    uv, error, size = uv[fine], error[fine], np.array(camera.size)
+    cells = np.where(size == size.max(), _CELLS[1], _CELLS[0])
+    cell = np.clip((uv / size * cells).astype(int), 0, cells - 1)
+    out = (ground * 0.4).astype(np.uint8)
+    for i in range(cells[0]):
+        for j in range(cells[1]):
+            here = (cell == (i, j)).all(axis=1)
+            if here.sum() >= _FEWEST:
+                start = image.from_calibration(np.median(uv[here], axis=0))
+                cv2.circle(out, _at(start), round(3 * scale), _TOLD, -1, cv2.LINE_AA)
+                _arrow(out, start, start + _MAGNIFIED * np.median(error[here], axis=0), 2 * scale)
+    return out
+
+
+def _at(uv: NDArray) -> tuple[int, int]:
+    u, v = np.clip(np.rint(uv), -20000, 20000).astype(int)
+    return int(u), int(v)
+
+
+def _arrow(out: NDArray, start: NDArray, end: NDArray, width: float) -> None:
+    length = float(np.linalg.norm(end - start))
+    if length > 1:
+        for colour, thick in ((_DARK, width + 3), (_ARROW, width)):
+            cv2.arrowedLine(
+                out,
+                _at(start),
+                _at(end),
+                colour,
+                max(1, round(thick)),
+                cv2.LINE_AA,
+                tipLength=min(0.5, 12 * width / 3 / length + 0.1),
+            )

@@ -1,0 +1,292 @@
+"""Whole-take smoothing: all frames in one sparse least-squares problem, with a prior on how motion changes.
+
+With v_s the step from frame s to s + 1 of every degree of freedom (the root's turn as a rotation vector in the world),
+the prior says that r_s = v_s − (κ + λ) v_{s−1} + κ λ v_{s−2} is new and random in every frame: an acceleration that
+forgets itself by λ a frame drives a velocity that forgets itself by κ a frame (Singer 1970; Särkkä & Svensson, Bayesian
+Filtering and Smoothing, 2023). Frames couple to the next three; the system is solved by Levenberg-Marquardt with a
+block band Cholesky factor, and covariances are blocks of its inverse (Takahashi et al. 1973).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.errors import ObservationError
+from kinefit.solvers import _kernels_band, _kernels_smoothing
+from kinefit.solvers._kernels_linear import adapt
+
+_NEVER = 1e12  # of damping, beyond which no step is small enough
+
+Equations = tuple[NDArray, NDArray, NDArray]
+MakeEquations = Callable[[NDArray, NDArray], Equations]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """How a body moves when nobody looks.
+
+    Parameters
+    ----------
+    acceleration : (n,) [m/s², rad/s²] one standard deviation, of every degree of freedom.
+    memory : (float, float) [s] in which an acceleration and a velocity forget themselves by 1/e.
+    dt : float [s] between frames.
+    usual : (T, D) or (D,) [rad or m] posture, in the chart of the angles.
+    spread : (D,) [rad or m]
+        Standard deviation of an angle that nothing observes, about the usual one.
+    liveliness : (T, n), optional
+        How much more than `acceleration` it is at times: a factor for every r_s, the last one for none.
+    """
+
+    acceleration: NDArray
+    memory: tuple[float, float]
+    dt: float
+    usual: NDArray
+    spread: NDArray
+    liveliness: NDArray | None = None
+
+    @property
+    def keep(self) -> tuple[float, float]:
+        """λ and κ, shares of an acceleration and of a velocity that are left one frame later."""
+        fast, slow = np.exp(-self.dt / np.array(self.memory))
+        return float(fast), float(slow)
+
+    @property
+    def weight(self) -> NDArray:
+        """(n,) inverse variance of r, 1/(a² Δt⁴ (1 − λ²))."""
+        return 1.0 / (np.square(self.acceleration * self.dt**2) * (1.0 - self.keep[0] ** 2))
+
+    def rows(self, count: int) -> tuple[NDArray, NDArray]:
+        """What r_s takes from v_{s−1} and v_{s−2}, (count, 2), and weights (count, n).
+
+        The first two steps have no past; they are as likely as any two of a motion that goes on for ever.
+        """
+        fast, slow = self.keep
+        past = np.tile([fast + slow, -fast * slow], (count, 1))
+        weight = np.tile(self.weight, (count, 1))
+        if self.liveliness is not None:
+            weight /= np.square(self.liveliness[:count])
+        past[:1], past[1:2] = 0.0, [(fast + slow) / (1 + fast * slow), 0.0]
+        weight[:1] *= (1 - fast * slow) * ((1 + fast * slow) ** 2 - (fast + slow) ** 2) / (1 + fast * slow)
+        weight[1:2] *= 1 - (fast * slow) ** 2
+        return past, weight
+
+    @property
+    def posture_share(self) -> NDArray:
+        """(D,) weight that the usual posture has in each frame of a covariance.
+
+        In the fit it weighs 1/spread² in every frame, as much against the pixels as in the fit of a single frame: both
+        err the same way in frame after frame. But a posture is not drawn anew in every frame. Here its weight is such
+        that an angle that nothing observes has the variance spread² in the middle of a long take,
+        spread² = ∫₀^π dθ/π / (w + weight |(1 − z)(1 − κ z)(1 − λ z)|²) with z = e^{iθ}.
+        """
+        lowest = 1e-6
+        theta = np.geomspace(lowest, np.pi, 2000)
+        z = np.exp(1j * theta)
+        prior = self.weight[6:, None] * np.abs((1 - z) * (1 - self.keep[0] * z) * (1 - self.keep[1] * z)) ** 2
+        low, high = np.full(len(self.spread), -40.0), np.full(len(self.spread), 40.0)  # of log w
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            w = np.exp(middle)
+            density = 1.0 / (w[:, None] + prior)
+            variance = np.trapezoid(density, theta, axis=1) / np.pi + lowest * density[:, 0] / np.pi
+            wide = variance > self.spread**2
+            low, high = np.where(wide, middle, low), np.where(wide, high, middle)
+        return np.where(np.isfinite(self.spread), np.exp(0.5 * (low + high)), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations, undamped; see `_kernels_band`."""
+
+    C: NDArray
+    band: NDArray
+    g: NDArray
+    cost: float
+    changes: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """All frames of a take, fitted together.
+
+    Parameters
+    ----------
+    roots : (T, 4, 4) [m], T_world_root; angles : (T, D) [rad or m]
+    cost : float
+    iterations : int, steps tried.
+    converged : bool
+    """
+
+    roots: NDArray
+    angles: NDArray
+    cost: float
+    iterations: int
+    converged: bool
+    prior: MotionPrior
+    system: _System
+
+    @property
+    def changes(self) -> NDArray:
+        """(T - 1, n) r_s [m, rad] a frame²."""
+        return self.system.changes
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Covariances of a smoothed take.
+
+    Parameters
+    ----------
+    frames : (T, n, n) of every frame.
+    following : (T - 1, n, n) of frame t + 1 (lines) with frame t (columns).
+    change_variance : (T - 1, n) of every r_s.
+    log_determinant : float, of the system's matrix.
+    """
+
+    frames: NDArray
+    following: NDArray
+    change_variance: NDArray
+    log_determinant: float
+
+
+def blocks(body: Body) -> tuple[NDArray, NDArray]:
+    """First column (n,) and width (n,) of each line of a block of the prior: the root's turn is one of three."""
+    first, width = np.arange(body.tree.n_dofs), np.ones(body.tree.n_dofs, np.int64)
+    first[3:6], width[3:6] = 3, 3
+    return first, width
+
+
+def smooth(
+    body: Body,
+    roots: NDArray,
+    angles: NDArray,
+    equations: MakeEquations,
+    prior: MotionPrior,
+    *,
+    bounds: tuple[NDArray, NDArray] | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-5,
+) -> Smoothed:
+    """Minimise every frame's cost and the prior's together.
+
+    Parameters
+    ----------
+    roots, angles : (T, 4, 4), (T, D), where to start; angles without jumps of 2π.
+    equations : (roots, angles) -> (C (T, n, m) packed as the tree has it, g (T, n), cost (T,))
+        Called anew at every state tried; its arrays are changed.
+    bounds : (T, D) lower and upper ends of every angle.
+    tolerance : stop when the predicted fall of the cost is below this share of it.
+
+    Raises
+    ------
+    ObservationError
+        The equations are not finite.
+    """
+    tree, first, width = body.tree, *blocks(body)
+    lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
+    roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
+    now = _system(body, roots, angles, equations, prior)
+    mean = float(now.C[:, np.arange(tree.n_dofs), tree.depth].mean() + now.band[0, :, :, 0].mean())
+    if not np.isfinite(now.cost) or not np.isfinite(mean):
+        raise ObservationError("a take that cannot be smoothed", remedy="Are all weights and pixels finite?")
+    damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
+    W, below, delta = _workspace(len(roots), tree.n_dofs)
+    fresh, converged, tried, any_held = True, False, 0, False
+    while tried < max_iterations and not converged:
+        if fresh:
+            held = np.zeros(now.g.shape, bool)
+            held[:, 6:] = ((angles <= lower) & (now.g[:, 6:] < 0)) | ((angles >= upper) & (now.g[:, 6:] > 0))
+            held[:, :6] = not tree.root_free
+            any_held = bool(held.any())
+            if any_held:
+                _kernels_smoothing.hold(held, first, width, tree.chain, tree.depth, now.C, now.band, now.g)
+        tried, fresh = tried + 1, False
+        delta[:, : tree.n_dofs] = now.g
+        if not _kernels_band.factor_band(
+            now.C, tree.chain, tree.depth, now.band, first, width, damping, W, below, delta
+        ):
+            damping, growth = 100.0 * damping, 2.0
+            continue
+        _kernels_band.back_substitute(W, below, delta)
+        step = delta[:, : tree.n_dofs]
+        predicted = float(np.vdot(step, now.g) + damping * np.vdot(step, step))
+        converged = predicted <= tolerance * now.cost + nothing or damping > _NEVER * mean
+        new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
+        _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
+        new = _system(body, new_roots, new_angles, equations, prior)
+        damping, growth = adapt(damping, growth, now.cost - new.cost, predicted)
+        if new.cost < now.cost:
+            fresh, now, roots, angles = True, new, new_roots, new_angles
+    if any_held and not fresh:
+        now = _system(body, roots, angles, equations, prior)  # with what was held
+    return Smoothed(roots, angles, now.cost, tried, converged, prior, now)
+
+
+def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
+    p = 4 * -(-n // 4)
+    return np.empty((T, p, p)), np.empty((T, 3 * p, p)), np.zeros((T, p))
+
+
+def _system(body: Body, roots: NDArray, angles: NDArray, equations: MakeEquations, prior: MotionPrior) -> _System:
+    tree, T, n = body.tree, len(roots), body.tree.n_dofs
+    C, g, cost = equations(roots, angles)
+    usual = np.ascontiguousarray(np.broadcast_to(prior.usual, angles.shape))
+    weight = np.ascontiguousarray(np.broadcast_to(1.0 / np.square(prior.spread), angles.shape))
+    _kernels_smoothing.add_posture(angles, usual, weight, tree.depth, C, g, cost)
+    steps, band = np.empty((max(T - 1, 0), n)), np.zeros((4, T, n, 3))
+    _kernels_smoothing.velocities(roots, angles, steps)
+    past, weight = prior.rows(len(steps))
+    total = float(cost.sum()) + _kernels_smoothing.add_motion(steps, past, weight, *blocks(body), band, g)
+    changes = steps.copy()
+    changes[1:] -= past[1:, :1] * steps[:-1]
+    changes[2:] -= past[2:, 1:] * steps[:-2]
+    return _System(C, band, g, total, changes)
+
+
+def posterior(body: Body, smoothed: Smoothed) -> Posterior:
+    """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
+
+    Limits are left out, as they are of a frame's covariance.
+    """
+    tree, s, prior = body.tree, smoothed.system, smoothed.prior
+    T, n = s.g.shape
+    C = s.C.copy()
+    C[:, np.arange(6, n), tree.depth[6:]] += prior.posture_share - 1.0 / np.square(prior.spread)
+    W, below, nothing = _workspace(T, n)
+    p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), tree.depth].mean())
+    while not _kernels_band.factor_band(C, tree.chain, tree.depth, s.band, *blocks(body), tiny, W, below, nothing):
+        tiny *= 10.0
+    frames, following = np.empty((T, n, n)), np.empty((max(T - 1, 0), n, n))
+    past, _ = prior.rows(max(T - 1, 0))
+    variance = np.zeros((max(T - 1, 0), n))
+    ahead = np.zeros((4 * p, 4 * p))  # covariance of frames t .. t + 3
+    for t in range(T - 1, -1, -1):
+        ahead[p:, p:] = ahead[: 3 * p, : 3 * p].copy()
+        fall = below[t] @ W[t].T
+        cross = -ahead[p:, p:] @ fall
+        own = W[t] @ W[t].T - fall.T @ cross
+        ahead[:p, :p], ahead[p:, :p], ahead[:p, p:] = 0.5 * (own + own.T), cross, cross.T
+        frames[t] = ahead[:n, :n]
+        if t + 1 < T:
+            following[t] = cross[:n, :n]
+        alone = np.einsum("aibi->abi", ahead.reshape(4, p, 4, p))[:, :, :n]
+        for change in {t + 2} | ({0, 1} if t == 0 else set()):
+            if change < T - 1:
+                variance[change] = _variance_of(past[change], min(change, 2), alone)
+    return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
+
+
+def _variance_of(past: NDArray, back: int, alone: NDArray) -> NDArray:
+    """Variance (n,) of r from covariances (4, 4, n) of each degree of freedom; turns of the root taken for small."""
+    newest = 1 + back
+    part = np.zeros(4)
+    part[newest], part[newest - 1] = 1.0, -1.0
+    for i in range(back):
+        part[newest - 1 - i] -= past[i]
+        part[newest - 2 - i] += past[i]
+    return np.maximum(np.einsum("a,abi,b->i", part, alone, part), 0.0)

@@ -1,0 +1,81 @@
+"""Feet on the floor: points of the soles that stay low and hardly move, and where they rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.motion import UP_AXES
+
+_SOLE = 0.04  # [m] above the lowest landmark of the body at rest, up to which one counts as of a sole
+_SLOW = 0.15  # [m/s]: a foot that swings reaches several m/s; one that stands seems to move by its noise
+_LOW = 0.04  # [m] above where the point rests: a foot that is lifted to step clears more within few frames
+_LEAST = 0.1  # [s] that a contact lasts at least; the shortest stance of a sprinter
+_GIVES = 0.01  # [m] that a resting point still moves, one standard deviation: soles and skin give
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Points of the body that rest at times.
+
+    Parameters
+    ----------
+    points : PointSet of P points.
+    places : (F, P, 3) [m] where they rest.
+    weight : (F, P) [1/m²], 0 where they do not.
+    """
+
+    points: PointSet
+    places: NDArray
+    weight: NDArray
+
+    def part(self, frames: slice) -> Contacts:
+        """Those of a stretch of frames."""
+        return replace(self, places=self.places[frames], weight=self.weight[frames])
+
+
+def soles(body: Body) -> PointSet:
+    """Landmarks of the body that are lowest when it stands at rest (y up)."""
+    points = body.landmarks
+    height = body.points_rest(points)[:, 1]
+    low = np.flatnonzero(height < height.min(initial=np.inf) + _SOLE)
+    return points.select(tuple(points.names[i] for i in low))
+
+
+def find_contacts(body: Body, roots: NDArray, angles: NDArray, rate: float, up: str) -> Contacts:
+    """Contacts of the soles with a level floor in a smoothed motion.
+
+    The floor's height is taken for each point on its own, since its place on the sole is not known to the centimetre:
+    the median of those of its slow frames that are near the lowest.
+
+    Parameters
+    ----------
+    roots, angles : (F, 4, 4) [m], (F, D) [rad]
+    rate : float [Hz]
+    up : vertical axis of the world.
+    """
+    points, axis = soles(body), np.array(UP_AXES[up])
+    x = body.trajectories(roots, angles, points)
+    speed = np.linalg.norm(np.gradient(x, axis=0), axis=2) * rate if len(x) > 1 else np.full(x.shape[:2], np.inf)
+    height = x @ axis
+    places, weight = np.zeros(x.shape), np.zeros(x.shape[:2])
+    for p in range(len(points)):
+        slow = speed[:, p] < _SLOW
+        if slow.sum() < _LEAST * rate:
+            continue
+        lowest = np.quantile(height[slow, p], 0.1)
+        floor = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
+        for run in _runs(slow & (np.abs(height[:, p] - floor) < _LOW), int(np.ceil(_LEAST * rate))):
+            middle = np.median(x[run, p], axis=0)
+            places[run, p] = middle + (floor - middle @ axis) * axis
+            weight[run, p] = _GIVES**-2
+    return Contacts(points, places, weight)
+
+
+def _runs(on: NDArray, least: int) -> list[slice]:
+    """Stretches of at least so many frames that are on."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]

@@ -1,0 +1,77 @@
+"""Angles without jumps: one chart a ball joint for a whole take, and whole turns counted on."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.charts import SIGNS, twin
+from kinefit.bodies.tree import KinematicTree
+
+_TURN = 2.0 * np.pi
+
+
+def unwrap(tree: KinematicTree, angles: NDArray) -> NDArray:
+    """The same poses with angles (T, D) that are continuous wherever the pose is.
+
+    A ball joint keeps the chart in which most of the take lies within its limits, and may leave them where only the
+    other chart holds the turn (an arm that swings overhead): the number goes on instead of jumping.
+    """
+    out = np.array(angles, float)
+    turning = ~tree.prismatic
+    ball = np.zeros(out.shape[1], bool)
+    for d in tree.ball_joints:
+        ball[d] = True
+        out[:, d] = _ball(out[:, d], tree.lower[d], tree.upper[d])
+    free = turning & ~ball & (tree.upper - tree.lower > _TURN)  # others cannot come round within their limits
+    out[:, free] = np.unwrap(out[:, free], axis=0)
+    return out
+
+
+def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Lower and upper ends and usual posture (T, D) in the charts of angles (T, D).
+
+    Limits hold in one chart of a ball joint; where its angles stand in the other, or some turns on, so do these.
+    """
+    shape = np.shape(angles)
+    lower, upper, usual = (np.array(np.broadcast_to(v, shape)) for v in (tree.lower, tree.upper, tree.usual))
+    for d in tree.ball_joints:
+        q = np.asarray(angles)[:, d]
+        own = _nearest_turn(q, tree.lower[d], tree.upper[d])
+        other = _nearest_turn(twin(q), tree.lower[d], tree.upper[d])
+        swap = _outside(other, tree.lower[d], tree.upper[d]) < _outside(own, tree.lower[d], tree.upper[d])
+        sign = np.where(swap[:, None], SIGNS, 1.0)
+        shift = q - sign * np.where(swap[:, None], other, own)  # q = sign · (its value within limits) + shift
+        ends = sign * tree.lower[d] + shift, sign * tree.upper[d] + shift
+        lower[:, d], upper[:, d] = np.minimum(*ends), np.maximum(*ends)
+        usual[:, d] = sign * tree.usual[d] + shift
+    return lower, upper, usual
+
+
+def _ball(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """Angles (T, 3) of a ball joint, each in the form nearest to the one before, all within limits as far as can be."""
+    out = np.array(q)
+    for t in range(1, len(out)):
+        forms = np.stack([out[t], twin(out[t])])
+        forms += _TURN * np.round((out[t - 1] - forms) / _TURN)
+        out[t] = forms[np.argmin(np.abs(forms - out[t - 1]).sum(axis=1))]
+    whole = []
+    for form in (out, np.pi + SIGNS * out):
+        finite = np.isfinite(low) & np.isfinite(high)
+        middle = np.where(finite, 0.5 * (np.where(finite, low, 0.0) + np.where(finite, high, 0.0)), 0.0)
+        whole.append(form - _TURN * np.round((np.median(form, axis=0) - middle) / _TURN))
+    return whole[int(np.argmin([_outside(form, low, high).sum() for form in whole]))]
+
+
+def _nearest_turn(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """Angles moved by whole turns so that they lie within their limits, or as near as can be."""
+    below, above = np.ceil((low - q) / _TURN), np.floor((high - q) / _TURN)
+    turns = np.clip(np.zeros_like(q), np.minimum(below, above), np.maximum(below, above))
+    alone = below > above  # between the ends of two turns: the nearer one
+    nearer = np.where(low - (q + _TURN * above) <= (q + _TURN * below) - high, above, below)
+    return q + _TURN * np.where(alone, nearer, turns)
+
+
+def _outside(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
+    """(T,) how far angles (T, 3) lie beyond their limits."""
+    return np.asarray((np.maximum(low - q, 0.0) + np.maximum(q - high, 0.0)).sum(axis=1))
