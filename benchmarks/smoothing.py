@@ -46,7 +46,7 @@ def acceleration_noise(x: NDArray, rate: float) -> float:
 def joint_centres(motion: Motion) -> NDArray:
     """(F, 12, 3) [m] in the order of `rival_points`."""
     segments = [motion.body.tree.segment(f"{s}_{side}") for side in "rl" for s in JOINTS.values()]
-    return motion.segment_poses()[:, segments, :3, 3]
+    return motion.segment_poses()[..., :3, 3][:, segments]
 
 
 def rival_points(path: Path) -> tuple[NDArray, float]:
@@ -95,7 +95,7 @@ def synthetic(keypoint_set: str) -> None:
 
 def peak_speeds(motion: Motion) -> NDArray:
     """(4,) [m/s] that hands and feet exceed in a fiftieth of the frames."""
-    x = motion.segment_poses()[:, [motion.body.tree.segment(s) for s in FAST], :3, 3]
+    x = motion.segment_poses()[..., :3, 3][:, [motion.body.tree.segment(s) for s in FAST]]
     return np.quantile(np.linalg.norm(np.diff(x, axis=0), axis=2) * motion.rate, 0.98, axis=0)
 
 

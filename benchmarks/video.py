@@ -1,4 +1,4 @@
-"""Every figure of video. `python -m benchmarks.video`, or only some parts: `python -m benchmarks.video detect check`."""
+"""Every figure of video: `python -m benchmarks.video`; only some parts: `python -m benchmarks.video detect check`."""
 
 from __future__ import annotations
 

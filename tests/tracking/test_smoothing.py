@@ -186,7 +186,7 @@ def test_livelier_motion_is_given_more_acceleration(squats, tracked):
     subject = Subject(truth.body, np.ones(len(BODY.scale_groups)))
     calm = track(rig, simulate_keypoints(still, rig, "BODY_25B", noise_px=4.0, seed=1), BODY, subject=subject)
     found = calm.provenance["smoothing"]["acceleration"]
-    assert found["knee_angle_r"] < 0.25 * told["acceleration"]["knee_angle_r"]
+    assert found["knee_angle_r"] < 0.8 * told["acceleration"]["knee_angle_r"]
 
 
 def test_windows_agree_with_all_at_once(squats, tracked):

@@ -26,7 +26,7 @@ _STATIC_SIGMA = 1.0  # [px] of a point read by hand
 _RAYLEIGH = 1.177  # median length of a normal error in the plane, in σ
 _COARSEST = 30.0  # [px] beyond it points of different cameras are not taken for one
 _MOST_FRAMES, _LEAST_FRAMES = 600, 10
-_ROUNDS = 3
+_ROUNDS, _CLOCK_ROUNDS = 3, 6  # clocks come nearer by steps: how fast a point moves is told by frames out of step
 _SETTLED, _SETTLED_FRAMES = 2e-4, 0.02  # [m, rad] 0.3 px; [frames]: tracking anew would find the same
 _LIMIT_PX = 10.0  # a calibration known no better than this is no better than the ones that need refining
 _LIMIT_POINT = 0.05  # [m] the same: a tripod that was knocked
@@ -100,7 +100,8 @@ def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bo
 
 
 def refine_from(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, prior: CameraPrior, *, up: str, accuracy: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, prior: CameraPrior, *, up: str,
+    accuracy: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
     from_scratch: bool = False,
 ) -> Refinement:  # fmt: skip
     """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule."""
@@ -108,8 +109,9 @@ def refine_from(
     names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
     offsets = np.zeros(len(rig))
     first: Sighting | None = None
-    for turn in range(_ROUNDS):
-        step("refining", turn, _ROUNDS + 1)
+    rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
+    for turn in range(rounds):
+        step("refining", turn, rounds + 1)
         seen = _sight(rig, keypoints, body, accuracy, up, offsets)
         first = first or seen
         off = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH
@@ -129,13 +131,13 @@ def refine_from(
         offsets = offsets - offsets[0]
         if change[0] < _SETTLED and change[1] * seen.motion.rate < _SETTLED_FRAMES:
             break
-    step("refining", _ROUNDS, _ROUNDS + 1)
+    step("refining", rounds, rounds + 1)
     covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, velocity, prior, static)
     rig, rule = gauge(rig, seen)
     last = _sight(rig, keypoints, body, accuracy, up, offsets)
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
-    step("refining", _ROUNDS + 1, _ROUNDS + 1)
+    step("refining", rounds + 1, rounds + 1)
     _check_result(rig, changes, distance)
     left = _static_residuals(rig, static, names)
     return Refinement(

@@ -79,7 +79,7 @@ def _one_bias(b: CameraBias, accuracy: float, take: str) -> list[Finding]:
     )
     words = "Sure" if significance > 2 * _SURE else "Likely" if significance >= _SURE else "Not sure"
     sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
-    how = f"{sure}; as large as the keypoints' accuracy ({accuracy:g} px)." if severity == "fault" else f"{sure}."
+    how = f"{sure}; more than the keypoints' accuracy ({accuracy:g} px)." if severity == "fault" else f"{sure}."
     return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, f"Run: kinefit check {take} --refine")]
 
 

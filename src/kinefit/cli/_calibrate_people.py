@@ -35,6 +35,7 @@ def people(
 
     from kinefit.bodies import load_body
     from kinefit.calibration.people import calibrate_people
+    from kinefit.cli._detecting import with_detections
     from kinefit.errors import ExportError
     from kinefit.readers.calibration import write_calibration
     from kinefit.readers.take import read_take
@@ -45,8 +46,9 @@ def people(
     if out.exists():
         raise ExportError("there is a file of this name already", file=out, remedy="Name another one with --out.")
     with _screen.bars() as step:
+        entry = with_detections(entry, step)
         step("reading", 0, 0)
-        seen = load_keypoints(entry)
+        seen = load_keypoints(entry, exteriors=False)
         step("reading", 1, 1)
         assert seen.rig is not None
         found = calibrate_people(

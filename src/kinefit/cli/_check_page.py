@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.calibration.check import Check
 from kinefit.calibration.findings import Finding
@@ -165,8 +164,8 @@ def _times(check: Check) -> p.Section:
         "yaxis": {"title": "the rays miss by [px]", "rangemode": "tozero"},
     }
     told = (
-        "How far the rays of two cameras miss each other when one camera is shifted in time against the other. In step, "
-        "the valley is at 0; a flat line means too little motion to tell."
+        "How far the rays of two cameras miss each other when one is shifted in time against the other. In "
+        "step, the valley is at 0; a flat line means too little motion to tell."
     )
     return p.section(
         "Time", told, p.plot(traces, layout, height=340, label="Misses against shift in time"), anchor="time"
@@ -179,7 +178,7 @@ def _words() -> p.Section:
         "median of what is left, its standard error counts each keypoint once.",
         "Who moved: the normal equations of all cameras' shifts, turns and scales, the points taken out, tell how much "
         "of the disagreement one or two cameras alone explain.",
-        "Time: whole frames by the distance of rays, then fractions from the points' speeds; standard errors by leaving "
-        "out tenths of the recording.",
+        "Time: whole frames by the distance of rays, then parts from the points' speeds; standard errors by "
+        "leaving out tenths of the recording.",
         "A detector errs alike in many frames, and otherwise in another view: biases of a few pixels are its own.",
     ]), anchor="how")  # fmt: skip

@@ -44,8 +44,8 @@ def picture_section(check: Check) -> p.Section:
     )
     second = (
         f"The mean of (calibration minus seen) in each part of the picture, {_MAGNIFIED} times as long. Arrows that "
-        "are alike: the camera was turned or moved. Arrows towards the middle or away from it: focal length. Curved ones: "
-        "distortion."
+        "are alike: the camera was turned or moved. Arrows towards the middle or away: focal length. Curved "
+        "ones: distortion."
     )
     return p.section(
         "Pictures", first, p.gallery(pictures, smallest=240), p.paragraph(second), p.gallery(maps, smallest=240),

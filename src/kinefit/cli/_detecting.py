@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -90,6 +91,21 @@ def ensure_detections(
     return somebody(jobs)
 
 
+def with_detections(take: Take, step: _screen.Step) -> Take:
+    """The take with the built-in detector's keypoints where it asks for them, or names none and has videos."""
+    from kinefit.readers.take import KeypointsEntry
+
+    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
+    videos = any(camera.video for camera in take.cameras)
+    if not asked and (take.keypoints or not videos):
+        return take
+    files = ensure_detections(take, progress=step)
+    if take.keypoints:
+        return take
+    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
+    return replace(take, keypoints=entries)
+
+
 def somebody(jobs: Sequence[Job]) -> dict[str, Path]:
     """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
     from kinefit.readers.detections import read_detections
@@ -115,6 +131,9 @@ def detect(
     from kinefit.readers.detections import detections_key
 
     keys = {job: _video_key(job.video) for job in jobs}
+    if not force:
+        for job in jobs:
+            _from_beside(job, keys[job], people, masks)
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks)]
     if not todo:
         return []
@@ -148,6 +167,20 @@ def detect(
     for future in done:
         future.result()
     return todo
+
+
+def _from_beside(job: Job, key: str, people: int | None, masks: bool | None) -> None:
+    """Copy what another take of the same folder found in the same video already."""
+    from kinefit.exporters._atomic import writing
+    from kinefit.readers.detections import detections_key
+
+    if _fits(detections_key(job.file), key, people, masks):
+        return
+    for other in sorted(job.file.parent.parent.glob(f"*-detect/{job.file.name}")):
+        if _fits(detections_key(other), key, people, masks):
+            with writing(job.file) as temporary:
+                shutil.copyfile(other, temporary)
+            return
 
 
 class _Stopped(Exception):

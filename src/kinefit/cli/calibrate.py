@@ -36,7 +36,7 @@ class _Ways(click.Group):
         return getattr(import_module(_WAYS[name]), name) if name in _WAYS else None
 
 
-@click.group(cls=_Ways, short_help="Calibrate cameras with a board, or from the people in view.")
+@click.group(cls=_Ways, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, or from the people in view.")
 def calibrate() -> None:
     """Calibrate cameras: with a board in view, or from the people in view alone."""
 

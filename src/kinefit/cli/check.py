@@ -31,13 +31,17 @@ _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "gree
 @click.option("--focal", is_flag=True, help="With --refine: focal lengths too.")
 @click.option("--distortion", is_flag=True, help="With --refine: lens distortion too.")
 @click.option("--time-offsets", is_flag=True, help="With --refine: time offsets too.")
+@click.option(
+    "--points", type=click.Path(path_type=Path),
+    help="With --refine: TOML of static points, [name] and camera = [u, v] px in the calibration's image.",
+)
 @click.option("--take", "copy", is_flag=True, help="With --refine: write a copy of the take file that uses it.")
 @click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
 @_screen.verbose_option
 @click.pass_context
 def check(
     ctx: click.Context, take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    copy: bool, strict: bool, verbose: bool,
+    points: Path | None, copy: bool, strict: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Find out what is wrong with a recording, how sure that is, and what would mend it.
 
@@ -45,10 +49,11 @@ def check(
     of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
     up, and what each camera sees.
     """
-    if (focal or distortion or time_offsets or copy) and not refine:
-        raise click.UsageError("--focal, --distortion, --time-offsets and --take only go with --refine.")
+    if (focal or distortion or time_offsets or copy or points) and not refine:
+        raise click.UsageError("--focal, --distortion, --time-offsets, --points and --take only go with --refine.")
     from kinefit.calibration.check import check_take
     from kinefit.cli._check_page import check_page
+    from kinefit.cli._detecting import with_detections
     from kinefit.errors import KinefitError
     from kinefit.exporters._atomic import write_text
     from kinefit.readers.take import read_take
@@ -57,10 +62,14 @@ def check(
     refined: Refinement | None = None
     failed: KinefitError | None = None
     with _screen.bars() as step:
+        try:
+            entry = with_detections(entry, step)
+        except KinefitError as error:  # the rest can be checked without
+            _screen.note(f"note: no keypoints: {error}")
         found = check_take(entry, progress=step)
         if refine:
             try:
-                refined = _refine(found, step, focal=focal, distortion=distortion, time_offsets=time_offsets)
+                refined = _refine(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
             except KinefitError as error:
                 failed = error
     _print(found, verbose)
@@ -74,10 +83,13 @@ def check(
         ctx.exit(2)
 
 
-def _refine(found: Check, step: _screen.Step, *, focal: bool, distortion: bool, time_offsets: bool) -> Refinement:
+def _refine(
+    found: Check, step: _screen.Step, points: Path | None, *, focal: bool, distortion: bool, time_offsets: bool
+) -> Refinement:
     from kinefit.bodies import load_body
     from kinefit.calibration.refine import refine
     from kinefit.errors import CalibrationError
+    from kinefit.readers.static_points import read_static_points
 
     seen, take = found.observations, found.take
     if found.views is None or not found.biases or seen is None or take is None:
@@ -85,15 +97,18 @@ def _refine(found: Check, step: _screen.Step, *, focal: bool, distortion: bool, 
             "the calibration cannot be refined before the faults are mended",
             remedy="Mend what is named as a fault first.",
         )
+    static = read_static_points(points, found.views.rig.names) if points else None
     accuracy = min(entry.accuracy for entry in take.keypoints)
     return refine(
         found.views.rig, [k for k in seen.keypoints if k.camera in found.views.rig], load_body(take.body), focal=focal,
-        distortion=distortion, time_offsets=time_offsets, height=take.height, up=take.up, accuracy=accuracy,
+        distortion=distortion, time_offsets=time_offsets, static_points=static, height=take.height, up=take.up,
+        accuracy=accuracy,
         progress=step,
     )  # fmt: skip
 
 
 def _print(found: Check, verbose: bool) -> None:
+    from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
@@ -116,7 +131,7 @@ def _print(found: Check, verbose: bool) -> None:
     columns, rows = camera_rows(found)
     if rows:
         shown = [at for at, name in enumerate(columns) if name in _PRINTED]
-        table = Table(*(columns[at] for at in shown), box=None, pad_edge=False)
+        table = Table(*(escape(columns[at]) for at in shown), box=None, pad_edge=False)
         for row in rows:
             table.add_row(*(row[at] for at in shown))
         _screen.say()

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from kinefit.cli import _results, _screen
-
-if TYPE_CHECKING:
-    from kinefit.readers.take import Take
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -58,29 +54,13 @@ def track(
     ctx.exit(code)
 
 
-def with_detections(take: Take, step: _screen.Step) -> Take:
-    """The take with the built-in detector's keypoints where it asks for them, or names none and has videos."""
-    from kinefit.readers.take import KeypointsEntry
-
-    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
-    videos = any(camera.video for camera in take.cameras)
-    if not asked and (take.keypoints or not videos):
-        return take
-    from kinefit.cli._detecting import ensure_detections
-
-    files = ensure_detections(take, progress=step)
-    if take.keypoints:
-        return take
-    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
-    return replace(take, keypoints=entries)
-
-
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
     verbose: bool = False,
 ) -> int:
     """Track a take and write what comes of it; returns the exit code."""
     from kinefit.cli._agreement import print_agreement
+    from kinefit.cli._detecting import with_detections
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TrackingError

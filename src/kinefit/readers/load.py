@@ -13,6 +13,7 @@ from kinefit.errors import CalibrationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import Keypoints, Markers
 from kinefit.readers.calibration import read_calibration
+from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take import CameraEntry, KeypointsEntry, Take
@@ -48,8 +49,13 @@ class Observations:
     images: dict[str, ImageFrame]
 
 
-def load_observations(take: Take) -> Observations:
+def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     """Read everything that a take names, and check that it fits together.
+
+    Parameters
+    ----------
+    exteriors : bool
+        Whether the calibration must tell where cameras stand; without, one that it puts nowhere stands at the origin.
 
     Raises
     ------
@@ -60,7 +66,7 @@ def load_observations(take: Take) -> Observations:
     FileError
         A file that is damaged.
     """
-    rig = _read_rig(take)
+    rig = _read_rig(take, exteriors)
     rates: dict[str, float] = {"take": take.rate} if take.rate else {}
     lengths: dict[str, int] = {}
     offsets: dict[str, float] = {}
@@ -92,10 +98,10 @@ def load_observations(take: Take) -> Observations:
     )
 
 
-def _read_rig(take: Take) -> Rig | None:
+def _read_rig(take: Take, exteriors: bool) -> Rig | None:
     if not take.cameras or take.calibration is None:
         return None
-    rig = read_calibration(take.calibration.file, unit=take.calibration.unit)
+    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, exteriors=exteriors)
     for entry in take.cameras:
         if entry.name not in rig:
             raise CalibrationError(
@@ -147,8 +153,6 @@ def _read_keypoints(
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
     if source.format == "detect":
-        from kinefit.readers.detections import detections_file, read_detections
-
         file = source.file or detections_file(take.path, source.camera)
         return read_detections(file).keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate

@@ -144,7 +144,7 @@ def common_start(keypoints: Sequence[Keypoints]) -> float:
 
 
 def between_frames(values: NDArray, late: float) -> NDArray:
-    """Values (F, ...) of frames `late` frames later, a fraction, linearly between neighbours; NaN beside unseen ones."""
+    """Values (F, ...) of frames `late` frames later, a fraction, linear between neighbours; NaN beside unseen ones."""
     if abs(late) < _CLOCK or len(values) < 2:
         return values
     at = np.clip(np.arange(len(values)) + late, 0, len(values) - 1)

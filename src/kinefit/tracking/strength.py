@@ -143,7 +143,8 @@ def estimate(
         takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
         looks = min(takes[0].dt / _LOOK, 1.0)
-        found = Strength(acceleration, _noise(channels, *(np.concatenate(p) for p in zip(*told, strict=True)), looks))
+        r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
+        found = Strength(acceleration, _noise(channels, r2, variance, looks))
         change = found.change(strength)
         strength = found
         if change < _SETTLED:
@@ -206,12 +207,11 @@ def alike(body: Body) -> NDArray:
 
 
 def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: NDArray) -> NDArray:
-    """(n,) by what factor each should change: to start, moved like the others, where the take tells little."""
+    """(n,) by what factor each should change: to start (n,), where the take tells little."""
     squares, informed = np.bincount(groups, squares)[groups], np.bincount(groups, informed)[groups]
     own = 0.5 * np.log(np.maximum(squares, 1e-12) / np.maximum(informed, 1e-12))
-    common = np.sum(informed * (own - np.log(start))) / (np.sum(informed) + _FRAMES)
     share = informed / (informed + _FRAMES)
-    return np.asarray(np.exp(share * own + (1.0 - share) * (np.log(start) + common)))
+    return np.asarray(np.exp(share * own + (1.0 - share) * np.log(start)))
 
 
 def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray]:

@@ -50,9 +50,9 @@ def track_take(
     return motion, observations
 
 
-def load_keypoints(take: Take) -> Observations:
-    """What the sensors of a take saw, keypoints of calibrated cameras among it."""
-    observations = load_observations(take)
+def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
+    """What the sensors of a take saw, keypoints of cameras among it; `exteriors` as in `load_observations`."""
+    observations = load_observations(take, exteriors=exteriors)
     if not observations.keypoints or observations.rig is None:
         raise TakeError(
             "the take has no [[keypoints]]",

@@ -1,0 +1,62 @@
+"""Static points for a calibration: places in the pictures of things that did not move.
+
+A TOML file with one table a point, and in it the pixel of each camera that sees it, in the calibration's image:
+
+    [beam_end]
+    cam01 = [512.3, 1204.0]
+    cam03 = [430.1, 1311.8]
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+from kinefit.errors import FileError, ObservationError, choices
+
+
+def read_static_points(
+    path: str | PathLike[str], cameras: Sequence[str]
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """{point: {camera: (u, v)}} [px] of points that two or more of the cameras see.
+
+    Raises
+    ------
+    FileError
+        No such file, or not TOML.
+    ObservationError
+        An unknown camera, a pixel that is not two finite numbers, a point in fewer than two cameras, no point at all.
+    """
+    file = Path(path)
+    try:
+        raw = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FileError("no such file of static points", file=file, remedy="Check the path.") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FileError(f"cannot be read ({error})", file=file, remedy="Give a TOML file in UTF-8.") from error
+    form = "Write [name] and below it camera = [u, v] for two or more cameras."
+    out: dict[str, dict[str, tuple[float, float]]] = {}
+    for name, views in raw.items():
+        if not isinstance(views, dict) or len(views) < 2:
+            raise ObservationError("a point is seen by two or more cameras", file=file, place=f"[{name}]", remedy=form)
+        out[name] = {}
+        for camera, pixel in views.items():
+            place = f"[{name}] {camera}"
+            if camera not in cameras:
+                raise ObservationError(choices("camera", camera, cameras), file=file, place=place)
+            if not _is_pixel(pixel):
+                raise ObservationError(f"{pixel} is no pixel", file=file, place=place, remedy=form)
+            out[name][camera] = (float(pixel[0]), float(pixel[1]))
+    if not out:
+        raise ObservationError("there are no points", file=file, remedy=form)
+    return out
+
+
+def _is_pixel(value: object) -> bool:
+    return (
+        isinstance(value, list) and len(value) == 2
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+    )  # fmt: skip
