@@ -36,12 +36,13 @@ Examples:
     help="What to write; parquet, c3d and usd are there too.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
+@click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor.")
 @click.option("--realtime", is_flag=True, help="Do not smooth over the whole take.")
 @_screen.verbose_option
 @click.pass_context
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
-    realtime: bool, verbose: bool,
+    contacts: bool, realtime: bool, verbose: bool,
 ) -> None:
     """Track the person of a take file and write all results.
 
@@ -49,14 +50,19 @@ def track(
     `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
     the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done.
     """
+    if contacts and realtime:
+        raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
     out = out or take.with_name(f"{take.stem}-kinefit")
-    code = run(take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, verbose=verbose)
+    code = run(
+        take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, contacts=contacts,
+        verbose=verbose,
+    )  # fmt: skip
     ctx.exit(code)
 
 
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
-    verbose: bool = False,
+    contacts: bool = False, verbose: bool = False,
 ) -> int:
     """Track a take and write what comes of it; returns the exit code."""
     from kinefit.cli._agreement import print_agreement
@@ -78,7 +84,8 @@ def run(
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(
-                    take, smooth=smooth, progress=lambda *told: (step("reading", 1, 1), step(*told))[1]
+                    take, smooth=smooth, contacts=contacts,
+                    progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False

@@ -25,6 +25,52 @@ def scale_motion(parents, offsets, groups, frames, motion):
 
 
 @jit
+def pose_and_shape_columns(
+    x, y, z, ux, uy, uz, vx, vy, vz, s, k, n, n_groups, dof_parent, last_dof, groups, base, shift, mirror, motion,
+    frames, screws, centre, index, ju, jv,
+):  # fmt: skip
+    """Derivatives ju, jv of one pixel by degrees of freedom and shape, their places in index; returns how many."""
+    count = 0
+    dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
+    d = last_dof[s]
+    while d >= 0:
+        if d >= 6:
+            t = screws[d - 6]
+            vx_, vy_, vz_ = t[0], t[1], t[2]
+            wx, wy, wz = t[3], t[4], t[5]
+        else:
+            vx_, vy_, vz_ = (1.0 if d == 0 else 0.0), (1.0 if d == 1 else 0.0), (1.0 if d == 2 else 0.0)
+            wx, wy, wz = (1.0 if d == 3 else 0.0), (1.0 if d == 4 else 0.0), (1.0 if d == 5 else 0.0)
+        mx, my, mz = vx_ + wy * dz - wz * dy, vy_ + wz * dx - wx * dz, vz_ + wx * dy - wy * dx
+        index[count] = d
+        ju[count] = ux * mx + uy * my + uz * mz
+        jv[count] = vx * mx + vy * my + vz * mz
+        count += 1
+        d = dof_parent[d]
+    f = frames[s]
+    for q in range(n_groups):
+        mx, my, mz = motion[s, q, 0], motion[s, q, 1], motion[s, q, 2]
+        if q == groups[s]:
+            mx += f[0] * base[k, 0] + f[1] * base[k, 1] + f[2] * base[k, 2]
+            my += f[3] * base[k, 0] + f[4] * base[k, 1] + f[5] * base[k, 2]
+            mz += f[6] * base[k, 0] + f[7] * base[k, 1] + f[8] * base[k, 2]
+        if mx != 0.0 or my != 0.0 or mz != 0.0:
+            index[count] = n + q
+            ju[count] = ux * mx + uy * my + uz * mz
+            jv[count] = vx * mx + vy * my + vz * mz
+            count += 1
+    if shift[k] >= 0:
+        for i in range(3):
+            sign = mirror[k] if i == 2 else 1.0
+            mx, my, mz = sign * f[i], sign * f[3 + i], sign * f[6 + i]
+            index[count] = n + n_groups + shift[k] + i
+            ju[count] = ux * mx + uy * my + uz * mz
+            jv[count] = vx * mx + vy * my + vz * mz
+            count += 1
+    return count
+
+
+@jit
 def frame_system(
     parents, dof_parent, last_dof, offsets, groups, n_groups,
     owner, rest, base, shift, mirror, cameras, camera, column, target, weight, share,
@@ -60,44 +106,11 @@ def frame_system(
         w *= factor * share[m]
         if w <= 0.0:
             continue
-        count = 0
-        dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
         s = owner[k]
-        d = last_dof[s]
-        while d >= 0:
-            if d >= 6:
-                t = screws[d - 6]
-                vx_, vy_, vz_ = t[0], t[1], t[2]
-                wx, wy, wz = t[3], t[4], t[5]
-            else:
-                vx_, vy_, vz_ = (1.0 if d == 0 else 0.0), (1.0 if d == 1 else 0.0), (1.0 if d == 2 else 0.0)
-                wx, wy, wz = (1.0 if d == 3 else 0.0), (1.0 if d == 4 else 0.0), (1.0 if d == 5 else 0.0)
-            mx, my, mz = vx_ + wy * dz - wz * dy, vy_ + wz * dx - wx * dz, vz_ + wx * dy - wy * dx
-            index[count] = d
-            ju[count] = ux * mx + uy * my + uz * mz
-            jv[count] = vx * mx + vy * my + vz * mz
-            count += 1
-            d = dof_parent[d]
-        f = frames[s]
-        for q in range(n_groups):
-            mx, my, mz = motion[s, q, 0], motion[s, q, 1], motion[s, q, 2]
-            if q == groups[s]:
-                mx += f[0] * base[k, 0] + f[1] * base[k, 1] + f[2] * base[k, 2]
-                my += f[3] * base[k, 0] + f[4] * base[k, 1] + f[5] * base[k, 2]
-                mz += f[6] * base[k, 0] + f[7] * base[k, 1] + f[8] * base[k, 2]
-            if mx != 0.0 or my != 0.0 or mz != 0.0:
-                index[count] = n + q
-                ju[count] = ux * mx + uy * my + uz * mz
-                jv[count] = vx * mx + vy * my + vz * mz
-                count += 1
-        if shift[k] >= 0:
-            for i in range(3):
-                sign = mirror[k] if i == 2 else 1.0
-                mx, my, mz = sign * f[i], sign * f[3 + i], sign * f[6 + i]
-                index[count] = n + n_groups + shift[k] + i
-                ju[count] = ux * mx + uy * my + uz * mz
-                jv[count] = vx * mx + vy * my + vz * mz
-                count += 1
+        count = pose_and_shape_columns(
+            x, y, z, ux, uy, uz, vx, vy, vz, s, k, n, n_groups, dof_parent, last_dof, groups, base, shift, mirror,
+            motion, frames, screws, centre, index, ju, jv,
+        )  # fmt: skip
         if first >= 0:
             c = camera[m]
             camera_columns(
@@ -116,6 +129,31 @@ def frame_system(
                 if ib <= ia:
                     H[ia, ib] += wu * ju[b] + wv * jv[b]
     return cost
+
+
+@jit
+def frame_jacobian(
+    parents, dof_parent, last_dof, offsets, groups, n_groups, owner, rest, base, shift, mirror, cameras, camera, column,
+    frames, screws, centre, J,
+):  # fmt: skip
+    """J (N, 2, m): derivatives of every measurement's pixel; left alone where it cannot be seen."""
+    n = screws.shape[0] + 6
+    motion = np.empty((parents.size, n_groups, 3))
+    scale_motion(parents, offsets, groups, frames, motion)
+    index = np.empty(n + n_groups + 3, np.int64)
+    ju, jv = np.empty(index.size), np.empty(index.size)
+    for m in range(camera.size):
+        k = column[m]
+        x, y, z = place(frames, owner, rest, k)
+        ok, _, _, ux, uy, uz, vx, vy, vz = project_jacobian(cameras[camera[m]], x, y, z)
+        if not ok:
+            continue
+        count = pose_and_shape_columns(
+            x, y, z, ux, uy, uz, vx, vy, vz, owner[k], k, n, n_groups, dof_parent, last_dof, groups, base, shift,
+            mirror, motion, frames, screws, centre, index, ju, jv,
+        )  # fmt: skip
+        for a in range(count):
+            J[m, 0, index[a]], J[m, 1, index[a]] = ju[a], jv[a]
 
 
 @jit

@@ -6,7 +6,7 @@ All frames share the shape; each frame's pose is eliminated (Schur complement), 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,6 +144,19 @@ class ShapeParameters:
         return H, g
 
 
+    def jacobian(self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray) -> NDArray:
+        """(N, 2, n + p) derivatives of every measurement's pixel by degrees of freedom and shape; zero where unseen."""
+        tree, body = self.body.tree, self.body
+        moved, rest, _ = self.geometry(theta)
+        placed, screws = moved.forward(state.T_world_root, state.angles)
+        J = np.zeros((len(column), 2, tree.n_dofs + len(self.mean)))
+        _kernels_shape.frame_jacobian(
+            tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
+            self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, camera, column, placed,
+            screws, np.ascontiguousarray(state.T_world_root[:3, 3]), J,
+        )  # fmt: skip
+        return J
+
     def pixels(self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray) -> NDArray:
         """(N, 2) [px] where every measurement's point is seen; NaN where it cannot be."""
         moved, rest, _ = self.geometry(theta)
@@ -167,6 +180,12 @@ class ShapeParameters:
         shape = np.zeros((len(tree.segments), 3, len(self.mean)))
         shape[:, :, : stretch.shape[1]] = stretch.swapaxes(1, 2)
         return moves, shape
+
+    def with_lengths(self, scales: NDArray, covariance: NDArray) -> ShapeParameters:
+        """The same with another prior of the scales: their mean (G,) and covariance (G, G)."""
+        mean, prior, groups = self.mean.copy(), self.prior.copy(), len(scales)
+        mean[:groups], prior[:groups, :groups] = scales, np.linalg.inv(covariance)
+        return replace(self, mean=mean, prior=prior)
 
 
 def shape_parameters(
@@ -200,6 +219,7 @@ def fit_shape(
     scale_sigma: float = PROPORTIONS,
     shift_sigma: float = 0.01,
     whole: float | None = None,
+    lengths: tuple[NDArray, NDArray] | None = None,
     loss: Loss | None = None,
     max_iterations: int = 12,
     tolerance: float = 1e-3,
@@ -215,6 +235,8 @@ def fit_shape(
         Spread of each scale about the person's size, as a share.
     whole : float, optional
         The person's size, as a share of the body's, where the stature is known.
+    lengths : scales (G,) and their covariance (G, G), optional
+        What another trial of the same person tells of them, in place of proportions.
     shift_sigma : float [m]
         Spread of a detector's point about the anatomical one, along each axis. It also decides what the data cannot: a
         point shifted along a joint's turn looks the same as the joint turned.
@@ -225,6 +247,8 @@ def fit_shape(
     loss = loss or geman_mcclure()
     tree, n = body.tree, body.tree.n_dofs
     model = shape_parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma, whole=whole)
+    if lengths is not None:
+        model = model.with_lengths(*lengths)
     posture = _POSTURE * np.square(1.0 / tree.spread)
     p, groups = len(model.mean), len(body.scale_groups)
     owner, cameras = frames.points.segments, rig.packed

@@ -70,11 +70,13 @@ def smooth_results(
     fitted, weight = take.fitted(roots, angles), take.confidence / np.square(channels.sigma)
     # Outliers and quality are told by the accuracy that was stated, as for a single frame: they compare between takes.
     factor, informs = take.factors(channels.sigma, fitted), informing(body, channels)
+    took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
     smoothed = []
     for f in range(len(roots)):
         state, used = BodyState(roots[f], angles[f]), np.where(weight[f][:, None] > 0, take.uv[f], np.nan)
         std = _deviations(body, state, covariances[f], take.told[f])
-        smoothed.append(judged(channels, informs, state, std, used, weight[f], factor[f], fitted[f], swapped[f]))
+        result = judged(channels, informs, state, std, used, weight[f], factor[f], fitted[f], swapped[f])
+        smoothed.append(replace(result, weight=took_part[f]))
     return smoothed, _told(take, strength, rounds)
 
 

@@ -47,6 +47,7 @@ def fit_subject(
     *,
     frames: int = 25,
     height: float | None = None,
+    trial: Subject | None = None,
     progress: Progress | None = None,
 ) -> Subject:
     """Bone lengths and the places of the detectors' points on a body, with no pose given.
@@ -56,6 +57,7 @@ def fit_subject(
     body : Body, generic.
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
+    trial : what another trial of the same person told: lengths start from there, and stay as near as it was sure.
 
     Raises
     ------
@@ -66,7 +68,7 @@ def fit_subject(
     if progress:
         progress("bone lengths", 0, 1)
     x = triangulated(channels, chosen)
-    scales = first_scales(body, channels.points, x, height=height)
+    scales = first_scales(body, channels.points, x, height=height) if trial is None else trial.scales
     sized = channels.with_points(body.scaled(scales))
     states: dict[int, BodyState] = {}
     for i, f in enumerate(chosen):
@@ -83,7 +85,7 @@ def fit_subject(
     weight = _weights(body.scaled(scales), sized, states)
     pixels = PixelFrames(channels.points, channels.camera, channels.column, channels.uv[list(states)], weight)
     whole = height / body.stature if height and body.stature else None
-    shape, covariance = _shape(body, channels, pixels, list(states.values()), scales, whole)
+    shape, covariance = _shape(body, channels, pixels, list(states.values()), scales, whole, trial)
     fitted = body.scaled(shape.scales)
     for name, span in channels.sets.items():
         points = fitted.keypoints(name)
@@ -96,16 +98,19 @@ def fit_subject(
 
 
 def _shape(
-    body: Body, channels: Channels, pixels: PixelFrames, states: list[BodyState], scales: NDArray, whole: float | None
+    body: Body, channels: Channels, pixels: PixelFrames, states: list[BodyState], scales: NDArray, whole: float | None,
+    trial: Subject | None,
 ) -> tuple[Shape, NDArray]:
     """Shape, with as much freedom for a detector's points as this take asks for; and its covariance (p, p).
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's spread, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis.
     """
-    spread, known = _SHIFT, 0.0
+    spread, known, lengths = _SHIFT, 0.0, None
+    if trial is not None and trial.covariance is not None:
+        lengths = trial.scales, trial.covariance[: len(scales), : len(scales)]
     for _ in range(_ROUNDS):
-        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole)
+        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole, lengths=lengths)
         covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels, known))
         moved = shape.theta - shape.parameters.mean
         open_to = np.isclose(np.diag(shape.prior), spread**-2)

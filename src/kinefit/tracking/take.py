@@ -17,10 +17,10 @@ from kinefit.tracking.video import Progress, track
 
 
 def track_take(
-    take: Take | str | PathLike[str], *, smooth: bool = True, settings: Settings | None = None,
+    take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False, settings: Settings | None = None,
     progress: Progress | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file; `smooth` as in `track`.
+    """Track the person of a take file; `smooth` and `contacts` as in `track`.
 
     Returns the motion and what the sensors saw (for overlays).
 
@@ -39,7 +39,8 @@ def track_take(
         observations.keypoints,
         body,
         accuracy=[entry.accuracy for entry in take.keypoints],
-        subject=subject_of(take),
+        trial=trial_of(take),
+        contacts=contacts,
         smooth=smooth,
         settings=settings,
         height=take.height,
@@ -62,8 +63,8 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
     return observations
 
 
-def subject_of(take: Take, *, frames: int = 50) -> Subject | None:
-    """Bone lengths and points from the trial of the same person that a take names; None where it names none."""
+def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
+    """The person as another trial shows it, where a take names one (`subject`)."""
     if take.subject is None:
         return None
     trial = read_take(take.subject)

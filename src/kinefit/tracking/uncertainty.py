@@ -89,30 +89,21 @@ def lasting(
     """
     tree = parameters.body.tree
     n = tree.n_dofs
-
-    def system(uv: NDArray, weight: NDArray) -> tuple[NDArray, NDArray]:
-        return parameters.equations(theta, state, channels.rig, channels.camera, channels.column, uv, weight)
-
-    nowhere = np.zeros((len(weight), 2))
-    H, _ = system(nowhere, weight)
-    prior = np.concatenate([np.full(6, _ANYWHERE**-2), np.square(1.0 / tree.spread)])
-    alone = inverse(_whole(H[:n, :n]) + np.diag(prior))
-    meat = _whole(system(nowhere, np.square(weight * noise.drift))[0][:n, :n])
-    fitted = parameters.pixels(theta, state, channels.rig, channels.camera, channels.column)
+    J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
+    Jq = J[:, :, :n].reshape(-1, n)
+    each = np.repeat(weight, 2)
+    H = (Jq * each[:, None]).T @ J.reshape(len(each), -1)
+    alone = inverse(H[:, :n] + np.diag(np.concatenate([np.full(6, _ANYWHERE**-2), np.square(1.0 / tree.spread)])))
+    last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
+    meat = last.T @ last
     for q, shift in enumerate(noise.shift):
         mine = np.where(channels.source == q, weight, 0.0)
-        for axis in np.diag(shift):
-            if mine.any() and axis.any():
-                push = system(fitted + axis, mine)[1][:n]
-                meat += np.outer(push, push)
-    answer = -alone @ H[n:, :n].T
+        push = np.einsum("k,kin->in", mine, J[:, :, :n]) * shift[:, None]
+        meat += push.T @ push
+    answer = -alone @ H[:, n:]
     dofs = alone @ meat @ alone
     moves, stretch = parameters.joint_moves(theta, state)
     whole = moves @ answer + stretch
-    joints = np.einsum("sin,nm,sim->si", moves, dofs, moves) + np.einsum("sip,pq,siq->si", whole, Sigma_shape, whole)
+    joints = np.sum((moves @ dofs) * moves, axis=-1) + np.sum((whole @ Sigma_shape) * whole, axis=-1)
     return Lasting(dofs + answer @ Sigma_shape @ answer.T, joints)
 
-
-def _whole(lower: NDArray) -> NDArray:
-    """A symmetric matrix from its lower triangle."""
-    return np.tril(lower) + np.tril(lower, -1).T

@@ -41,6 +41,7 @@ def track(
     *,
     accuracy: float | Sequence[float] = 8.0,
     subject: Subject | None = None,
+    trial: Subject | None = None,
     height: float | None = None,
     settings: Settings | None = None,
     smooth: bool = True,
@@ -63,6 +64,8 @@ def track(
     accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
     subject : Subject
         Known already; default: fitted from this take.
+    trial : Subject
+        Of another trial of the same person: the fit of this take starts from its lengths.
     height : float [m]
         Stature, where it is known: the length of bones that nobody sees follows it.
     smooth : bool
@@ -94,7 +97,7 @@ def track(
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     channels = make_channels(body, rig, keypoints, choose_people(rig, keypoints), sigma)
     if subject is None:
-        subject = fit_subject(body, channels, frames=shape_frames, height=height, progress=progress)
+        subject = fit_subject(body, channels, frames=shape_frames, height=height, trial=trial, progress=progress)
     channels = channels.with_points(subject.body)
     settings = settings or Settings()
     results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
