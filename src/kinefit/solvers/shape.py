@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,6 +108,18 @@ class ShapeParameters:
     mean: NDArray  # (p,)
 
     def geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
+        """What `_geometry` gives; the latest is kept, for it is asked once for every frame."""
+        key = theta.tobytes()
+        if key not in self._latest:
+            self._latest.clear()
+            self._latest[key] = self._geometry(theta)
+        return self._latest[key]
+
+    @cached_property
+    def _latest(self) -> dict[bytes, tuple[KinematicTree, NDArray, NDArray]]:
+        return {}
+
+    def _geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
         """The tree, the points (K, 3) in the root frame at rest, and their shifts (K, 3)."""
         tree, groups = self.body.tree, len(self.body.scale_groups)
         factor = theta[:groups][self.body.segment_scale]
@@ -115,7 +128,6 @@ class ShapeParameters:
         shifts[:, 2] *= self.mirror
         owner = self.points.segments
         return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
-
 
     def equations(
         self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray, uv: NDArray,
@@ -142,7 +154,6 @@ class ShapeParameters:
             np.zeros(uv.shape) if velocity is None else velocity, H, g,
         )  # fmt: skip
         return H, g
-
 
     def jacobian(self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray) -> NDArray:
         """(N, 2, n + p) derivatives of every measurement's pixel by degrees of freedom and shape; zero where unseen."""
@@ -220,6 +231,7 @@ def fit_shape(
     shift_sigma: float = 0.01,
     whole: float | None = None,
     lengths: tuple[NDArray, NDArray] | None = None,
+    start: NDArray | None = None,
     loss: Loss | None = None,
     max_iterations: int = 12,
     tolerance: float = 1e-3,
@@ -237,6 +249,7 @@ def fit_shape(
         The person's size, as a share of the body's, where the stature is known.
     lengths : scales (G,) and their covariance (G, G), optional
         What another trial of the same person tells of them, in place of proportions.
+    start : (p,) parameters to start from, as an earlier fit of these points left them; default: the scales, no shifts.
     shift_sigma : float [m]
         Spread of a detector's point about the anatomical one, along each axis. It also decides what the data cannot: a
         point shifted along a joint's turn looks the same as the joint turned.
@@ -293,7 +306,7 @@ def fit_shape(
         new[:groups] = np.clip(new[:groups], 0.2, 5.0)
         return new, [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(states, moves, strict=True)]
 
-    theta, states = np.concatenate([scales, np.zeros(p - groups)]), list(states)
+    theta, states = np.concatenate([scales, np.zeros(p - groups)]) if start is None else start, list(states)
     cost, damping = cost_of(theta, states), 1e-3
     for _ in range(max_iterations):
         systems = [system(theta, state, f) for f, state in enumerate(states)]

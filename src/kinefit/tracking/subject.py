@@ -106,11 +106,14 @@ def _shape(
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's spread, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis.
     """
-    spread, known, lengths = _SHIFT, 0.0, None
+    spread, known, lengths, start = _SHIFT, 0.0, None, None
     if trial is not None and trial.covariance is not None:
         lengths = trial.scales, trial.covariance[: len(scales), : len(scales)]
     for _ in range(_ROUNDS):
-        shape = fit_shape(body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole, lengths=lengths)
+        shape = fit_shape(
+            body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole, lengths=lengths, start=start
+        )
+        states, start = list(shape.states), shape.theta
         covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels, known))
         moved = shape.theta - shape.parameters.mean
         open_to = np.isclose(np.diag(shape.prior), spread**-2)

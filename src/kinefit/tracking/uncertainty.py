@@ -70,7 +70,7 @@ def with_lasting_errors(
         more = lasting(parameters, theta, Sigma, channels, result.state, result.weight, noise)
         out.append(replace(
             result,
-            dof_std=np.sqrt(np.square(result.dof_std) + np.diag(more.dofs)),
+            dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(more.dofs), 0.0)),
             joint_std=np.sqrt(np.square(result.joint_std) + more.joints),
         ))  # fmt: skip
     return out, noise
@@ -105,5 +105,5 @@ def lasting(
     moves, stretch = parameters.joint_moves(theta, state)
     whole = moves @ answer + stretch
     joints = np.sum((moves @ dofs) * moves, axis=-1) + np.sum((whole @ Sigma_shape) * whole, axis=-1)
-    return Lasting(dofs + answer @ Sigma_shape @ answer.T, joints)
+    return Lasting(dofs + answer @ Sigma_shape @ answer.T, np.maximum(joints, 0.0))
 
