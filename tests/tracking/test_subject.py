@@ -32,6 +32,12 @@ def test_lengths_are_found_within_what_they_tell_of_themselves():
     subject = fit_subject(BODY, channels_of(MOTION, 3.0))
     off = np.abs(subject.scales - SCALES) / spread(subject)
     assert np.sqrt(np.mean(off**2)) < 2.0 and spread(subject).max() < 0.12
+    told = subject.length_std
+    lengths = np.linalg.norm(subject.body.tree.offsets, axis=1)
+    shank = subject.body.tree.segment("shank_l")
+    share = spread(subject)[BODY.scale_groups.index("thigh")] / subject.scales[BODY.scale_groups.index("thigh")]
+    assert told["thigh_l-shank_l"] == pytest.approx(lengths[shank] * share)
+    assert all(0 <= v < 0.05 for v in told.values())
 
 
 def test_worse_keypoints_leave_the_lengths_less_sure():

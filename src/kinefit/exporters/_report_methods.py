@@ -21,8 +21,9 @@ def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
     return [
         p.paragraph("To paste into a paper:", small=True), p.quote(text),
         p.paragraph(
-            "Error bars are standard deviations that follow from the measurements' stated or estimated accuracies; the "
-            "error of the body's lengths and of the calibration is not in them.", small=True),
+            "Error bars are standard deviations. In them are the jitter and lasting errors of the keypoints, what "
+            "the cameras' pictures have shifted as a whole, and how sure the body's lengths are; not the scale of the "
+            "calibration, nor errors that all cameras share.", small=True),
         p.folded("All settings, as JSON", p.code(json.dumps(summary(motion, date), indent=2, ensure_ascii=False))),
     ]  # fmt: skip
 
@@ -116,7 +117,7 @@ def _calibration(told: Mapping[str, Any]) -> str:
     if not isinstance(found, Mapping) or "file" not in found:
         return ""
     digest = f" (SHA-256 {str(found['sha256'])[:16]}…)" if found.get("sha256") else ""
-    return f"The cameras were calibrated beforehand: {found['file']}{digest}."
+    return f"The calibration of the cameras was {found['file']}{digest}."
 
 
 def _told_settings(told: Mapping[str, Any]) -> list[str]:

@@ -40,6 +40,18 @@ class Subject:
     shape: Shape | None = None
     covariance: NDArray | None = None
 
+    @property
+    def length_std(self) -> dict[str, float]:
+        """[m] standard deviation of each length, from one segment's joint to the next's: "thigh_l-shank_l"."""
+        if self.covariance is None:
+            return {}
+        tree, share = self.body.tree, np.sqrt(np.diag(self.covariance)[: len(self.scales)]) / self.scales
+        lengths = np.linalg.norm(tree.offsets, axis=1)
+        return {
+            f"{tree.segments[p]}-{tree.segments[s]}": float(lengths[s] * share[self.body.segment_scale[p]])
+            for s, p in enumerate(tree.parents) if p >= 0
+        }  # fmt: skip
+
 
 def fit_subject(
     body: Body,

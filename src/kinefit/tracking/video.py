@@ -109,6 +109,7 @@ def track(
             subject.body, channels, frames, keypoints[0].rate, settings, contacts=contacts, up=up
         )
     frames, noise = with_lasting_errors(frames, subject, channels, keypoints[0].rate)
+    provenance["length_std_m"] = subject.length_std
     provenance["detector noise"] = noise.as_told(channels.sources)
     motion = _motion(subject.body, channels, frames, keypoints[0], up, name, provenance)
     if len(motion) < len(channels.uv):
