@@ -162,3 +162,25 @@ def test_a_camera_without_room_for_anybody():
     chosen = choose_people(RIG, [*keypoints[:3], empty])
     np.testing.assert_array_equal(chosen[3], -1)
     np.testing.assert_array_equal(chosen[0], truth[0][:, 0])
+
+
+def test_a_person_whom_a_detector_cuts_in_two_for_a_moment_is_not_lost():
+    """Legs and trunk as two people in one camera and frame: the others are still followed there."""
+    person, other = walker((0.0, 0.0, 0.0)), walker((1.5, 1.0, 0.0), seed=1)
+    seen, _ = records([person, other], sure=(1.0, 0.5))
+    first = seen[0]
+    points = np.full((len(first), 3, *first.points.shape[2:]), np.nan)
+    confidence = np.zeros(points.shape[:3])
+    points[:, :2], confidence[:, :2] = first.points, first.confidence
+    lower, upper = (
+        np.array([n[1:].startswith(parts) for n in NAMES])
+        for parts in (("Knee", "Ankle", "BigToe", "SmallToe", "Heel"), ("Shoulder", "Elbow", "Wrist"))
+    )
+    whole = choose_people(RIG, seen)
+    cut = int(whole[0][6])
+    points[6, 2, upper], confidence[6, 2, upper] = points[6, cut, upper], confidence[6, cut, upper]
+    points[6, cut, ~lower], confidence[6, cut, ~lower] = np.nan, 0.0
+    halved = Keypoints(first.camera, first.keypoint_set, first.names, first.rate, points, confidence)
+    chosen = choose_people(RIG, [halved, *seen[1:]])
+    for before, now in zip(whole[1:], chosen[1:], strict=True):
+        np.testing.assert_array_equal(now, before)

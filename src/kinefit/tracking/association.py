@@ -124,13 +124,15 @@ def _groups(
         if np.isfinite(centre[frame, 0]) and pair[0] in people and pair[1] in people
     }
     found: dict[frozenset[Node], _Group] = {}
-    for pair, centre in links.items():
+    for pair in links:
         group = list(pair)
         for node in people:
             if all(node[0] != m[0] and ((node, m) in links or (m, node) in links) for m in group):
                 group.append(node)
         score = sum(float(surety[q][frame, p]) for q, p in group) / full
-        found.setdefault(frozenset(group), _Group(tuple(group), score, centre))
+        # of all its pairs: one of them may have only half of the person in common
+        middle = np.median([c for (a, b), c in links.items() if a in group and b in group], axis=0)
+        found.setdefault(frozenset(group), _Group(tuple(group), score, middle))
     nowhere = np.full(3, np.nan)
     return list(found.values()) or [_Group(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people]
 

@@ -27,6 +27,7 @@ from kinefit.tracking.subject import Subject
 from kinefit.tracking.tracker import FrameResult
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
 _ANYWHERE = 1.0  # [m, rad] spread of a root that nothing holds, as a prior
 
 
@@ -65,15 +66,24 @@ def with_lasting_errors(
         theta, Sigma = parameters.mean, np.zeros((len(parameters.mean),) * 2)
     else:
         parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
+    weights = _pooled(np.stack([r.weight for r in frames]), round(_TIED * rate))
     out = []
-    for result in frames:
-        more = lasting(parameters, theta, Sigma, channels, result.state, result.weight, noise)
+    for result, weight in zip(frames, weights, strict=True):
+        more = lasting(parameters, theta, Sigma, channels, result.state, weight, noise)
         out.append(replace(
             result,
             dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(more.dofs), 0.0)),
             joint_std=np.sqrt(np.square(result.joint_std) + more.joints),
         ))  # fmt: skip
     return out, noise
+
+
+def _pooled(weights: NDArray, half: int) -> NDArray:
+    """Weights (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
+    total = np.concatenate([np.zeros((1, weights.shape[1])), np.cumsum(weights, axis=0)])
+    frames = np.arange(len(weights))
+    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(weights))
+    return np.maximum(total[high] - total[low], 0.0) / (high - low)[:, None]
 
 
 def lasting(
