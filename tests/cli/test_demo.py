@@ -28,7 +28,7 @@ def test_the_drawn_figure_needs_nothing_fetched(tmp_path, monkeypatch, no_overla
     assert len(kinefit.read_motion(tmp_path / "demo" / "motion.npz")) == 60
     assert (tmp_path / "demo" / "take" / "take.toml").is_file()
     assert "No recording of a person" in (tmp_path / "demo" / "take" / "take.toml").read_text()
-    for name in ("motion.bvh", "tables", "montage.png", "overlays", "take/take.toml"):
+    for name in ("motion.bvh", "tables", "report.html", "overlays", "take/take.toml"):
         assert str(tmp_path / "demo" / name) in told.stdout
 
 

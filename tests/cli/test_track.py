@@ -34,7 +34,7 @@ def test_a_take_becomes_a_folder_of_results(take):
     overlays = {f"overlays/cam0{c}.mp4" for c in (1, 2, 3, 4)}
     tables = {f"tables/{name}.csv" for name in ("angles", "joints", "landmarks", "quality", "residuals")}
     files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-    assert files == {NAMES[name] for name in USUAL if name != "csv"} | tables | overlays | {"montage.png"}
+    assert files == {NAMES[name] for name in USUAL if name != "csv"} | tables | overlays | {"montage.png", "report.html"}
     motion = kinefit.read_motion(out / "motion.npz")
     assert len(motion) == 60
     for camera in motion.residuals:
@@ -49,9 +49,18 @@ def test_a_take_becomes_a_folder_of_results(take):
 
 
 def test_only_what_is_asked_for_is_written(take, tmp_path):
-    told = run("track", take, "--no-overlays", "--formats", "bvh, trc", "--out", tmp_path / "there")
+    told = run("track", take, "--no-overlays", "--no-report", "--formats", "bvh, trc", "--out", tmp_path / "there")
     assert told.exit_code == 0
     assert {path.name for path in (tmp_path / "there").iterdir()} == {"motion.bvh", "motion.trc"}
+
+
+def test_in_real_time_nothing_is_smoothed_and_contacts_need_the_whole_take(take, tmp_path):
+    told = run("track", take, "--no-overlays", "--no-report", "--realtime", "--formats", "motion", "--out", tmp_path)
+    assert told.exit_code == 0
+    motion = kinefit.read_motion(tmp_path / "motion.npz")
+    assert "smoothing" not in motion.provenance and motion.provenance["detector noise"]
+    refused = run("track", take, "--realtime", "--contacts")
+    assert refused.exit_code == 2 and "--contacts needs the whole take" in refused.stderr
 
 
 def test_an_unknown_format_is_told_before_anything_is_read():
@@ -282,7 +291,7 @@ def test_ctrl_c_gives_a_script_the_frames_that_are_done():
 
         return progress
 
-    whole = track(rig, seen, motion.body, up=motion.up)
+    whole = track(rig, seen, motion.body, up=motion.up, smooth=False)
     with pytest.raises(TrackingInterrupted) as stopped:
         track(rig, seen, motion.body, up=motion.up, progress=stop_at(5))
     part = stopped.value.motion
