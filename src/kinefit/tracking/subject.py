@@ -121,10 +121,11 @@ def _shape(
     spread, known, lengths, start = _SHIFT, 0.0, None, None
     if trial is not None and trial.covariance is not None:
         lengths = trial.scales, trial.covariance[: len(scales), : len(scales)]
-    for _ in range(_ROUNDS):
+    for last in [False] * (_ROUNDS - 1) + [True]:
         shape = fit_shape(
-            body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole, lengths=lengths, start=start
-        )
+            body, channels.rig, pixels, states, scales, shift_sigma=spread, whole=whole, lengths=lengths, start=start,
+            tolerance=1e-3 if last else 1e-2,
+        )  # fmt: skip
         states, start = list(shape.states), shape.theta
         covariance = inverse(shape.prior + shape.information / _excess(shape, channels, pixels, known))
         moved = shape.theta - shape.parameters.mean
