@@ -450,7 +450,8 @@ def test_the_balancing_trial(data_dir, tmp_path):
     assert {c.name: c.image for c in take.cameras} == {
         "cam01": "letterboxed", "cam02": "letterboxed", "cam03": "as calibrated", "cam04": "as calibrated",
     }  # fmt: skip
-    assert {c.video for c in take.cameras} == {folder / "videos" / f"cam0{k}.mp4" for k in (1, 2, 3, 4)}
+    videos = {(folder / "videos" / f"cam0{k}.mp4").resolve() for k in (1, 2, 3, 4)}
+    assert {c.video.resolve() for c in take.cameras} == videos
     assert [(k.camera, k.set) for k in take.keypoints] == [(f"cam0{k}", "BODY_25B") for k in (1, 2, 3, 4)]
     assert "static_trial/videos/*: a static trial" in notes(guess)
     assert {k.frame for k in take.keypoints if k.camera in ("cam01", "cam02")} == {"calibration"}  # SOURCE.txt, trap 1

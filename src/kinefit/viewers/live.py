@@ -17,12 +17,13 @@ from kinefit.viewers import figure, pictures, stage
 class View:
     """A body, and cameras if there are any, in a page of this computer's browser.
 
-    ```python
-    with View(body, rig, up="z") as view:
-        print(view.address)
-        for frame in frames:
-            view.show(tracker.step(frame).state, time=frame.time)
-    ```
+    Use it around a tracker's loop::
+
+        with View(body, rig, up="z") as view:
+            print(view.address)
+            for time, uv, confidence in frames:
+                result = tracker.update(uv, confidence)
+                view.show(result.state, time=time)
 
     Parameters
     ----------
