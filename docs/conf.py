@@ -19,7 +19,7 @@ myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 
 default_role = "literal"  # `name` in a docstring is code
-suppress_warnings = ["ref.python"]  # types such as (K,) names are words, not links: several classes have one of that name
+suppress_warnings = ["ref.python"]  # "(K,) names" in a docstring are words: several classes have one of that name
 autosummary_generate = True
 autosummary_ignore_module_all = False
 autodoc_default_options = {"members": True, "member-order": "bysource"}
