@@ -18,7 +18,10 @@ _HOMES = {
     "Markers": "kinefit.observations",
     "Motion": "kinefit.motion",
     "Rig": "kinefit.geometry.camera",
+    "calibrate_board": "kinefit.calibration.board",
+    "calibrate_people": "kinefit.calibration.people",
     "catalogue": "kinefit.bodies",
+    "check_take": "kinefit.calibration.check",
     "fit_markers": "kinefit.tracking.markers",
     "gauss_newton": "kinefit.solvers.least_squares",
     "levenberg_marquardt": "kinefit.solvers.least_squares",
@@ -28,13 +31,16 @@ _HOMES = {
     "read_bvh": "kinefit.readers.bvh",
     "read_caliscope_csv": "kinefit.readers.keypoints",
     "read_calibration": "kinefit.readers.calibration",
+    "read_detections": "kinefit.readers.detections",
     "read_keypoints": "kinefit.readers.keypoints",
     "read_markers": "kinefit.readers.markers",
     "read_motion": "kinefit.readers.motion",
     "read_take": "kinefit.readers.take",
+    "refine": "kinefit.calibration.refine",
     "retarget": "kinefit.simulation.retarget",
     "track": "kinefit.tracking.video",
     "track_take": "kinefit.tracking.take",
+    "write_calibration_like": "kinefit.readers.calibration_write",
 }
 __all__ = [*_HOMES, "__version__"]  # noqa: PLE0604
 
