@@ -20,7 +20,8 @@ LEVELS = [
     {"solvers"},
     {"identification", "tracking"},
     {"calibration"},
-    {"simulation", "evaluation", "recipes"},
+    {"simulation", "recipes"},
+    {"evaluation"},
     {"batch"},
     {"cli", "__main__"},
 ]

@@ -1,7 +1,5 @@
-"""What one sensor saw: frozen records, in metres, radians, seconds and pixels.
+"""Whole recordings of one sensor: frozen records, in metres, radians, seconds and pixels."""
 
-Readers make them, correspondences use them; nothing here opens a file or knows a body.
-"""
 
 from __future__ import annotations
 

@@ -1,0 +1,21 @@
+"""What sensors saw: frozen records, in metres, radians, seconds and pixels.
+
+Readers make them, correspondences use them; nothing here opens a file or knows a body. `recordings` are whole takes of
+one sensor, `frames` what it saw at one time.
+"""
+
+from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, Markers, SkeletonMotion
+
+__all__ = [
+    "MEDIAPIPE_33",
+    "DepthFrame",
+    "Detections",
+    "Frame",
+    "KeypointFrame",
+    "Keypoints",
+    "MarkerFrame",
+    "Markers",
+    "PointCloud",
+    "SkeletonMotion",
+]

@@ -1,0 +1,149 @@
+"""What one sensor saw at one time: what a live source hands to the tracker, and what a recording is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+
+def _frozen(array: NDArray, dtype: type) -> NDArray:
+    array = np.array(array, dtype=dtype)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """One depth image.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of its camera in the rig.
+    time : float [s]
+    depth : (H, W) float32 [m]
+        Along the optical axis; 0 where nothing was measured.
+    """
+
+    sensor: str
+    time: float
+    depth: NDArray
+
+    def __post_init__(self) -> None:
+        depth = np.array(self.depth, dtype=np.float32)
+        if depth.ndim != 2 or not depth.size:
+            raise ObservationError(
+                f"a depth image of {self.sensor} has shape {depth.shape}", remedy="Give (height, width) in metres."
+            )
+        depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
+        depth.flags.writeable = False
+        object.__setattr__(self, "depth", depth)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self.depth.shape[1], self.depth.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """3D points that lie on some surface (P2 2.3): anywhere, on the body, or on one segment of it.
+
+    Parameters
+    ----------
+    sensor : str
+    time : float [s]
+    points : (N, 3) [m] in the world
+    viewpoint : (3,) [m] or None
+        Where the sensor stood, in the world: only a side that faces it can have been seen.
+    on_body : bool
+        Whether all points are known to be the body's.
+    segment : str or None
+        The one segment that they are on, where that is known.
+    """
+
+    sensor: str
+    time: float
+    points: NDArray
+    viewpoint: NDArray | None = None
+    on_body: bool = False
+    segment: str | None = None
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, float)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ObservationError(f"a cloud of {self.sensor} has shape {points.shape}", remedy="Give (points, 3).")
+        object.__setattr__(self, "points", _frozen(points[np.isfinite(points).all(axis=1)], float))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointFrame:
+    """2D keypoints of one person in one camera.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the camera in the rig.
+    time : float [s]
+    names : (K,) of the keypoints
+    uv : (K, 2) [px] in the calibration's image frame; NaN where unseen
+    confidence : (K,) in 0..1, 0 where unseen
+    keypoint_set : str
+        The body's keypoint set that the names belong to; "" for names of the body's landmarks.
+    """
+
+    sensor: str
+    time: float
+    names: tuple[str, ...]
+    uv: NDArray
+    confidence: NDArray
+    keypoint_set: str = ""
+
+    def __post_init__(self) -> None:
+        uv, confidence = _frozen(self.uv, float), _frozen(self.confidence, float)
+        if uv.shape != (len(self.names), 2) or confidence.shape != (len(self.names),):
+            raise ObservationError(
+                f"keypoints of {self.sensor} have shape {uv.shape} with confidence {confidence.shape}",
+                remedy=f"Give ({len(self.names)}, 2) and ({len(self.names)},).",
+            )
+        object.__setattr__(self, "uv", uv)
+        object.__setattr__(self, "confidence", confidence)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerFrame:
+    """3D positions of labelled markers: point to point.
+
+    Parameters
+    ----------
+    sensor : str
+    time : float [s]
+    names : (M,)
+    positions : (M, 3) [m] in the world; NaN where unseen
+    marker_set : str
+        The body's marker set that the names belong to; "" for names of the body's landmarks.
+    """
+
+    sensor: str
+    time: float
+    names: tuple[str, ...]
+    positions: NDArray
+    marker_set: str = ""
+
+    def __post_init__(self) -> None:
+        positions = _frozen(self.positions, float)
+        if positions.shape != (len(self.names), 3):
+            raise ObservationError(
+                f"markers of {self.sensor} have shape {positions.shape}", remedy=f"Give ({len(self.names)}, 3)."
+            )
+        object.__setattr__(self, "positions", positions)
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame
