@@ -31,6 +31,8 @@ _HOMES = {
     "read_bvh": "kinefit.readers.bvh",
     "read_caliscope_csv": "kinefit.readers.keypoints",
     "read_calibration": "kinefit.readers.calibration",
+    "read_clouds": "kinefit.readers.depth",
+    "read_depth": "kinefit.readers.depth",
     "read_detections": "kinefit.readers.detections",
     "read_keypoints": "kinefit.readers.keypoints",
     "read_markers": "kinefit.readers.markers",

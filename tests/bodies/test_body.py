@@ -1,10 +1,12 @@
 """Bodies: named points, lengths that scale, and their form as arrays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import posture, random_body
 
-from kinefit.bodies import BodyState, PointSet, load_body
+from kinefit.bodies import BodyState, MeshSurface, PointSet, TaperedCylinder, load_body
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
@@ -137,6 +139,27 @@ def test_a_body_as_arrays_comes_back_the_same(body):
     )
     assert set(back.keypoint_sets) == set(body.keypoint_sets) and back.surfaces == body.surfaces
     assert {c: dict(n) for c, n in back.aliases.items()} == {c: dict(n) for c, n in body.aliases.items()}
+
+
+def test_surfaces_of_all_kinds_come_back_in_their_order():
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+    mesh = MeshSurface(1, corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
+    ellipse = TaperedCylinder(2, (0.1, 0, 0), (0, 0.3, 0.1), ((0.1, 0.2), (0.05, 0.04)), (0.3, 0.2, 0.9))
+    body = replace(HUMANOID, surfaces=(ellipse, mesh, HUMANOID.surfaces[0]))
+    back = body_from_arrays(body_to_arrays(body)).surfaces
+    assert back[0] == ellipse and back[2] == HUMANOID.surfaces[0] and back[1].segment == 1
+    np.testing.assert_array_equal(back[1].vertices, corners)
+    np.testing.assert_array_equal(back[1].faces, mesh.faces)
+
+
+def test_round_surfaces_of_older_files_are_read():
+    arrays = body_to_arrays(HUMANOID)
+    arrays = {k: v for k, v in arrays.items() if k not in ("surfaces/starts", "surfaces/sides")}
+    count = len(HUMANOID.surfaces)
+    arrays["surfaces/radii"] = np.linspace(0.05, 0.1, 2 * count).reshape(count, 2)
+    for k, surface in enumerate(body_from_arrays(arrays).surfaces):
+        assert surface.start == (0.0, 0.0, 0.0) and surface.end == HUMANOID.surfaces[k].end and surface.is_round
+        assert surface.mean_radii == pytest.approx(arrays["surfaces/radii"][k])
 
 
 def test_arrays_that_are_no_body_are_told():

@@ -69,7 +69,7 @@ def test_keypoints_are_those_of_their_detectors(body):
 
 def test_surfaces_end_at_the_next_joint_or_within_the_body(body):
     for limb in body.surfaces:
-        assert min(limb.radii) > 0 and 0.03 < np.linalg.norm(limb.end) < 0.7
+        assert np.min(limb.radii) > 0 and 0.03 < np.linalg.norm(limb.end) < 0.7
 
 
 def test_screws_agree_with_central_differences(body):

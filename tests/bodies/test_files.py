@@ -272,6 +272,28 @@ def test_names_and_surfaces_are_mirrored_too():
     assert body.segment_scale[body.tree.segment("leg_l")] == body.segment_scale[body.tree.segment("leg_r")]
 
 
+def test_ellipses_and_several_surfaces_of_a_segment_are_read_and_mirrored():
+    ellipse = "start = [0.0, 0.1, 0.05], end = [0.0, -0.4, 0.02], radii = [[0.1, 0.2], 0.05], side = [0.5, 0.0, 0.2]"
+    text = SIDES.replace("{ end = [0.0, -0.4, 0.02], radii = [0.1, 0.05] }",
+                         f"[\n  {{ {ellipse} }},\n  {{ end = [0.1, 0.0, 0.0], radii = [0.01, 0.02] }},\n]")  # fmt: skip
+    body = parse_body(text)
+    assert len(body.surfaces) == 4
+    right, left = body.surfaces[0], body.surfaces[2]
+    assert right.radii == left.radii == ((0.1, 0.2), (0.05, 0.05))
+    assert left.start == (0.0, 0.1, -0.05) and left.segment == body.tree.segment("leg_l")
+    np.testing.assert_allclose(np.array(left.side) * (1, 1, -1), right.side)
+    np.testing.assert_array_equal(body.segment_ends()[right.segment], right.end)  # the first one's
+
+
+@pytest.mark.parametrize("bad", ["end = [0, 0, 0]", "radii = [0.1, 0.0]", "radii = [[0.1, -0.1], 0.1]", "side = [0, 1, 0]"])
+def test_a_surface_that_cannot_be_is_told_with_its_place(bad):
+    good = {"end": "end = [0, -0.4, 0]", "radii": "radii = [0.1, 0.05]", "side": "side = [1, 0, 0]"}
+    entry = ", ".join((good | {bad.split(" ")[0]: bad}).values())
+    with pytest.raises(BodyError) as error:
+        parse_body(SIDES.replace("end = [0.0, -0.4, 0.02], radii = [0.1, 0.05]", entry), "my.toml")
+    assert (error.value.file, error.value.place) == ("my.toml", "surface of segment leg_r") and error.value.remedy
+
+
 def test_what_is_given_for_the_left_is_kept():
     text = SIDES + 'l_ear = { segment = "trunk", at = [0.0, 0.4, -0.3] }\n'
     points = parse_body(text).landmarks

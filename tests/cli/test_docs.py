@@ -41,7 +41,8 @@ def rows(text):
     [
         (TAKE, "## `[take]`", takes._Head), (TAKE, "## `[calibration]`", takes.CalibrationEntry),
         (TAKE, "## `[[camera]]`", takes.CameraEntry), (TAKE, "## `[[keypoints]]`", takes.KeypointsEntry),
-        (TAKE, "## `[[markers]]`", takes.MarkersEntry), (BODIES, "## `[body]`", files._Head),
+        (TAKE, "## `[[markers]]`", takes.MarkersEntry), (TAKE, "## `[[depth]]`", takes.DepthEntry),
+        (TAKE, "## `[[stereo]]`", takes.StereoEntry), (BODIES, "## `[body]`", files._Head),
         (BODIES, "## `[[segment]]`", files._Segment), (BODIES, "### `joint`", files._Joint),
     ],
 )  # fmt: skip

@@ -19,10 +19,15 @@ from tests.oracle import (
 )
 
 import kinefit.correspondences as correspondences
-from kinefit.bodies import BodyState, load_body
+from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
 from kinefit.correspondences import (
+    Bands,
+    band_rows,
     coincidence_rows,
+    collision_rows,
+    depth_image_rows,
     edge_rows,
+    free_space_rows,
     image_line_rows,
     limit_rows,
     pixel_rows,
@@ -31,7 +36,11 @@ from kinefit.correspondences import (
     prediction_rows,
     prior_rows,
     ray_rows,
+    surface_rows,
 )
+from kinefit.correspondences.collisions import CollisionPairs
+from kinefit.correspondences.depth_image import SurfaceSamples
+from kinefit.correspondences.free_space import FreeSpace
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
@@ -100,7 +109,20 @@ CASES = {
     "edge_rows": lambda s: (
         lambda state: edge_rows(s.body, state, s.points, s.others, s.rig, s.camera, s.image_line, sigma=s.sigma)
     ),
+    "band_rows": lambda s: (
+        lambda state: band_rows(s.body, state, Bands(s.points, s.others, s.points.segments), sigma=s.sigma)
+    ),
     "coincidence_rows": lambda s: lambda state: coincidence_rows(s.body, state, s.points, s.others, sigma=s.sigma),
+    "collision_rows": lambda s: (
+        lambda state: collision_rows(s.body, state, pairs=random_capsules(s), margin=9.0, sigma=0.7)
+    ),
+    "depth_image_rows": lambda s: (
+        lambda state: depth_image_rows(s.body, state, *measured_samples(s), before=np.inf, behind=np.inf, facing=-1.0)
+    ),
+    "free_space_rows": lambda s: (
+        lambda state: free_space_rows(s.body, state, *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
+    ),
+    "surface_rows": lambda s: about_surfaces(s),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
     "prediction_rows": lambda s: (
@@ -109,6 +131,45 @@ CASES = {
         )
     ),
 }
+
+
+def about_surfaces(s):
+    """Points inside and outside of an elliptical cylinder on every segment, each known to be of one of them."""
+    random, count = np.random.default_rng(4), len(s.body.tree.segments)
+    shapes = random.uniform(0.05, 0.15, (count, 2, 2))
+    surfaces = tuple(
+        TaperedCylinder(k, random.normal(scale=0.05, size=3), (0.0, 0.4, 0.1), shapes[k], random.normal(size=3))
+        for k in range(count)
+    )
+    body, owner = replace(s.body, surfaces=surfaces), np.repeat(np.arange(count), 3)
+    points = PointSet(tuple(f"{k}" for k in range(3 * count)), owner, random.normal(scale=0.2, size=(3 * count, 3)))
+    x = slow_positions(body, s.state, points)
+    return lambda state: surface_rows(body, state, x, segment=owner, max_distance=5.0, sigma=0.7, exact=True)
+
+
+def random_capsules(s):
+    """A capsule of random place on every segment, each pair of which is to keep apart."""
+    random, count = np.random.default_rng(2), len(s.body.tree.segments)
+    starts, ends = s.body.tree.rest + random.normal(scale=0.2, size=(2, count, 3))
+    pairs = np.array(np.triu_indices(count, 1)).T.copy()
+    return CollisionPairs(np.arange(count), starts, ends, np.full(count, 0.05), pairs, np.full(len(pairs), 0.1))
+
+
+def seen_through(s):
+    """Samples of the body's surface, a depth image that looks past all of them, and its camera."""
+    random, camera = np.random.default_rng(2), s.rig.cameras[0]
+    samples = SurfaceSamples(np.repeat(s.points.segments, 3), random.normal(scale=0.2, size=(3, 3 * len(s.points))),
+                             random_unit(random, 3 * len(s.points)).T)  # fmt: skip
+    depth = np.full(camera.size[::-1], 1e6, np.float32)
+    depth[40:80, 100:150] = 1.0  # the only place where it can be
+    return samples, FreeSpace.of(depth, farthest=10.0), camera
+
+
+def measured_samples(s):
+    """Samples of the body's surface, a camera of few pixels (no sample may change its), one depth, nothing hidden."""
+    samples, camera = seen_through(s)[0], s.rig.cameras[1].scaled((8, 6))
+    depth = np.full(camera.size[::-1], np.linalg.norm(camera.centre_world - s.x.mean(axis=0)), np.float32)
+    return samples, camera, depth, np.full((30, 40), np.inf)
 
 
 def beyond_limits(s):

@@ -116,7 +116,7 @@ def test_skin_rests_in_its_bind_pose_and_follows_the_joints(motion, glb):
     truth = motion.turned("y").segment_poses()[17, :, :3, 3]
     for surface in motion.body.surfaces:  # the skin of each segment stays about its joint
         near = np.linalg.norm(skinned - truth[surface.segment], axis=1).min()
-        assert near < 1.3 * max(surface.radii), motion.body.tree.segments[surface.segment]
+        assert near < 1.3 * np.max(surface.radii), motion.body.tree.segments[surface.segment]
 
 
 def test_mesh_is_closed_smooth_and_turned_outwards():

@@ -80,9 +80,9 @@ def test_limits_masses_and_bodies_are_usable(tmp_path):
 
 @pytest.mark.parametrize("end", [(0.0, 0.3, 0.0), (0.1, -0.2, 0.05), (0.0, -0.3, 0.0), (0.3, 0.0, 0.0)])
 def test_inertia_is_that_of_a_round_rod(end):
-    from kinefit.bodies import Cylinder
+    from kinefit.bodies import TaperedCylinder
 
-    mass, centre, inertia = mass_properties("thing", Cylinder(0, end, (0.05, 0.05)))
+    mass, centre, inertia = mass_properties("thing", [TaperedCylinder.round(0, end, (0.05, 0.05))])
     length = np.linalg.norm(end)
     assert mass == pytest.approx(1000 * np.pi * 0.05**2 * length)
     u = np.array(end) / length

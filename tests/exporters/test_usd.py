@@ -62,7 +62,7 @@ def test_the_skin_rests_upright_and_follows_the_joints(motion, stage):
         at = np.array(points)
         for surface in motion.body.surfaces:
             near = np.linalg.norm(at - truth[frame, surface.segment], axis=1).min()
-            assert near < 1.3 * max(surface.radii), motion.body.tree.segments[surface.segment]
+            assert near < 1.3 * np.max(surface.radii), motion.body.tree.segments[surface.segment]
         low, high = (np.array(v) for v in UsdGeom.Boundable(stage.GetDefaultPrim()).GetExtentAttr().Get(frame))
         assert np.all(at >= low) and np.all(at <= high)
     assert isinstance(skeleton.ComputeJointLocalTransforms(0)[0], Gf.Matrix4d)

@@ -42,7 +42,7 @@ def test_every_surface_is_there():
     meshes = scene.surface_meshes(body)
     assert {s for s, mesh in enumerate(meshes) if mesh} == {c.segment for c in body.surfaces}
     thigh = next(c for c in body.surfaces if body.tree.segments[c.segment] == "thigh_l")
-    reach = np.linalg.norm(thigh.end) + sum(thigh.radii)
+    reach = np.linalg.norm(thigh.end) + sum(thigh.mean_radii)
     assert np.ptp(meshes[thigh.segment].vertices, axis=0).max() == pytest.approx(reach, rel=0.05)
 
 

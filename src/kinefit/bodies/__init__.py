@@ -1,8 +1,19 @@
 """What is tracked: trees of segments with named points."""
 
-from kinefit.bodies.body import Body, Cylinder, PointSet
+from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import catalogue, load_body, parse_body
 from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 
-__all__ = ["Body", "BodyState", "Cylinder", "KinematicTree", "PointSet", "catalogue", "load_body", "parse_body"]
+__all__ = [
+    "Body",
+    "BodyState",
+    "KinematicTree",
+    "MeshSurface",
+    "PointSet",
+    "TaperedCylinder",
+    "catalogue",
+    "load_body",
+    "parse_body",
+]

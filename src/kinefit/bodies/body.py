@@ -1,14 +1,17 @@
-"""Body: a kinematic tree with named points, scale groups and simple surfaces; frozen."""
+"""Body: a kinematic tree with named points, scale groups and surfaces; frozen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.bodies.surfaces.tables import SurfaceTables, tables
 from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
@@ -50,15 +53,6 @@ class PointSet:
         return PointSet(tuple(names), self.segments[rows], self.points[rows])
 
 
-@dataclass(frozen=True)
-class Cylinder:
-    """Tapered round surface of a segment, from its joint to `end` [m, segment's frame], radii [m] at both ends."""
-
-    segment: int
-    end: tuple[float, float, float]
-    radii: tuple[float, float]
-
-
 @dataclass(frozen=True, eq=False)
 class Body:
     """What is tracked.
@@ -72,7 +66,7 @@ class Body:
     segment_scale : (S,) int, scale group of each segment.
     landmarks : PointSet
     keypoint_sets, marker_sets : name -> PointSet
-    surfaces : one Cylinder for each segment that has one.
+    surfaces : tapered elliptical cylinders and meshes; a segment may have several, or none.
     aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name there.
     stature : float [m] of the body as it stands.
     """
@@ -85,7 +79,7 @@ class Body:
     landmarks: PointSet
     keypoint_sets: Mapping[str, PointSet] = field(default_factory=dict)
     marker_sets: Mapping[str, PointSet] = field(default_factory=dict)
-    surfaces: tuple[Cylinder, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
     aliases: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     stature: float = 0.0
 
@@ -150,7 +144,7 @@ class Body:
             landmarks=_stretch(self.landmarks, per_segment),
             keypoint_sets={name: _stretch(s, per_segment) for name, s in self.keypoint_sets.items()},
             marker_sets={name: _stretch(s, per_segment) for name, s in self.marker_sets.items()},
-            surfaces=tuple(_stretch_cylinder(c, float(per_segment[c.segment])) for c in self.surfaces),
+            surfaces=tuple(surface.scaled(float(per_segment[surface.segment])) for surface in self.surfaces),
         )
         return replace(stretched, stature=self.stature * stretched._extent() / max(self._extent(), 1e-9))
 
@@ -164,6 +158,21 @@ class Body:
         old = self.keypoints(name)
         return replace(self, keypoint_sets={**self.keypoint_sets, name: PointSet(old.names, old.segments, points)})
 
+    @cached_property
+    def surface_tables(self) -> SurfaceTables:
+        """All surfaces as the kernels that search them take them, packed once."""
+        return tables(self.surfaces, self.tree.rest)
+
+    def segment_ends(self) -> dict[int, NDArray]:
+        """(3,) [m] far end of each segment that has a surface, in its frame: of the first one that its file gives."""
+        ends: dict[int, NDArray] = {}
+        for surface in reversed(self.surfaces):
+            if isinstance(surface, TaperedCylinder):
+                ends[surface.segment] = np.array(surface.end)
+            else:
+                ends[surface.segment] = surface.vertices[np.argmax(np.linalg.norm(surface.vertices, axis=1))]
+        return ends
+
     def segment_lengths(self) -> dict[str, float]:
         """[m] distance between the two joints of every scale group that has a child joint (bone lengths)."""
         out: dict[str, float] = {}
@@ -176,8 +185,3 @@ class Body:
 
 def _stretch(points: PointSet, per_segment: NDArray) -> PointSet:
     return PointSet(points.names, points.segments, points.points * per_segment[points.segments][:, None])
-
-
-def _stretch_cylinder(c: Cylinder, factor: float) -> Cylinder:
-    x, y, z = (factor * v for v in c.end)
-    return Cylinder(c.segment, (x, y, z), (factor * c.radii[0], factor * c.radii[1]))

@@ -11,7 +11,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit.bodies.body import Body, Cylinder, PointSet
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
 
@@ -37,17 +38,12 @@ class _Joint(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     spread: list[float] = []
 
 
-class _Surface(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    end: Vector
-    radii: tuple[float, float]
-
-
 class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     name: str
     joint: _Joint
     parent: str | None = None
     scale: str | None = None
-    surface: _Surface | None = None
+    surface: SurfaceRecord | list[SurfaceRecord] | None = None
     names: dict[str, str] = {}
 
 
@@ -141,7 +137,10 @@ def parse_body(text: str, source: str = "body") -> Body:
         landmarks=landmarks,
         keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
         marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
-        surfaces=tuple(Cylinder(index[s.name], s.surface.end, s.surface.radii) for s in segments if s.surface),
+        surfaces=tuple(
+            surface for s in segments
+            for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
+        ),
         aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
         stature=record.body.stature,
     )
@@ -170,13 +169,11 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
             axes=axes,
             coordinates=[_left(c) for c in s.joint.coordinates],
         )
-        surface = s.surface and _Surface(
-            end=(s.surface.end[0], s.surface.end[1], -s.surface.end[2]), radii=s.surface.radii
-        )
+        other = [r.mirrored() for r in s.surface] if isinstance(s.surface, list) else s.surface and s.surface.mirrored()
         names = {k: _left(n) if _left(n) != n else re.sub("^r", "l", n) for k, n in s.names.items()}  # CMU: rfemur
         parent = _left(s.parent) if s.parent else None
         out.append(
-            msgspec.structs.replace(s, name=_left(s.name), parent=parent, joint=joint, surface=surface, names=names)
+            msgspec.structs.replace(s, name=_left(s.name), parent=parent, joint=joint, surface=other, names=names)
         )
     return out
 

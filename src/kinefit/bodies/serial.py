@@ -13,7 +13,10 @@ radians:
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
     markers/SET/names, segments, points
-    surfaces/segments (C,)  surfaces/ends (C, 3)  surfaces/radii (C, 2)       [m]
+    surfaces/segments (C,)                             of every surface; of a tapered cylinder (NaN for a mesh):
+    surfaces/starts, ends, sides (C, 3)                in the segment's frame [m]; sides: directions
+    surfaces/radii (C, 2, 2)                           half axes at both ends [m]
+    surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
     aliases/CONVENTION (N, 2)                          pairs: segment, name there
 
 Names that are part of a key are percent-encoded.
@@ -27,7 +30,8 @@ from urllib.parse import quote, unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.body import Body, Cylinder, PointSet
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.surfaces import MeshSurface, Surface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
@@ -46,10 +50,8 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
         "coordinates": text_array(tree.coordinates),
         "scale_groups": text_array(body.scale_groups),
         "segment_scale": np.array(body.segment_scale, np.int64),
-        "surfaces/segments": np.array([c.segment for c in body.surfaces], np.int64),
-        "surfaces/ends": np.array([c.end for c in body.surfaces], float).reshape(-1, 3),
-        "surfaces/radii": np.array([c.radii for c in body.surfaces], float).reshape(-1, 2),
     }
+    out |= _surfaces_to_arrays(body.surfaces)
     out |= {name: np.array(getattr(tree, name)) for name in _TREE}
     out |= _points_to_arrays("landmarks", body.landmarks)
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
@@ -83,9 +85,6 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
     _check_indices(tree.parents[1:], n_segments, "parents")
     groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
     _check_indices(segment_scale, len(groups), "segment_scale")
-    owners = _array(arrays, "surfaces/segments", (None,))
-    _check_indices(owners, n_segments, "surfaces/segments")
-    ends, radii = _array(arrays, "surfaces/ends", (len(owners), 3)), _array(arrays, "surfaces/radii", (len(owners), 2))
     return Body(
         name=str(_array(arrays, "name", ())),
         tree=tree,
@@ -95,7 +94,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
         landmarks=_points_from_arrays(arrays, "landmarks", n_segments),
         keypoint_sets=_sets(arrays, "keypoints", n_segments),
         marker_sets=_sets(arrays, "markers", n_segments),
-        surfaces=tuple(Cylinder(int(s), tuple(e), tuple(r)) for s, e, r in zip(owners, ends.tolist(), radii.tolist())),
+        surfaces=_surfaces_from_arrays(arrays, n_segments),
         aliases={
             unquote(key.split("/")[1]): {str(a): str(b) for a, b in _array(arrays, key, (None, 2))}
             for key in arrays
@@ -108,6 +107,41 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
 def text_array(names: object) -> NDArray:
     """(N,) array of text, also for no names at all."""
     return np.array(list(names), dtype=np.str_)  # type: ignore[call-overload]
+
+
+def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
+    count = len(surfaces)
+    out = {"surfaces/segments": np.array([c.segment for c in surfaces], np.int64)}
+    out |= {f"surfaces/{name}": np.full((count, 3), np.nan) for name in ("starts", "ends", "sides")}
+    out["surfaces/radii"] = np.full((count, 2, 2), np.nan)
+    for k, surface in enumerate(surfaces):
+        if isinstance(surface, TaperedCylinder):
+            for name in ("starts", "ends", "sides"):
+                out[f"surfaces/{name}"][k] = getattr(surface, name[:-1])
+            out["surfaces/radii"][k] = surface.radii
+        else:
+            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in ("vertices", "faces")}
+    return out
+
+
+def _surfaces_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> tuple[Surface, ...]:
+    owners = _array(arrays, "surfaces/segments", (None,))
+    _check_indices(owners, n_segments, "surfaces/segments")
+    count, out = len(owners), list[Surface]()
+    ends = _array(arrays, "surfaces/ends", (count, 3))
+    if "surfaces/starts" not in arrays:  # files of before there were ellipses: two radii, from the joint
+        radii = _array(arrays, "surfaces/radii", (count, 2))
+        return tuple(TaperedCylinder.round(int(s), e, (r[0], r[1])) for s, e, r in zip(owners, ends, radii))
+    starts, sides = (_array(arrays, f"surfaces/{name}", (count, 3)) for name in ("starts", "sides"))
+    radii = _array(arrays, "surfaces/radii", (count, 2, 2))
+    for k, segment in enumerate(owners):
+        if f"surfaces/{k}/vertices" in arrays:
+            vertices, faces = (_array(arrays, f"surfaces/{k}/{name}", (None, 3)) for name in ("vertices", "faces"))
+            out.append(MeshSurface(int(segment), vertices, faces))
+        else:
+            numbers = (v[k].tolist() for v in (starts, ends, radii, sides))
+            out.append(TaperedCylinder(int(segment), *numbers))
+    return tuple(out)
 
 
 def _points_to_arrays(key: str, points: PointSet) -> dict[str, NDArray]:

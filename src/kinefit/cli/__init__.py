@@ -13,7 +13,10 @@ from kinefit import __version__
 from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
-COMMANDS = ("demo", "init", "calibrate", "detect", "check", "track", "view", "export", "retarget", "warmup")
+COMMANDS = (
+    "demo", "init", "calibrate", "detect", "check", "track", "view", "export", "retarget", "simulate", "evaluate",
+    "warmup",
+)  # fmt: skip
 
 _EPILOG = """\b
 Examples:

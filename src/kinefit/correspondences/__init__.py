@@ -1,17 +1,28 @@
 """Observations and a body at a state become rows: one file a kind."""
 
+from kinefit.correspondences.bands import Bands, band_rows, joint_bands
 from kinefit.correspondences.coincidence import coincidence_rows
+from kinefit.correspondences.collisions import collision_rows
+from kinefit.correspondences.depth_image import depth_image_rows
+from kinefit.correspondences.free_space import free_space_rows
 from kinefit.correspondences.image_lines import edge_rows, image_line_rows
 from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
 from kinefit.correspondences.pixels import pixel_rows
 from kinefit.correspondences.planes import plane_rows
 from kinefit.correspondences.points import point_rows
 from kinefit.correspondences.rays import ray_rows
+from kinefit.correspondences.surfaces import surface_rows
 
 __all__ = [
+    "Bands",
+    "band_rows",
     "coincidence_rows",
+    "collision_rows",
+    "depth_image_rows",
     "edge_rows",
+    "free_space_rows",
     "image_line_rows",
+    "joint_bands",
     "limit_rows",
     "pixel_rows",
     "plane_rows",
@@ -19,4 +30,5 @@ __all__ = [
     "prediction_rows",
     "prior_rows",
     "ray_rows",
+    "surface_rows",
 ]

@@ -27,13 +27,13 @@ def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, 
 
     From every joint to the joints of its children; from the last joint of a limb to the end of its surface.
     """
-    tree, ends = body.tree, {c.segment: c.end for c in body.surfaces}
+    tree, ends = body.tree, body.segment_ends()
     owners, points, colours = [], [], []
     for s, name in enumerate(tree.segments):
         children = np.flatnonzero(tree.parents == s)
         tips = [(tree.offsets[c], tree.segments[c]) for c in children]
         if not tips and s in ends:
-            tips = [(np.array(ends[s]), name)]
+            tips = [(ends[s], name)]
         for tip, side in tips:
             owners.append(s)
             points += [np.zeros(3), tip]

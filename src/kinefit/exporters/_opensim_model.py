@@ -10,7 +10,8 @@ from os import PathLike
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, Cylinder
+from kinefit.bodies import Body, TaperedCylinder
+from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters._skeleton import plain_names
 
@@ -30,7 +31,6 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     tree = body.tree
     names = plain_names(body.alias("opensim", s) for s in tree.segments)
     coordinates = plain_names(tree.coordinates)
-    surfaces = {c.segment: c for c in body.surfaces}
     out = ET.Element("Model", name=plain_names([body.name])[0])
     _text(out, "length_units", "meters")
     _text(out, "force_units", "N")
@@ -39,7 +39,7 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     joints = ET.SubElement(ET.SubElement(out, "JointSet"), "objects")
     markers = ET.SubElement(ET.SubElement(out, "MarkerSet"), "objects")
     for s, name in enumerate(names):
-        bodies.append(_body(name, tree.segments[s], surfaces.get(s)))
+        bodies.append(_body(name, tree.segments[s], [c for c in body.surfaces if c.segment == s]))
         parent = "/ground" if tree.parents[s] < 0 else f"/bodyset/{names[tree.parents[s]]}"
         dofs = range(tree.dof_start[s], tree.dof_start[s + 1])
         moves = {d: (coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs}
@@ -123,33 +123,67 @@ def _limits(low: float, high: float) -> tuple[float, float]:
     return max(float(low), -99999.9), min(float(high), 99999.9)
 
 
-def _body(name: str, segment: str, surface: Cylinder | None) -> ET.Element:
-    mass, centre, inertia = mass_properties(segment, surface)
+def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
+    mass, centre, inertia = mass_properties(segment, surfaces)
     out = ET.Element("Body", name=name)
     _text(out, "mass", _numbers([mass]))
     _text(out, "mass_center", _numbers(centre))
     _text(out, "inertia", _numbers([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]))
-    if surface is not None:
-        frame = ET.SubElement(ET.SubElement(out, "components"), "PhysicalOffsetFrame", name=f"{name}_axis")
-        geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{name}_surface")
-        _text(geometry, "radius", _numbers([np.mean(surface.radii)]))
-        _text(geometry, "half_height", _numbers([0.5 * np.linalg.norm(surface.end)]))
+    components = ET.SubElement(out, "components") if surfaces else out
+    for k, surface in enumerate(surfaces):
+        middle, R_body_cylinder, length, radii = _rod(surface)
+        label = f"{name}_{k + 1}" if k else name
+        frame = ET.SubElement(components, "PhysicalOffsetFrame", name=f"{label}_axis")
+        geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{label}_surface")
+        radius = float(np.mean(radii))
+        _text(geometry, "radius", _numbers([radius]))
+        _text(geometry, "half_height", _numbers([0.5 * length]))
+        if abs(radii[0] - radii[1]) > 1e-9:
+            _text(geometry, "scale_factors", _numbers([radii[0] / radius, 1.0, radii[1] / radius]))
         _text(frame, "socket_parent", "..")
-        _text(frame, "translation", _numbers(0.5 * np.array(surface.end)))
-        x, y, z = np.array(surface.end) / np.linalg.norm(surface.end)
-        _text(frame, "orientation", _numbers([np.arctan2(z, y), 0.0, -np.arcsin(np.clip(x, -1, 1))]))  # y to the axis
+        _text(frame, "translation", _numbers(middle))
+        _text(frame, "orientation", _numbers(_turns(R_body_cylinder)))
     return out
 
 
-def mass_properties(segment: str, surface: Cylinder | None) -> tuple[float, NDArray, NDArray]:
-    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of a round body along the surface."""
-    end = np.array(surface.end if surface else (0.0, 0.05, 0.0))
-    length, radius = float(np.linalg.norm(end)), float(np.mean(surface.radii)) if surface else 0.02
+def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
+    """Middle (3,) [m], rotation (3, 3) from an upright cylinder, length [m] and half axes (2,) [m] along its x and z.
+
+    Of a mesh: the elliptical cylinder in the box along its principal directions.
+    """
+    if isinstance(surface, TaperedCylinder):
+        a, b, axis = surface.axes
+        middle = 0.5 * np.add(surface.start, surface.end)
+        return middle, np.stack([a, axis, -b], axis=1), surface.length, np.mean(surface.radii, axis=0)
+    middle = surface.vertices.mean(axis=0)
+    _, _, axes = np.linalg.svd(surface.vertices - middle, full_matrices=False)
+    size = np.ptp((surface.vertices - middle) @ axes.T, axis=0)
+    R = np.stack([axes[1], axes[0], np.cross(axes[1], axes[0])], axis=1)
+    return middle, R, float(size[0]), 0.5 * size[1:]
+
+
+def _turns(R: NDArray) -> NDArray:
+    """(3,) [rad] turns about x, y, z, each carried along, as OpenSim writes orientations: R = Rx Ry Rz."""
+    y = np.arcsin(np.clip(R[0, 2], -1.0, 1.0))
+    if abs(R[0, 2]) > 1 - 1e-12:
+        return np.array([np.arctan2(R[1, 0], R[1, 1]), y, 0.0])
+    return np.array([np.arctan2(-R[1, 2], R[2, 2]), y, np.arctan2(-R[0, 1], R[0, 0])])
+
+
+def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, NDArray, NDArray]:
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of elliptical rods along the surfaces."""
+    rods = [_rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
+    volumes = np.array([np.pi * length * radii[0] * radii[1] for _, _, length, radii in rods])
     share = SHARES.get(re.sub("_[lr]$", "", segment))
-    mass = max(_LEAST, share * PERSON if share else _WATER * np.pi * radius**2 * length)
-    along = np.outer(end, end) / max(length, 1e-9) ** 2
-    inertia = mass * ((3 * radius**2 + length**2) / 12 * (_EYE - along) + radius**2 / 2 * along)
-    return mass, 0.5 * end, inertia
+    mass = max(_LEAST, share * PERSON if share else _WATER * float(volumes.sum()))
+    masses = mass * volumes / volumes.sum()
+    centre = sum(m * middle for m, (middle, _, _, _) in zip(masses, rods)) / mass
+    inertia = np.zeros((3, 3))
+    for m, (middle, R, length, (a, b)) in zip(masses, rods):
+        own = m * np.diag([b**2 / 4 + length**2 / 12, (a**2 + b**2) / 4, a**2 / 4 + length**2 / 12])
+        away = middle - centre
+        inertia += R @ own @ R.T + m * ((away @ away) * _EYE - np.outer(away, away))
+    return mass, centre, inertia
 
 
 def _text(parent: ET.Element, tag: str, text: str) -> None:

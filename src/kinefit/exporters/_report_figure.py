@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import PointSet
+from kinefit.bodies import Body, MeshSurface, PointSet
+from kinefit.bodies.surfaces import Surface
 from kinefit.exporters._drawing import bones
-from kinefit.exporters._tubes import side_colour
+from kinefit.exporters._tubes import is_last, side_colour
 from kinefit.exporters.page import Html, to_json
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -85,11 +86,11 @@ def _packed(array: NDArray) -> str:
 def _capsules(motion: Motion) -> tuple[PointSet, NDArray, NDArray, NDArray, list[str]]:
     """Points, ends (C, 2), radii (C, 2), owners (C,) and colours (C,) of a body's surfaces, or of its bones."""
     tree = motion.body.tree
-    surfaces = [c for c in motion.body.surfaces if min(c.radii) > 0]
-    if surfaces:
-        segments = np.repeat([c.segment for c in surfaces], 2)
-        tips = np.array([p for c in surfaces for p in (np.zeros(3), _tip(c, tree))])
-        radii = np.array([c.radii for c in surfaces], float)
+    limbs = [limb for c in motion.body.surfaces for limb in _limbs(c, motion.body)]
+    if limbs:
+        segments = np.repeat([segment for segment, _, _ in limbs], 2)
+        tips = np.concatenate([both for _, both, _ in limbs])
+        radii = np.array([r for _, _, r in limbs])
         points = PointSet(tuple(f"{k}" for k in range(len(tips))), segments, tips)
     else:
         points, _, _ = bones(motion.body)
@@ -99,13 +100,26 @@ def _capsules(motion: Motion) -> tuple[PointSet, NDArray, NDArray, NDArray, list
     return points, np.arange(len(points)).reshape(-1, 2), radii, owners, colours
 
 
-def _tip(c: Any, tree: Any) -> NDArray:
-    """End of a capsule; the last of a limb is, with its rounded end, as long as its surface."""
-    end = np.array(c.end)
-    length = float(np.linalg.norm(end))
-    if np.any(tree.parents == c.segment) or length < 1e-9:
-        return end
-    return end * max(0.2, 1 - c.radii[1] / length)
+def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:
+    """Segment, both ends (2, 3) [m] and radii (2,) [m] of the capsules that stand for a surface.
+
+    An ellipse is filled by three circles side by side. The last of a limb is, with its rounded end, as long as its
+    surface; a mesh is as long as its longest direction and as thick as the rest of it.
+    """
+    if isinstance(c, MeshSurface):
+        middle = c.vertices.mean(axis=0)
+        _, _, axes = np.linalg.svd(c.vertices - middle, full_matrices=False)
+        half = 0.5 * np.ptp((c.vertices - middle) @ axes.T, axis=0)
+        radius = float(np.sqrt(half[1] * half[2]))
+        return [(c.segment, middle + np.outer([-1, 1], max(half[0] - radius, 1e-3) * axes[0]), np.full(2, radius))]
+    start, end, radii = np.array(c.start), np.array(c.end), np.array(c.radii)
+    thin, wide = np.argmin(radii.sum(0)), np.argmax(radii.sum(0))
+    if is_last(body, c):
+        end = start + (end - start) * max(0.2, 1 - c.mean_radii[1] / c.length)
+    if c.is_round:
+        return [(c.segment, np.stack([start, end]), radii[:, 0])]
+    beside = (radii[:, wide] - radii[:, thin]).clip(0)[:, None] * c.axes[wide]
+    return [(c.segment, np.stack([start, end]) + k * beside, radii.min(axis=1)) for k in (-1, 0, 1)]
 
 
 def _reach(ends: NDArray, radii: NDArray, count: int) -> NDArray:

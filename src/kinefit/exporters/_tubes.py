@@ -1,4 +1,4 @@
-"""A body's round surfaces as one closed, smooth mesh whose vertices follow one or two segments."""
+"""A body's surfaces as one closed, smooth mesh whose vertices follow one or two segments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, Cylinder
+from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
@@ -41,8 +41,8 @@ def side_colour(name: str) -> tuple[int, int, int]:
 
 
 def body_mesh(body: Body) -> SkinnedMesh:
-    """Tubes with rounded ends around all surfaces; near a joint the skin follows both segments."""
-    parts = [_tube(body, c) for c in body.surfaces if np.linalg.norm(c.end) > 1e-6 and min(c.radii) > 0]
+    """Tubes with rounded ends around all cylinders, meshes as they are; near a joint a tube follows both segments."""
+    parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in body.surfaces]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))
         return SkinnedMesh(*(np.zeros((0, count), kind) for count, kind in columns))
@@ -57,24 +57,47 @@ def body_mesh(body: Body) -> SkinnedMesh:
     )
 
 
-def _tube(body: Body, c: Cylinder) -> SkinnedMesh:
-    tree, end = body.tree, np.array(c.end)
-    length = float(np.linalg.norm(end))
-    u = end / length
-    if not np.any(tree.parents == c.segment):  # the last of a limb is as long, with its rounded end, as its surface
-        length = max(0.2 * length, length - c.radii[1])
-    along, radius, slope = _profile(length, *c.radii)
-    side = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
-    side /= np.linalg.norm(side)
+def is_last(body: Body, c: TaperedCylinder) -> bool:
+    """Whether neither a joint nor another surface of the segment follows at the end of a cylinder."""
+    others = [s for s in body.surfaces if s is not c and s.segment == c.segment and isinstance(s, TaperedCylinder)]
+    follows = any(np.linalg.norm(np.subtract(s.start, c.end)) < s.length for s in others)
+    return not follows and not np.any(body.tree.parents == c.segment)
+
+
+def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.zeros_like(mesh.vertices)
+    np.add.at(normals, mesh.faces, np.cross(b - a, c - a)[:, None])
+    count = len(mesh.vertices)
+    return SkinnedMesh(
+        vertices=mesh.vertices + body.tree.rest[mesh.segment],
+        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30),
+        colours=np.tile(np.array(side_colour(body.tree.segments[mesh.segment]), np.uint8), (count, 1)),
+        triangles=mesh.faces,
+        segments=np.full((count, 2), mesh.segment),
+        weights=np.tile([1.0, 0.0], (count, 1)),
+    )
+
+
+def _tube(body: Body, c: TaperedCylinder) -> SkinnedMesh:
+    tree, start, radii = body.tree, np.array(c.start), c.mean_radii
+    length, (side, across, u) = c.length, c.axes
+    if is_last(body, c):  # the last of a limb is as long, with its rounded end, as its surface
+        length = max(0.2 * length, length - radii[1])
+    along, radius, slope = _profile(length, *radii)
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
-    out = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(u, side))  # (AROUND, 3)
-    points = along[:, None, None] * u + radius[:, None, None] * out  # (rings, AROUND, 3)
-    normals = np.sin(slope)[:, None, None] * u + np.cos(slope)[:, None, None] * out
+    out = np.stack([np.outer(np.cos(angle), side), np.outer(np.sin(angle), across)])  # (2, AROUND, 3)
+    flat = np.array(c.radii) / np.array(radii)[:, None]  # (2, 2) how an ellipse departs from a circle, at both ends
+    t = np.clip(along / length, 0.0, 1.0)[:, None]
+    flat = (1 - t) * flat[0] + t * flat[1]  # (rings, 2)
+    points = along[:, None, None] * u + radius[:, None, None] * np.einsum("rk,kai->rai", flat, out)
+    normals = np.sin(slope)[:, None, None] * u + np.cos(slope)[:, None, None] * np.einsum("rk,kai->rai", 1 / flat, out)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
     vertices = np.concatenate([[along[0] * u], points[1:-1].reshape(-1, 3), [along[-1] * u]])
     heights = np.concatenate([[along[0]], np.repeat(along[1:-1], AROUND), [along[-1]]])
     segments, weights = _weights(body, c, heights, length)
     return SkinnedMesh(
-        vertices=vertices + tree.rest[c.segment],
+        vertices=vertices + start + tree.rest[c.segment],
         normals=np.concatenate([[-u], normals[1:-1].reshape(-1, 3), [u]]),
         colours=np.tile(np.array(side_colour(tree.segments[c.segment]), np.uint8), (len(vertices), 1)),
         triangles=_triangles(len(along) - 2),
@@ -107,13 +130,15 @@ def _triangles(rings: int) -> NDArray:
     return np.concatenate([start, walls, end])
 
 
-def _weights(body: Body, c: Cylinder, heights: NDArray, length: float) -> tuple[NDArray, NDArray]:
+def _weights(body: Body, c: TaperedCylinder, heights: NDArray, length: float) -> tuple[NDArray, NDArray]:
     """At its joint a tube follows its parent by half, at its end the child that begins there; between, itself."""
-    tree, (start, end) = body.tree, c.radii
+    tree, (start, end) = body.tree, c.mean_radii
     segments = np.full((len(heights), 2), c.segment)
     other = np.zeros(len(heights))
     children = [k for k in np.flatnonzero(tree.parents == c.segment) if np.linalg.norm(tree.offsets[k] - c.end) < end]
-    reaches = [(-heights / start, tree.parents[c.segment])] + [((heights - length) / end, k) for k in children[:1]]
+    at_joint = np.linalg.norm(c.start) < start
+    parent = tree.parents[c.segment] if at_joint else -1
+    reaches = [(-heights / start, parent)] + [((heights - length) / end, k) for k in children[:1]]
     for beyond, neighbour in reaches:
         if neighbour >= 0:
             t = np.clip(0.5 + 0.5 * beyond, 0.0, 1.0)  # 0 a radius before the end, 1 a radius beyond it

@@ -67,7 +67,7 @@ def _hierarchy(
 ) -> list[str]:
     """Lines of the hierarchy; fills `order` with the segments in the order of their channels."""
     tree = body.tree
-    ends = {c.segment: scale * pose.turns[c.segment] @ np.array(c.end) for c in body.surfaces}
+    ends = {s: scale * pose.turns[s] @ end for s, end in body.segment_ends().items()}
 
     def joint(s: int, depth: int) -> list[str]:
         order.append(s)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, MeshSurface
+from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters._atomic import writing
 from kinefit.exporters._rest import Rest, rest_pose
@@ -109,11 +110,18 @@ def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: flo
     if motion.body.surfaces:
         _mesh(stage, pose.posed(body_mesh(motion.body), motion.body), bind[0], factor, skeleton)
     centres = factor * motion.segment_poses()[..., :3, 3]
-    margin = factor * max((max(c.radii) + float(np.linalg.norm(c.end)) for c in motion.body.surfaces), default=0.0)
+    margin = factor * max((_reach(c) for c in motion.body.surfaces), default=0.0)
     extent = UsdGeom.Boundable(root).CreateExtentAttr()
     for frame, points in enumerate(centres):
         extent.Set([Gf.Vec3f(*(points.min(0) - margin).tolist()), Gf.Vec3f(*(points.max(0) + margin).tolist())],
                    Usd.TimeCode(frame))
+
+
+def _reach(surface: Surface) -> float:
+    """[m] from a segment's joint to the farthest of its surface, or somewhat more."""
+    if isinstance(surface, MeshSurface):
+        return float(np.linalg.norm(surface.vertices, axis=1).max())
+    return max(float(np.linalg.norm(end)) + max(r) for end, r in zip((surface.start, surface.end), surface.radii))
 
 
 def _rest_poses(body: Body, pose: Rest, up: str, factor: float) -> tuple[NDArray, NDArray]:

@@ -154,6 +154,13 @@ class Camera:
         kernels.rays(self.packed, np.array(pixels.reshape(-1, 2), order="C"), directions)
         return directions.reshape(*pixels.shape[:-1], 3)
 
+    @cached_property
+    def ray_table(self) -> NDArray:
+        """(2, H, W) x/z and y/z of the ray through every pixel, in the camera's frame; NaN where no ray reaches it."""
+        u, v = np.meshgrid(np.arange(self.size[0], dtype=float), np.arange(self.size[1], dtype=float))
+        rays = self.ray(np.stack([u, v], axis=-1)) @ self.T_camera_world[:3, :3].T
+        return _read_only(np.ascontiguousarray(np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)))
+
     def with_pose(self, T_camera_world: ArrayLike) -> Camera:
         """Same camera elsewhere."""
         return replace(self, T_camera_world=np.asarray(T_camera_world, float))

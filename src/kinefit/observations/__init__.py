@@ -4,12 +4,15 @@ Readers make them, correspondences use them; nothing here opens a file or knows 
 one sensor, `frames` what it saw at one time.
 """
 
+from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, Markers, SkeletonMotion
 
 __all__ = [
     "MEDIAPIPE_33",
+    "CloudVideo",
     "DepthFrame",
+    "DepthVideo",
     "Detections",
     "Frame",
     "KeypointFrame",

@@ -1,6 +1,5 @@
 """Whole recordings of one sensor: frozen records, in metres, radians, seconds and pixels."""
 
-
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kinefit.errors import CalibrationError, TakeError, choices
+from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.observations import Keypoints, Markers
+from kinefit.observations import CloudVideo, DepthVideo, Keypoints, Markers
 from kinefit.readers.calibration import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.load_depth import load_depth
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.video import Video, check_rates, common_frames
@@ -30,7 +31,7 @@ class Observations:
     frames : (start, stop)
         Steps of the common time that every camera's streams have; t = step / rate.
     rig : Rig or None
-        The take's cameras, in its order; None where there are none.
+        The take's cameras, in its order, then its depth sensors; None where there are none.
     keypoints : tuple of Keypoints
         In the order of `take.keypoints`, all cut to `frames`, in the image frame of the calibration.
     markers : tuple of Markers
@@ -38,6 +39,12 @@ class Observations:
     videos : {camera: Path}
     images : {camera: ImageFrame}
         How the video's picture of each camera relates to the calibration's.
+    depth : tuple of DepthVideo
+        In the order of `take.depth`, whole, at their own rates; those whose files are images.
+    clouds : tuple of CloudVideo
+        Those whose files are points without order.
+    notes : tuple of str
+        What is worth saying: depth of another rate, frames that are missing.
     """
 
     rate: float
@@ -47,6 +54,9 @@ class Observations:
     markers: tuple[Markers, ...]
     videos: dict[str, Path]
     images: dict[str, ImageFrame]
+    depth: tuple[DepthVideo, ...] = ()
+    clouds: tuple[CloudVideo, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
@@ -83,32 +93,62 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
         rates[stream], lengths[stream], offsets[stream] = read.rate, len(read), read.time_offset
-    if not (lengths or markers):
+    sensors = load_depth(take, rig, rates)
+    recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
+    if not (lengths or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
     check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
-    rate = take.rate or next(iter(rates.values()), None) or markers[0].rate
+    own = [*(recording.rate for recording in recordings), *(m.rate for m in markers)]
+    rate = take.rate or next(iter(rates.values()), None) or own[0]
     if lengths:
         frames = common_frames(lengths, offsets, rate, take.frames, file=take.path)
+    elif recordings:
+        frames = take.frames or _span(recordings, rate)
     else:
         frames = take.frames or (0, max(round(len(m) * rate / m.rate) for m in markers))
+    _check_depth(recordings, frames, rate, take)
+    cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
     return Observations(
-        rate=rate, frames=frames, rig=rig, keypoints=tuple(_cut(k, frames) for k in keypoints), markers=markers,
+        rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
+        keypoints=tuple(_cut(k, frames) for k in keypoints), markers=markers,
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
+        depth=sensors.depth, clouds=sensors.clouds, notes=sensors.notes(rate),
     )
 
 
+def _span(recordings: Sequence[DepthVideo | CloudVideo], rate: float) -> tuple[int, int]:
+    """Steps from the first depth image of any sensor to the last."""
+    first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
+    return round(float(first) * rate), round(float(last) * rate) + 1
+
+
+def _check_depth(
+    recordings: Sequence[DepthVideo | CloudVideo], frames: tuple[int, int], rate: float, take: Take
+) -> None:
+    """Refuse depth that was not recorded at the time of the rest."""
+    for recording in recordings:
+        first, last = float(recording.times[0]), float(recording.times[-1])
+        if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
+            raise ObservationError(
+                f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
+                f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,
+                place=f"depth {recording.sensor}", remedy="Correct its time_offset, its rate, or frames.",
+            )
+
+
 def _read_rig(take: Take, exteriors: bool) -> Rig | None:
-    if not take.cameras or take.calibration is None:
+    if take.calibration is None or not (take.cameras or take.depth):
         return None
     rig = read_calibration(take.calibration.file, unit=take.calibration.unit, exteriors=exteriors)
-    for entry in take.cameras:
-        if entry.name not in rig:
+    names = [entry.name for entry in take.cameras] + [entry.camera or entry.name for entry in take.depth]
+    for name in names:
+        if name not in rig:
             raise CalibrationError(
-                choices("calibration of camera", entry.name, rig.names), file=take.calibration.file,
+                choices("calibration of camera", name, rig.names), file=take.calibration.file,
                 remedy=f"Correct the camera's name in {take.path.name}, or calibrate this camera too.",
             )
-    return rig.select(tuple(entry.name for entry in take.cameras))
+    return rig.select(tuple(dict.fromkeys(names)))
 
 
 def _image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:

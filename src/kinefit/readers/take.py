@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,60 +14,27 @@ import msgspec
 from kinefit.errors import FileError, TakeError, choices
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.markers import UNITS
+from kinefit.readers.take_entries import (
+    CalibrationEntry,
+    CameraEntry,
+    DepthEntry,
+    KeypointsEntry,
+    MarkersEntry,
+    StereoEntry,
+    _Entry,
+    _Head,
+)
 
-
-class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the take file; paths are absolute once it is read."""
-
-
-class CalibrationEntry(_Entry, frozen=True, kw_only=True):
-    """`[calibration]`: where the cameras stood."""
-
-    file: Path
-    unit: str = "auto"  # of its translations, where the format does not tell
-
-
-class CameraEntry(_Entry, frozen=True, kw_only=True):
-    """`[[camera]]`: one camera of the calibration, with its video or the size of its picture."""
-
-    name: str
-    video: Path | None = None
-    size: tuple[int, int] | None = None  # [px] (width, height) of the picture; default: the video's
-    image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the picture
-    rotation: Literal[0, 90, 180, 270] = 0  # [deg] the picture is the calibration's, turned clockwise
-    time_offset: float = 0.0  # [s] added to frame / rate
-
-
-class KeypointsEntry(_Entry, frozen=True, kw_only=True):
-    """`[[keypoints]]`: what a detector saw in one camera."""
-
-    camera: str
-    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
-    format: Literal["openpose", "mediapipe", "caliscope", "detect"] = "openpose"
-    set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe
-    frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
-    rate: float | None = None  # [Hz]; default: the camera's video, or the take
-    accuracy: float = 8.0  # [px] standard deviation, in the calibration's image
-
-
-class MarkersEntry(_Entry, frozen=True, kw_only=True):
-    """`[[markers]]`: a marker recording."""
-
-    file: Path
-    unit: str | None = None  # where the file does not tell it
-    set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
-    time_offset: float = 0.0  # [s]
-    accuracy: float = 0.005  # [m] standard deviation
-
-
-class _Head(_Entry, frozen=True, kw_only=True):
-    name: str | None = None
-    rate: float | None = None
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-    body: str = "humanoid"
-    height: float | None = None
-    subject: Path | None = None
-    frames: tuple[int, int] | None = None
+__all__ = [
+    "CalibrationEntry",
+    "CameraEntry",
+    "DepthEntry",
+    "KeypointsEntry",
+    "MarkersEntry",
+    "StereoEntry",
+    "Take",
+    "read_take",
+]
 
 
 class _File(_Entry, frozen=True, kw_only=True):
@@ -76,6 +43,8 @@ class _File(_Entry, frozen=True, kw_only=True):
     camera: tuple[CameraEntry, ...] = ()
     keypoints: tuple[KeypointsEntry, ...] = ()
     markers: tuple[MarkersEntry, ...] = ()
+    depth: tuple[DepthEntry, ...] = ()
+    stereo: tuple[StereoEntry, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,7 +70,7 @@ class Take:
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
-    cameras, keypoints, markers : tuples of entries
+    cameras, keypoints, markers, depth, stereo : tuples of entries
     """
 
     path: Path
@@ -116,6 +85,8 @@ class Take:
     cameras: tuple[CameraEntry, ...]
     keypoints: tuple[KeypointsEntry, ...]
     markers: tuple[MarkersEntry, ...]
+    depth: tuple[DepthEntry, ...] = ()
+    stereo: tuple[StereoEntry, ...] = ()
 
 
 def read_take(path: str | PathLike[str]) -> Take:
@@ -152,7 +123,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     take = Take(
         path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
-        keypoints=content.keypoints, markers=content.markers,
+        keypoints=content.keypoints, markers=content.markers, depth=content.depth, stereo=content.stereo,
     )
     _check_values(take)
     _check_names(take)
@@ -189,12 +160,12 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
     """Name an unknown table or key, and what exists."""
     tables: dict[str, type[msgspec.Struct]] = {
         "take": _Head, "calibration": CalibrationEntry, "camera": CameraEntry, "keypoints": KeypointsEntry,
-        "markers": MarkersEntry,
+        "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     }
     for table, content in raw.items():
         if table not in tables:
             raise TakeError(choices("sensor or table", table, tables), file=path, place=f"[{table}]")
-        many = table in ("camera", "keypoints", "markers")
+        many = table not in ("take", "calibration")
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
             raise TakeError(f"'{table}' is not a table {wanted}", file=path, place=table, remedy=f"Write {wanted}.")
@@ -238,17 +209,48 @@ def _check_values(take: Take) -> None:
             refuse(f"accuracy {entry.accuracy} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
         if entry.unit is not None and entry.unit.lower() not in UNITS:
             refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+    for problem, place, remedy in _odd_depth(take):
+        refuse(problem, place, remedy)
+
+
+def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
+    """Numbers of depth sensors and stereo pairs that cannot be: problem, place, remedy."""
+    for entry in take.depth:
+        place = f"depth {entry.name}"
+        if not 0 < entry.accuracy < 1 or not abs(entry.time_offset) < 1e6:
+            yield f"accuracy {entry.accuracy} m, time offset {entry.time_offset} s", place, "Give metres and seconds."
+        for key, value in (("unit", entry.unit), ("rate", entry.rate), ("time_unit", entry.time_unit)):
+            if value is not None and not 0 < value < 1e6:
+                yield f"{key} = {value:g}", place, "Give a positive number: unit in metres a count, rate in Hz."
+        if entry.range is not None and not 0 <= entry.range[0] < entry.range[1]:
+            yield f"range = {list(entry.range)}", place, "Give [near, far] in metres."
+        if entry.size is not None and min(entry.size) < 1:
+            yield f"size = {list(entry.size)}", place, "Give [width, height] in pixels."
+        if entry.camera is not None and take.calibration is None:
+            yield f"camera = {entry.camera}, but no [calibration]", place, "Add one, or give intrinsics."
+        if entry.distortion and entry.intrinsics is None:
+            yield "distortion without intrinsics", place, "Write intrinsics = [fx, fy, cx, cy] too."
+        if entry.intrinsics is not None and not min(entry.intrinsics[:2]) > 0:
+            yield f"intrinsics = {list(entry.intrinsics)}", place, "Give [fx, fy, cx, cy] in pixels."
+    for pair in take.stereo:
+        if not (0 < pair.range[0] < pair.range[1] and 0 < pair.accuracy < 100):
+            yield (
+                f"range {list(pair.range)} m, accuracy {pair.accuracy} px", f"stereo {pair.name}",
+                "Give [near, far] in metres, nearer than far, and pixels.",
+            )
 
 
 def _check_names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
-    if not (take.cameras or take.keypoints or take.markers):
-        remedy = "Add [[camera]] with [[keypoints]], or [[markers]]."
+    if not (take.cameras or take.keypoints or take.markers or take.depth):
+        remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
-    for name in names:
-        if names.count(name) > 1:
-            raise TakeError("there are two of this name", file=take.path, place=f"camera {name}", remedy="Rename one.")
+    sensors = [*names, *(entry.name for entry in take.depth), *(entry.name for entry in take.stereo)]
+    for name in sensors:
+        if sensors.count(name) > 1:
+            kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
+            raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
     for source in take.keypoints:
         if source.camera not in names:
             raise TakeError(
@@ -257,6 +259,21 @@ def _check_names(take: Take) -> None:
             )
     if take.cameras and take.calibration is None:
         raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')
+    for pair in take.stereo:
+        for side in (pair.left, pair.right):
+            if not any(entry.name == side and entry.video is not None for entry in take.cameras):
+                raise TakeError(
+                    choices("camera with a video", side, [e.name for e in take.cameras if e.video is not None]),
+                    file=take.path, place=f"stereo {pair.name}", remedy="Name two [[camera]] that have a video.",
+                )  # fmt: skip
+        if pair.left == pair.right:
+            raise TakeError("left and right are one camera", file=take.path, place=f"stereo {pair.name}")
+    alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
+    if alone and (take.calibration is not None or len(take.depth) > 1):
+        raise TakeError(
+            "intrinsics alone do not tell where a sensor stands beside others", file=take.path,
+            place=f"depth {alone[0]}", remedy="Put its intrinsics and its pose into the calibration, and not here.",
+        )  # fmt: skip
 
 
 def _check_files(take: Take) -> None:
@@ -267,8 +284,10 @@ def _check_files(take: Take) -> None:
     named += [("[take] subject", take.subject)]
     named += [("markers", entry.file) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith(".toml") else None)]
+    named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
+    named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:
-        if file is not None and not file.exists():
+        if file is not None and not file.exists() and not ("*" in file.name and any(file.parent.glob(file.name))):
             raise FileError(
                 f"no such file or folder: {file}", file=take.path, place=place,
                 remedy="Correct the path; a relative one starts at the take file.",

@@ -3,17 +3,41 @@
 from kinefit.simulation.exercise import squat_and_wave
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
+from kinefit.simulation.movements import Person, movement, people
+from kinefit.simulation.pictures import COLOUR, STEREO, ColourSensor, StereoSensor, picture
+from kinefit.simulation.placing import in_front
+from kinefit.simulation.recordings import SENSORS, write_recording
 from kinefit.simulation.retarget import cut, known_motion, resampled, retarget
+from kinefit.simulation.scenes import Scene
+from kinefit.simulation.sensors import KINECT, TOF, DepthSensor, simulate_depth
 from kinefit.simulation.takes import write_synthetic_take
+from kinefit.simulation.transfer import on_body
 
 __all__ = [
+    "COLOUR",
+    "KINECT",
+    "SENSORS",
+    "STEREO",
+    "TOF",
+    "ColourSensor",
+    "DepthSensor",
+    "Person",
+    "Scene",
+    "StereoSensor",
     "cut",
     "draw_figure",
+    "in_front",
     "known_motion",
+    "movement",
+    "on_body",
+    "people",
+    "picture",
     "resampled",
     "retarget",
+    "simulate_depth",
     "simulate_keypoints",
     "squat_and_wave",
     "studio_rig",
+    "write_recording",
     "write_synthetic_take",
 ]

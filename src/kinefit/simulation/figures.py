@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
+from kinefit.bodies import MeshSurface
+from kinefit.bodies.surfaces import Surface
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 
@@ -28,23 +29,19 @@ def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | Non
     """
     image = np.full((camera.size[1], camera.size[0], 3), _GREY, np.uint8) if image is None else image.copy()
     R_camera_world, far = camera.T_camera_world[:3, :3], []
+    frames, _ = motion.body.tree.forward(motion.state(frame).T_world_root, motion.state(frame).angles)
     for limb in motion.body.surfaces:
-        ends = _ends(motion.state(frame), motion, limb.segment, limb.end)
-        depth = (ends @ R_camera_world.T + camera.T_camera_world[:3, 3])[:, 2]
-        far.append((float(depth.mean()), ends, limb))
+        R, t = frames[limb.segment, :9].reshape(3, 3), frames[limb.segment, 9:]
+        x = _rim(limb, R_camera_world @ R) @ R.T + R @ motion.body.tree.rest[limb.segment] + t
+        far.append((float((x @ R_camera_world[2]).mean() + camera.T_camera_world[2, 3]), x, limb.segment))
     nearest, farthest = min(item[0] for item in far), max(item[0] for item in far)
-    circle = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
-    for depth, ends, limb in sorted(far, key=lambda item: -item[0]):
-        rims = [
-            x + r * (np.outer(np.cos(circle), R_camera_world[0]) + np.outer(np.sin(circle), R_camera_world[1]))
-            for x, r in zip(ends, limb.radii)
-        ]
-        outline = camera.project(np.concatenate(rims))
+    for depth, x, segment in sorted(far, key=lambda item: -item[0]):
+        outline = camera.project(x)
         if not np.isfinite(outline).all():
             continue
         hull = cv2.convexHull(outline.astype(np.float32))[:, 0]
         corners = np.round(hull * 2**_FINE).astype(np.int32)
-        name = motion.body.tree.segments[limb.segment]
+        name = motion.body.tree.segments[segment]
         colour = np.array(_COLOURS[name[-2:] if name[-2:] in _COLOURS else ""])
         shade = 1.0 - 0.35 * (depth - nearest) / max(farthest - nearest, 1e-9)
         cv2.fillPoly(image, [corners], (colour * shade).tolist(), cv2.LINE_AA, _FINE)
@@ -52,8 +49,14 @@ def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | Non
     return image
 
 
-def _ends(state: BodyState, motion: Motion, segment: int, end: tuple[float, float, float]) -> NDArray:
-    """(2, 3) [m] both ends of a limb's axis in the world."""
-    frames, _ = motion.body.tree.forward(state.T_world_root, state.angles)
-    points = motion.body.tree.rest[segment] + np.array([np.zeros(3), end])
-    return points @ frames[segment, :9].reshape(3, 3).T + frames[segment, 9:]
+def _rim(limb: Surface, R_camera_segment: NDArray) -> NDArray:
+    """(K, 3) [m] points in the segment's frame about which the limb's outline runs: of its two rounded ends."""
+    if isinstance(limb, MeshSurface):
+        return limb.vertices
+    angle = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
+    outward = np.outer(np.cos(angle), R_camera_segment[0]) + np.outer(np.sin(angle), R_camera_segment[1])
+    rims = []
+    for end, (a, b) in zip((limb.start, limb.end), limb.radii):
+        M = limb.axes.T @ np.diag([a, b, np.sqrt(a * b)]) ** 2 @ limb.axes  # ellipsoid; its farthest point outward
+        rims.append(end + (outward @ M) / np.sqrt(np.sum(outward @ M * outward, axis=1))[:, None])
+    return np.concatenate(rims)

@@ -60,15 +60,17 @@ class Prediction:
         """Stay where the body was last seen: for a frame in which nothing is."""
         self._velocity = np.zeros_like(self._velocity)
 
-    def ahead(self) -> tuple[BodyState, NDArray]:
-        """The next frame's state, and the information (n, n) that it stands for."""
+    def ahead(self, steps: int = 1) -> tuple[BodyState, NDArray]:
+        """The state some frames on (more than one where frames were dropped), and the information (n, n) of it."""
         assert self.state is not None
-        self._velocity = self._keep * self._velocity
-        vx, vv = self._keep * self._vx, self._keep**2 * self._vv
-        self._xx = self._xx + vx + vx.T + vv + self._noise[0]
-        self._vx = vx + vv + self._noise[1]
-        self._vv = vv + self._noise[2]
-        self._ahead = self.state.retract(self._velocity, self._bounds)
+        self._ahead = self.state
+        for _ in range(steps):
+            self._velocity = self._keep * self._velocity
+            vx, vv = self._keep * self._vx, self._keep**2 * self._vv
+            self._xx = self._xx + vx + vx.T + vv + self._noise[0]
+            self._vx = vx + vv + self._noise[1]
+            self._vv = vv + self._noise[2]
+            self._ahead = self._ahead.retract(self._velocity, self._bounds)
         self._information = inverse(self._xx)
         return self._ahead, self._information
 

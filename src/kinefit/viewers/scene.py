@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion, Residuals
 
@@ -40,19 +40,25 @@ class Rays:
     colours: NDArray
 
 
-def capsule(start: NDArray, end: NDArray, radii: tuple[float, float]) -> Mesh:
-    """Tube from `start` to `end` (3,) with rounded ends of the two radii [m]."""
+def capsule(start: NDArray, end: NDArray, radii: ArrayLike, side: ArrayLike | None = None) -> Mesh:
+    """Tube from `start` to `end` (3,) with rounded ends of the two radii [m].
+
+    Ellipses have radii ((a0, b0), (a1, b1)): a along `side` (3,), which is at right angles to the axis.
+    """
+    given = np.asarray(radii, float)
+    sections = given if given.ndim == 2 else np.repeat(given[:, None], 2, axis=1)
+    first, last = np.sqrt(sections.prod(axis=1))  # along the axis
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
     u = (end - start) / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    side = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
-    side /= np.linalg.norm(side)
+    across = np.cross(u, np.eye(3)[np.argmin(np.abs(u))]) if side is None else np.asarray(side, float)
+    across = across / np.linalg.norm(across)
     polar = np.linspace(-np.pi / 2, 0, _CAP + 1)
-    along = np.concatenate([radii[0] * np.sin(polar), length - radii[1] * np.sin(polar[::-1])])
-    radius = np.concatenate([radii[0] * np.cos(polar), radii[1] * np.cos(polar[::-1])])
+    along = np.concatenate([first * np.sin(polar), length - last * np.sin(polar[::-1])])
+    radius = np.concatenate([np.outer(np.cos(polar), sections[0]), np.outer(np.cos(polar[::-1]), sections[1])])
     angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-    out = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(u, side))
-    vertices = start + along[:, None, None] * u + radius[:, None, None] * out  # (rings, _AROUND, 3)
+    out = np.stack([np.outer(np.cos(angle), across), np.outer(np.sin(angle), np.cross(u, across))])  # (2, _AROUND, 3)
+    vertices = start + along[:, None, None] * u + np.einsum("rk,kai->rai", radius, out)  # (rings, _AROUND, 3)
     i, j = np.meshgrid(np.arange(len(along) - 1), np.arange(_AROUND), indexing="ij")
     a, b = i * _AROUND + j, i * _AROUND + (j + 1) % _AROUND
     faces = np.stack([a, b, b + _AROUND, a, b + _AROUND, a + _AROUND], -1).reshape(-1, 3)
@@ -70,7 +76,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
 
 def bone_meshes(body: Body) -> list[Mesh | None]:
     """One thin mesh a segment, in its frame: to the joints of its children, or to the end of the last surface."""
-    tree, ends = body.tree, {c.segment: np.array(c.end) for c in body.surfaces}
+    tree, ends = body.tree, body.segment_ends()
     out = []
     for s in range(len(tree.segments)):
         tips = [tree.offsets[k] for k in np.flatnonzero(tree.parents == s)] or ([ends[s]] if s in ends else [])
@@ -81,11 +87,13 @@ def bone_meshes(body: Body) -> list[Mesh | None]:
 
 
 def surface_meshes(body: Body) -> list[Mesh | None]:
-    """One mesh a segment, in its frame: its tapered round surfaces."""
+    """One mesh a segment, in its frame: its tapered surfaces with rounded ends, and its meshes."""
     found: list[list[Mesh]] = [[] for _ in body.tree.segments]
     for c in body.surfaces:
-        if min(c.radii) > 0 and np.linalg.norm(c.end) > 1e-6:
-            found[c.segment].append(capsule(np.zeros(3), np.array(c.end), c.radii))
+        if isinstance(c, TaperedCylinder):
+            found[c.segment].append(capsule(np.array(c.start), np.array(c.end), c.radii, c.side))
+        else:
+            found[c.segment].append(Mesh(c.vertices, c.faces))
     return [joined(meshes) for meshes in found]
 
 

@@ -1,0 +1,161 @@
+"""A start with no pose given, on rendered truth: postures found, limbs found again, the person's size."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import figure
+
+_POSES, _LIMBS, _NEAR = 16, 16, 0.1  # [m] a joint this near its true place is found
+_UP = np.array([0.0, 1.0, 0.0])
+
+
+def run() -> None:
+    """Print the figures."""
+    from kinefit import load_body
+
+    body = load_body("humanoid10")
+    _recovered(body)
+    _limbs(body)
+    _size(body)
+
+
+def random_state(body: Any, rng: np.random.Generator, *, sitting: bool) -> Any:
+    """Somebody who stands or sits, arms any way in front, at the side or raised, turned by up to 60° either way."""
+    from kinefit.bodies import BodyState
+
+    angles, tree = np.array(body.tree.usual), body.tree
+    ranges = {"arm_flex": (-30, 150), "arm_add": (-100, 5), "arm_rot": (-60, 60), "elbow_flex": (0, 120)}
+    ranges |= {"hip_flexion": (-15, 35), "knee_angle": (0, 40), "hip_adduction": (-25, 5)}
+    if sitting:
+        ranges |= {"hip_flexion": (70, 100), "knee_angle": (60, 100), "hip_adduction": (-20, 5)}
+    for name, (low, high) in ranges.items():
+        for side in "rl":
+            angles[tree.coordinate(f"{name}_{side}")] = np.radians(rng.uniform(low, high))
+    for name, most in (("neck_extension", 20), ("neck_rotation", 30)):
+        angles[tree.coordinate(name)] = np.radians(rng.uniform(-most, most))
+    yaw, lean = np.radians(rng.uniform(-60, 60)), np.radians(rng.uniform(-5, 15))
+    f = np.array([np.sin(yaw), 0.0, np.cos(yaw)])
+    y = np.cos(lean) * _UP + np.sin(lean) * f
+    z = np.cross(f, y) / np.linalg.norm(np.cross(f, y))
+    T = np.eye(4)
+    T[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    T[:3, 3] = rng.uniform(-0.4, 0.4), 0.55 if sitting else 0.95, rng.uniform(-0.4, 0.4)
+    return BodyState(T, np.clip(angles, tree.lower, tree.upper))
+
+
+def camera_in_front(sensor: Any) -> Any:
+    """The sensor's camera, 1.1 m high, 3 m in front of the origin."""
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = -T[:3, :3] @ [0.0, 1.1, 3.0]
+    return sensor.camera(T)
+
+
+def seen(body: Any, states: list[Any], camera: Any, sensor: Any, *, room: bool) -> list[NDArray]:
+    """The depth image of each state."""
+    from kinefit.simulation.sensors import simulate_depth
+
+    video = simulate_depth(_motion(body, states), camera, sensor, room=room)
+    return [video.frame(k).depth for k in range(len(states))]
+
+
+def _motion(body: Any, states: list[Any]) -> Any:
+    from kinefit.motion import Motion
+
+    roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
+    count, parts = len(states), len(body.tree.segments)
+    return Motion(
+        body=body, rate=1.0, times=np.arange(count, dtype=float), Ts_world_root=roots, angles=angles,
+        dof_std=np.zeros((count, body.tree.n_dofs)), joint_std=np.zeros((count, parts, 3)), quality=np.ones(count),
+        segment_quality=np.ones((count, parts)), up="y",
+    )  # fmt: skip
+
+
+def joints(body: Any, state: Any) -> NDArray:
+    """(K, 3) [m] joint centres, wrists, ankles and the top of the head."""
+    names = [n for n in body.landmarks.names if n.endswith(("_wrist", "_ankle")) or n == "skull_vertex"]
+    poses = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
+    return np.concatenate([poses[:, :3, 3], body.positions(state, body.landmarks.select(tuple(names)))])
+
+
+def _recovered(body: Any) -> None:
+    from kinefit.simulation.sensors import KINECT
+    from kinefit.tracking.depth_start import start_from_points
+
+    camera = camera_in_front(KINECT)
+    for room, suffix in ((False, ""), (True, "_room")):
+        count = _POSES if not room else _POSES // 2
+        seats = [bool(i % 2) and not room for i in range(count)]
+        truth = [random_state(body, np.random.default_rng(100 + i), sitting=seat) for i, seat in enumerate(seats)]
+        found, spent = [], []
+        for depth, state in zip(seen(body, truth, camera, KINECT, room=room), truth):
+            begin = time.process_time()
+            start = start_from_points(body, None, camera, depth, up=_UP)[0]
+            spent.append(time.process_time() - begin)
+            found.append(np.linalg.norm(joints(body, start.state) - joints(body, state), axis=1) < _NEAR)
+        rate = np.mean(found, axis=1)
+        figure(f"start_recovered{suffix}", float(np.mean(rate)), f"of joints within 100 mm, {count} poses", ">= 0.9")
+        if not room:
+            figure("start_recovered_standing", float(np.mean(rate[0::2])), "of joints", ">= 0.9")
+            figure("start_recovered_sitting", float(np.mean(rate[1::2])), "of joints", ">= 0.9")
+            figure("start_seconds", float(np.median(spent)), "s CPU", "<= 3")
+
+
+def _limbs(body: Any) -> None:
+    """One limb put anywhere, the rest as it is."""
+    from kinefit.bodies import BodyState
+    from kinefit.simulation.sensors import KINECT
+    from kinefit.tracking.depth_start import restart_limb
+
+    camera, good, spent = camera_in_front(KINECT), [], []
+    truth = [random_state(body, np.random.default_rng(300 + i), sitting=False) for i in range(_LIMBS)]
+    for k, (depth, state) in enumerate(zip(seen(body, truth, camera, KINECT, room=False), truth)):
+        rng, end = np.random.default_rng(k), ("forearm_r", "forearm_l", "shank_r", "shank_l")[k % 4]
+        limb = [body.tree.segment(end), int(body.tree.parents[body.tree.segment(end)])]
+        moved = np.isin(body.tree.owners, limb)
+        angles = np.where(moved, rng.uniform(body.tree.lower, body.tree.upper), state.angles)
+        begin = time.process_time()
+        lost = BodyState(state.T_world_root, angles)
+        start = restart_limb(body, lost, [end], None, camera, depth, up=_UP)[0]
+        spent.append(time.process_time() - begin)
+        names = ("elbow", "wrist") if "arm" in end else ("knee", "ankle")
+        tips = body.landmarks.select(tuple(f"{end[-1]}_{name}" for name in names))
+        good.append(np.linalg.norm(body.positions(start.state, tips) - body.positions(state, tips), axis=1) < _NEAR)
+    figure("restart_recovered", float(np.mean(good)), f"of joints within 100 mm, {_LIMBS} limbs", ">= 0.9")
+    figure("restart_seconds", float(np.median(spent)), "s CPU", "<= 0.3")
+
+
+def _size(body: Any) -> None:
+    """Somebody of other lengths and girths, from three postures that are off by 5° and 3 cm."""
+    from dataclasses import replace
+
+    from kinefit.bodies.surfaces import TaperedCylinder
+    from kinefit.simulation.sensors import KINECT
+    from kinefit.tracking._depth_view import view_of
+    from kinefit.tracking.depth_shape import fit_surfaces
+
+    camera, before, after = camera_in_front(KINECT), [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        scales = np.exp(rng.normal(0.0, 0.07) + rng.normal(0.0, 0.03, len(body.scale_groups)))
+        girth = float(np.exp(rng.normal(0.05, 0.12)))
+        person = body.scaled(scales)
+        person = replace(person, surfaces=tuple(
+            replace(s, radii=tuple((girth * a, girth * b) for a, b in s.radii)) if isinstance(s, TaperedCylinder) else s
+            for s in person.surfaces
+        ))  # fmt: skip
+        truth = [random_state(body, rng, sitting=False) for _ in range(3)]
+        views = [view_of(d, d > 0, camera) for d in seen(person, truth, camera, KINECT, room=False)]
+        sigma = np.repeat((0.03, 0.05, 0.09), (3, 3, len(body.tree.coordinates)))
+        states = [s.retract(sigma * rng.normal(size=len(sigma))) for s in truth]
+        fit = fit_surfaces(body, [v.cloud for v in views], states, views=views)
+        groups = len(scales)
+        before += np.abs(np.log(scales)).tolist()
+        after += np.abs(np.log(fit.factors[:groups] / scales)).tolist()
+    figure("size_lengths_before", 100 * float(np.mean(before)), "% mean error of lengths", ">= 0")
+    figure("size_lengths", 100 * float(np.mean(after)), "% mean error of lengths", "<= 3")

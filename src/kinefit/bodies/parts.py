@@ -1,0 +1,246 @@
+"""A body that changes while it is tracked: parts added and taken away, surfaces replaced, its state carried over.
+
+New parts stand behind all others, so that indices of segments and coordinates stay as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces import MeshSurface, Surface
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError
+
+# Corners of a box by the bits of their index (x: 1, y: 2, z: 4), two triangles a side, counter-clockwise from outside.
+_SIDES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
+
+
+@dataclass(frozen=True)
+class PartJoint:
+    """How a part hangs on its parent; without coordinates it is fixed to it.
+
+    Parameters
+    ----------
+    at : (3,) [m] joint centre in the parent's frame.
+    coordinates : (k,) names
+    axes : (k, 3) directions in the root-aligned rest frame
+    slides : (k,) bool, along its axis instead of turning about it; default none.
+    lower, upper : (k,) [rad] or [m], default without limits.
+    usual, spread : (k,) [rad] or [m], default 0 and no prior.
+    """
+
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    coordinates: tuple[str, ...] = ()
+    axes: tuple[tuple[float, float, float], ...] = ()
+    slides: tuple[bool, ...] = ()
+    lower: tuple[float, ...] = ()
+    upper: tuple[float, ...] = ()
+    usual: tuple[float, ...] = ()
+    spread: tuple[float, ...] = ()
+
+
+def with_part(
+    body: Body,
+    name: str,
+    *,
+    parent: str,
+    surfaces: Surface | Sequence[Surface],
+    joint: PartJoint | None = None,
+    landmarks: dict[str, tuple[float, float, float]] | None = None,
+) -> Body:
+    """The body with one more segment: a carried box, a ski, a tool.
+
+    Parameters
+    ----------
+    parent : name of the segment that holds it.
+    surfaces : one or several; the `segment` that they name is replaced by the new one.
+    joint : PartJoint, default fixed at the parent's joint.
+    landmarks : name -> (3,) [m] in the part's frame, which is aligned with the root's at rest.
+
+    Raises
+    ------
+    BodyError
+        A name that is taken, a parent that is not there, a joint whose numbers do not fit together.
+    """
+    joint, tree = joint or PartJoint(), body.tree
+    for what, new, old in (
+        ("segment", (name,), tree.segments),
+        ("coordinate", joint.coordinates, tree.coordinates),
+        ("landmark", tuple(landmarks or ()), body.landmarks.names),
+    ):
+        taken = sorted(set(new) & set(old)) + sorted({n for n in new if list(new).count(n) > 1})
+        if taken:
+            raise BodyError(f"{what} '{taken[0]}' is there already", place=f"part {name}", remedy="Choose another.")
+    here = len(tree.segments)
+    own = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
+    points = np.array(list((landmarks or {}).values()), float).reshape(-1, 3)
+    if not np.isfinite(points).all():
+        raise BodyError("a landmark is not finite", place=f"part {name}", remedy="Give three numbers in metres.")
+    return replace(
+        body,
+        tree=_grown(tree, name, tree.segment(parent), joint),
+        joints=(*body.joints, f"{name}_joint"),
+        scale_groups=(*body.scale_groups, _free_name(name, body.scale_groups)),
+        segment_scale=np.append(body.segment_scale, len(body.scale_groups)),
+        surfaces=(*body.surfaces, *(replace(s, segment=here) for s in own)),
+        landmarks=PointSet(
+            (*body.landmarks.names, *(landmarks or ())),
+            np.append(body.landmarks.segments, np.full(len(points), here)),
+            np.concatenate([body.landmarks.points, points]),
+        ),
+    )
+
+
+def without_part(body: Body, name: str) -> Body:
+    """The body without a segment and all that is on it: surfaces, landmarks, keypoints, markers, coordinates.
+
+    Raises
+    ------
+    BodyError
+        A name that is not there, the root, or a segment that others hang on.
+    """
+    tree = body.tree
+    gone = tree.segment(name)
+    if gone == 0:
+        raise BodyError(f"'{name}' is the root", place=f"part {name}", remedy="Every body has one; track another body.")
+    children = [s for s, p in zip(tree.segments, tree.parents) if p == gone]
+    if children:
+        remedy = "Take those away first, the last of the chain before the others."
+        raise BodyError(f"{', '.join(children)} hang on it", place=f"part {name}", remedy=remedy)
+    stay = np.arange(len(tree.segments)) != gone
+    used = sorted(set(body.segment_scale[stay].tolist()))
+    return replace(
+        body,
+        tree=_shrunk(tree, gone),
+        joints=tuple(j for j, keep in zip(body.joints, stay) if keep),
+        scale_groups=tuple(body.scale_groups[g] for g in used),
+        segment_scale=np.searchsorted(used, body.segment_scale[stay]),
+        landmarks=_left(body.landmarks, gone),
+        keypoint_sets={n: _left(p, gone) for n, p in body.keypoint_sets.items()},
+        marker_sets={n: _left(p, gone) for n, p in body.marker_sets.items()},
+        surfaces=tuple(replace(s, segment=s.segment - (s.segment > gone)) for s in body.surfaces if s.segment != gone),
+        aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
+    )
+
+
+def with_surfaces(body: Body, segment: str, surfaces: Surface | Sequence[Surface]) -> Body:
+    """The body with other surfaces of one segment; none for a segment that is not to be seen.
+
+    The `segment` that the surfaces name is replaced by this one.
+    """
+    here = body.tree.segment(segment)
+    new = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
+    others = [s for s in body.surfaces if s.segment != here]
+    both = sorted([*others, *(replace(s, segment=here) for s in new)], key=lambda s: s.segment)
+    return replace(body, surfaces=tuple(both))
+
+
+def box(size: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> MeshSurface:
+    """A box of a size (3,) [m] about a centre (3,) [m], along the axes of its segment's frame."""
+    sides = np.asarray(size, float)
+    if sides.shape != (3,) or not (np.isfinite(sides).all() and sides.min() > 0):
+        raise BodyError(f"a box of the size {size}", remedy="Give three positive lengths in metres.")
+    bits = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)])
+    faces = [triangle for a, b, c, d in _SIDES for triangle in ((a, b, c), (a, c, d))]
+    return MeshSurface(0, np.asarray(centre, float) + (bits - 0.5) * sides, np.array(faces))
+
+
+def carry_state(state: BodyState, old: Body, new: Body) -> BodyState:
+    """A state of one body as that of another: angles by their names, new ones as usual; so that a tracker goes on.
+
+    Raises
+    ------
+    BodyError
+        A state that is not of the old body.
+    """
+    if len(state.angles) != len(old.tree.coordinates):
+        problem = f"a state with {len(state.angles)} angles for a body with {len(old.tree.coordinates)}"
+        raise BodyError(problem, remedy="Give the body that the state was found for.")
+    known = dict(zip(old.tree.coordinates, state.angles))
+    angles = [known.get(name, usual) for name, usual in zip(new.tree.coordinates, new.tree.usual)]
+    return BodyState(state.T_world_root, np.array(angles, float))
+
+
+def carry_dofs(values: NDArray, old: Body, new: Body, *, missing: float = 0.0) -> NDArray:
+    """(6 + D_new,) values of degrees of freedom (velocities, deviations) by name; `missing` for new ones."""
+    if np.shape(values) != (old.tree.n_dofs,):
+        problem = f"values of shape {np.shape(values)} for {old.tree.n_dofs} degrees of freedom"
+        raise BodyError(problem, remedy="Give one for each of the old body's.")
+    known = dict(zip(old.dof_names, values))
+    return np.array([known.get(name, missing) for name in new.dof_names], float)
+
+
+def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:
+    k = len(joint.coordinates)
+    axes, at = np.array(joint.axes, float).reshape(-1, 3), np.array(joint.at, float)
+    columns = {
+        "slides": np.array(joint.slides or (False,) * k),
+        "lower": np.array(joint.lower or (-np.inf,) * k, float),
+        "upper": np.array(joint.upper or (np.inf,) * k, float),
+        "usual": np.array(joint.usual or (0.0,) * k, float),
+        "spread": np.array(joint.spread or (np.inf,) * k, float),
+    }
+    odd = [n for n, v in columns.items() if len(v) != k] + ["axes"] * (len(axes) != k)
+    if odd:
+        problem = f"{odd[0]} of its joint do not match its {k} coordinates"
+        raise BodyError(problem, place=f"part {name}", remedy="Give one for each coordinate.")
+    length = np.linalg.norm(axes, axis=1)
+    if not (np.isfinite(length).all() and (length > 1e-9).all() and at.shape == (3,) and np.isfinite(at).all()):
+        problem = "its joint has an axis without direction, or is not at three finite numbers"
+        raise BodyError(problem, place=f"part {name}", remedy="Give axes of some length, and `at` in metres.")
+    low, high, usual = columns["lower"], columns["upper"], columns["usual"]
+    if not ((low <= usual) & (usual <= high) & np.isfinite(usual) & (columns["spread"] > 0)).all():
+        problem = "its joint's usual values are outside of their limits, or a spread is not positive"
+        raise BodyError(problem, place=f"part {name}", remedy="Give lower <= usual <= upper.")
+    return replace(
+        tree,
+        segments=(*tree.segments, name),
+        parents=np.append(tree.parents, parent),
+        offsets=np.concatenate([tree.offsets, at[None]]),
+        coordinates=(*tree.coordinates, *joint.coordinates),
+        owners=np.append(tree.owners, np.full(k, len(tree.segments))),
+        axes=np.concatenate([tree.axes, axes / length[:, None]]),
+        prismatic=np.append(tree.prismatic, columns["slides"]),
+        lower=np.append(tree.lower, low),
+        upper=np.append(tree.upper, high),
+        usual=np.append(tree.usual, usual),
+        spread=np.append(tree.spread, columns["spread"]),
+    )
+
+
+def _shrunk(tree: KinematicTree, gone: int) -> KinematicTree:
+    stay, own = np.arange(len(tree.segments)) != gone, tree.owners != gone
+    parents, owners = tree.parents[stay], tree.owners[own]
+    return replace(
+        tree,
+        segments=tuple(s for s, keep in zip(tree.segments, stay) if keep),
+        parents=parents - (parents > gone),
+        offsets=tree.offsets[stay],
+        coordinates=tuple(c for c, keep in zip(tree.coordinates, own) if keep),
+        owners=owners - (owners > gone),
+        axes=tree.axes[own],
+        prismatic=tree.prismatic[own],
+        lower=tree.lower[own],
+        upper=tree.upper[own],
+        usual=tree.usual[own],
+        spread=tree.spread[own],
+    )
+
+
+def _left(points: PointSet, gone: int) -> PointSet:
+    stay = points.segments != gone
+    segments = points.segments[stay]
+    names = tuple(n for n, keep in zip(points.names, stay) if keep)
+    return PointSet(names, segments - (segments > gone), points.points[stay])
+
+
+def _free_name(name: str, taken: tuple[str, ...]) -> str:
+    while name in taken:
+        name += "_part"
+    return name

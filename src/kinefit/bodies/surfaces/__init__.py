@@ -1,0 +1,24 @@
+"""Surfaces of a body's segments: tapered elliptical cylinders and meshes."""
+
+from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.nearest import Nearest, nearest
+from kinefit.bodies.surfaces.tables import SurfaceTables
+from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, triangles
+
+Surface = TaperedCylinder | MeshSurface
+
+__all__ = [
+    "BodyMesh",
+    "Box",
+    "MeshSurface",
+    "Nearest",
+    "Surface",
+    "SurfaceTables",
+    "TaperedCylinder",
+    "body_mesh",
+    "bounding_box",
+    "nearest",
+    "sample",
+    "triangles",
+]

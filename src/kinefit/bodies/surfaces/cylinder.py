@@ -1,0 +1,130 @@
+"""Tapered elliptical cylinder: the "degenerated cylinder" of five numbers (P2 2.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import BodyError
+
+Vector = tuple[float, float, float]
+Radii = tuple[tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class TaperedCylinder:
+    """Cylinder of a segment with an elliptical section that changes linearly from end to end, closed by flat caps.
+
+    Its five numbers are the length and two radii at each end; `start`, `end` and `side` say where it sits.
+
+    Parameters
+    ----------
+    segment : int
+    start, end : (3,) [m] centres of both ends, in the segment's frame.
+    radii : ((a0, b0), (a1, b1)) [m]
+        Half axes at the start and at the end: a along `side`, b along axis × side.
+    side : (3,), optional
+        Direction of a; what of it is at right angles to the axis counts. Default: x (forward), or y (up) for a
+        cylinder that lies along x.
+
+    Raises
+    ------
+    BodyError
+        No length, a radius that is not positive, a side along the axis, or numbers that are not finite.
+    """
+
+    segment: int
+    start: Vector
+    end: Vector
+    radii: Radii
+    side: Vector | None = None
+
+    def __post_init__(self) -> None:
+        start, end, radii = (np.array(v, float) for v in (self.start, self.end, self.radii))
+        if start.shape != (3,) or end.shape != (3,) or radii.shape != (2, 2):
+            problem = f"a cylinder has ends of shape {start.shape} and {end.shape} and radii of shape {radii.shape}"
+            raise BodyError(problem, remedy="Give (3,), (3,) and (2, 2).")
+        if not np.isfinite([start.sum(), end.sum(), radii.sum()]).all() or radii.min() <= 0:
+            problem = f"a cylinder from {start.tolist()} to {end.tolist()} has radii {radii.tolist()}"
+            raise BodyError(problem, remedy="Give positive radii in metres, and finite ends.")
+        length = float(np.linalg.norm(end - start))
+        if length < 1e-9:
+            raise BodyError("a cylinder has no length", remedy="Let its end differ from its start.")
+        for name, value in (("start", start), ("end", end), ("side", _side(self.side, (end - start) / length))):
+            object.__setattr__(self, name, tuple(value.tolist()))
+        object.__setattr__(self, "segment", int(self.segment))
+        object.__setattr__(self, "radii", tuple(tuple(pair) for pair in radii.tolist()))
+
+    @classmethod
+    def round(
+        cls, segment: int, end: ArrayLike, radii: tuple[float, float], *, start: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> TaperedCylinder:
+        """Cylinder with circles at its ends, from the segment's joint unless told otherwise."""
+        (first, last), (joint, tip) = radii, [tuple(np.asarray(v, float).tolist()) for v in (start, end)]
+        return cls(segment, joint, tip, ((first, first), (last, last)))  # type: ignore[arg-type]
+
+    @cached_property
+    def length(self) -> float:
+        """[m] from end to end."""
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+    @property
+    def axes(self) -> NDArray:
+        """(3, 3) rows: unit directions of a, of b and of the axis, right-handed, in the segment's frame."""
+        u = np.subtract(self.end, self.start) / self.length
+        return np.stack([np.array(self.side), np.cross(u, np.array(self.side)), u])
+
+    @property
+    def is_round(self) -> bool:
+        """Whether both ends are circles."""
+        return all(a == b for a, b in self.radii)
+
+    @property
+    def mean_radii(self) -> tuple[float, float]:
+        """[m] radii of circles of the same area as both ends."""
+        first, last = (float(np.sqrt(a * b)) for a, b in self.radii)
+        return first, last
+
+    def scaled(self, factor: float) -> TaperedCylinder:
+        """The cylinder stretched about its segment's joint."""
+        start, end, radii = (tuple((factor * np.array(v)).tolist()) for v in (self.start, self.end, self.radii))
+        return TaperedCylinder(self.segment, start, end, radii, self.side)
+
+
+def _side(side: Vector | None, axis: NDArray) -> NDArray:
+    """(3,) unit at right angles to the axis; one that is so already is left as it is, to the last digit."""
+    if side is None:
+        side = (0.0, 1.0, 0.0) if abs(axis[0]) > 0.8 else (1.0, 0.0, 0.0)
+    out = np.array(side, float)
+    if out.shape != (3,) or not np.isfinite(out).all():
+        raise BodyError(f"the side of a cylinder is no direction: {side}", remedy="Give three finite numbers.")
+    if abs(out @ out - 1.0) < 1e-12 and abs(out @ axis) < 1e-12:
+        return out
+    out = out - (out @ axis) * axis
+    norm = float(np.linalg.norm(out))
+    if norm < 1e-6 * max(float(np.linalg.norm(side)), 1e-12):
+        raise BodyError("the side of a cylinder lies along its axis", remedy="Give one at right angles to it.")
+    return out / norm
+
+
+class Box(NamedTuple):
+    """Oriented box in a segment's frame: centre (3,) [m], axes (3, 3) rows, half edges (3,) [m] along them."""
+
+    centre: NDArray
+    axes: NDArray
+    half: NDArray
+
+    def contains(self, points: NDArray) -> NDArray:
+        """(N,) bool for points (N, 3) [m] in the segment's frame."""
+        inside: NDArray = np.all(np.abs((points - self.centre) @ self.axes.T) <= self.half, axis=1)
+        return inside
+
+
+def bounding_box(cylinder: TaperedCylinder, margin: float = 0.0) -> Box:
+    """Smallest box along the cylinder's own axes, enlarged by `margin` [m] on all sides (P2 2.3, limb boxes)."""
+    half = np.append(np.max(cylinder.radii, axis=0), 0.5 * cylinder.length) + margin
+    return Box(0.5 * np.add(cylinder.start, cylinder.end), cylinder.axes, half)

@@ -1,0 +1,70 @@
+"""Surfaces in a body file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from kinefit.bodies.surfaces.cylinder import TaperedCylinder
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.obj import mesh_surface
+from kinefit.errors import BodyError
+
+Vector = tuple[float, float, float]
+Section = float | tuple[float, float]
+
+
+class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
+
+    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit.
+    """
+
+    end: Vector | None = None
+    radii: tuple[Section, Section] | None = None
+    start: Vector = (0.0, 0.0, 0.0)
+    side: Vector | None = None
+    mesh: str | None = None
+    unit: str = "m"
+    mirror: bool = False
+
+    def mirrored(self) -> SurfaceRecord:
+        """The surface on the other side of the body's plane of symmetry."""
+        places = {name: _mirrored(value) for name in ("start", "end", "side") if (value := getattr(self, name))}
+        return msgspec.structs.replace(self, **places, mirror=not self.mirror)
+
+
+def surfaces_of(
+    records: SurfaceRecord | Sequence[SurfaceRecord] | None, segment: int, source: str, place: str
+) -> list[TaperedCylinder | MeshSurface]:
+    """Surfaces of the segment with that index; `source` and `place` are named in messages.
+
+    Raises
+    ------
+    BodyError
+        A surface that cannot be: see `TaperedCylinder`, `mesh_surface`.
+    """
+    out: list[TaperedCylinder | MeshSurface] = []
+    for record in [records] if isinstance(records, SurfaceRecord) else records or ():
+        is_cylinder = record.end is not None and record.radii is not None
+        if is_cylinder == (record.mesh is not None):
+            remedy = "Give `end` and `radii` of a cylinder, or else `mesh`, the path of an OBJ file."
+            raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
+        if record.mesh is not None:
+            path = Path(source).parent / record.mesh
+            out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
+            continue
+        assert record.end is not None and record.radii is not None
+        first, last = (r if isinstance(r, tuple) else (r, r) for r in record.radii)
+        try:
+            out.append(TaperedCylinder(segment, record.start, record.end, (first, last), record.side))
+        except BodyError as error:
+            raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
+    return out
+
+
+def _mirrored(vector: Vector) -> Vector:
+    x, y, z = vector
+    return x, y, -z

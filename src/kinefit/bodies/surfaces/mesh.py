@@ -1,0 +1,131 @@
+"""A triangle mesh as the surface of a segment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces.grid import DistanceGrid, cell_size, distance_grid, parts
+from kinefit.errors import BodyError
+
+WELD = 1e-6  # [m] corners as near as that are one: what six decimals in a file leave apart
+
+
+@dataclass(frozen=True, eq=False)
+class MeshSurface:
+    """Closed triangle mesh of a segment; it may consist of several closed parts that run into each other.
+
+    Parameters
+    ----------
+    segment : int
+    vertices : (V, 3) [m] in the segment's frame.
+    faces : (T, 3) int, counter-clockwise as seen from outside.
+
+    Raises
+    ------
+    BodyError
+        Vertices that are not finite, faces that name vertices that are not there, neighbours of which one is flipped,
+        a part that is inside out, a hole that is wider than a cell of the distance grid.
+    """
+
+    segment: int
+    vertices: NDArray
+    faces: NDArray
+
+    def __post_init__(self) -> None:
+        vertices, faces = np.array(self.vertices, float), np.array(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
+            problem = f"a mesh has vertices of shape {vertices.shape} and faces of shape {faces.shape}"
+            raise BodyError(problem, remedy="Give (V, 3) and (T, 3).")
+        if not np.isfinite(vertices).all():
+            line = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
+            raise BodyError(f"vertex {line} of a mesh is not finite", remedy="Leave out it and its faces.")
+        if faces.size and faces.dtype.kind not in "iu":
+            raise BodyError(f"a mesh has faces of {faces.dtype} numbers", remedy="Give the indices of vertices.")
+        faces = faces.astype(np.int64)
+        if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
+            problem = f"a mesh of {len(vertices)} vertices has faces of vertices that are not there, or no faces"
+            raise BodyError(problem, remedy="Count vertices from 0.")
+        vertices.flags.writeable = faces.flags.writeable = False
+        object.__setattr__(self, "segment", int(self.segment))
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+        _check(vertices, self._welded, self._open_edges)
+
+    @cached_property
+    def grid(self) -> DistanceGrid:
+        """Signed distances around the mesh, made when they are first asked for."""
+        return distance_grid(self.vertices, self._welded)
+
+    @property
+    def open_edges(self) -> int:
+        """How many edges have a face on one side only: 0 for a watertight mesh."""
+        return len(self._open_edges)
+
+    def scaled(self, factor: float) -> MeshSurface:
+        """The mesh stretched about the origin of its segment."""
+        return self._like(self.segment, factor * self.vertices, factor)
+
+    def on(self, segment: int) -> MeshSurface:
+        """The same mesh on another segment; both share one distance grid."""
+        return self._like(segment, self.vertices, 1.0)
+
+    def mirrored(self) -> MeshSurface:
+        """The mesh on the other side of the plane z = 0: a left limb's from the right one's."""
+        return MeshSurface(self.segment, self.vertices * (1.0, 1.0, -1.0), self.faces[:, ::-1])
+
+    def _like(self, segment: int, vertices: NDArray, factor: float) -> MeshSurface:
+        out = MeshSurface(segment, vertices, self.faces)
+        if "grid" in self.__dict__:
+            out.__dict__["grid"] = self.grid if factor == 1.0 else self.grid.scaled(factor)
+        return out
+
+    @cached_property
+    def _welded(self) -> NDArray:
+        """(T', 3) faces with one index for each place, without those that have no area left."""
+        _, first, same = np.unique(np.round(self.vertices / WELD), axis=0, return_index=True, return_inverse=True)
+        faces = first[same.ravel()][self.faces]
+        flat = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
+        return np.ascontiguousarray(faces[~flat])
+
+    @cached_property
+    def _open_edges(self) -> NDArray:
+        """(E, 2) edges that an odd number of faces share."""
+        edges, count, _ = _edges(self._welded)
+        return edges[count % 2 == 1]
+
+
+def _edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Edges (E, 2), how many faces share each, and how many more run along it upwards than downwards."""
+    ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges, which, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(which.ravel(), np.sign(ends[:, 1] - ends[:, 0]), len(edges))
+    return edges, count, balance
+
+
+def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
+    if not len(faces):
+        raise BodyError("all faces of a mesh are without area", remedy="Is it in metres?")
+    edges, count, balance = _edges(faces)
+    flipped = edges[(count % 2 == 0) & (balance != 0)]
+    if len(flipped):
+        at = np.round(vertices[flipped[0]].mean(0), 4).tolist()
+        problem = f"neighbouring faces of a mesh face opposite ways, at {len(flipped)} edges, the first near {at}"
+        raise BodyError(problem, remedy="Make them all face outwards (in Blender: Mesh, Normals, Recalculate Outside).")
+    cell = cell_size(vertices[faces])
+    for hole in parts(open_edges) if len(open_edges) else []:
+        rim = vertices[open_edges[hole]].reshape(-1, 3)
+        width = float(np.linalg.norm(np.ptp(rim, axis=0)))
+        if width > cell:  # what is inside of a wider one cannot be told from what is outside
+            at = np.round(rim.mean(0), 4).tolist()
+            problem = f"a mesh has a hole of {width:.3f} m near {at} ({len(open_edges)} open edges in all)"
+            raise BodyError(problem, remedy="Fill it (in Blender: Mesh, Clean Up, Fill Holes).")
+    for part in parts(faces):
+        a, b, c = np.moveaxis(vertices[faces[part]] - vertices[faces[part[0], 0]], 1, 0)
+        volume = float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
+        if volume <= 0.0:
+            problem = f"a mesh's part of {len(part)} faces is inside out or flat (volume {volume:.3g} m³)"
+            raise BodyError(problem, remedy="List the corners of its faces the other way round; leave out inner walls.")

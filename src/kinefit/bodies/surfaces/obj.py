@@ -1,0 +1,90 @@
+"""Triangle meshes from Wavefront OBJ files."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.errors import BodyError, choices
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+LONGEST = 10.0  # [m] no single segment of anything that is tracked is as long
+
+
+def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
+    """Vertices (V, 3) in the file's unit and triangles (T, 3) of an OBJ file; polygons are split into fans.
+
+    Of `v` lines the first three numbers count, of `f` lines (`1`, `1/2`, `1//3`, `1/2/3`, or counted back from the
+    end by negative numbers) the vertices; everything else is passed over.
+
+    Raises
+    ------
+    BodyError
+        A file that cannot be read, a line that is not what it says, a file without faces.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        problem = f"cannot read the mesh ({error.strerror or error})"
+        raise BodyError(problem, file=path, remedy="Give the path of an OBJ file.") from error
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for number, line in enumerate(lines, 1):
+        word, *rest = line.split("#")[0].split() or [""]
+        if word not in ("v", "f"):
+            continue
+        try:
+            if word == "v":
+                x, y, z = (float(text) for text in rest[:3])
+                vertices.append([x, y, z])
+                continue
+            corners = [int(text.split("/")[0]) for text in rest]
+        except ValueError as error:
+            problem = f"not a line of an OBJ file: '{line[:60]}'"
+            remedy = "A `v` has three numbers, an `f` whole numbers such as 1, 1/2 or 1/2/3."
+            raise BodyError(problem, file=path, place=f"line {number}", remedy=remedy) from error
+        corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
+        if len(corners) < 3 or min(corners) < 0 or max(corners) >= len(vertices):
+            problem = f"a face of {len(corners)} vertices, or of some that do not stand above it: '{line[:60]}'"
+            remedy = "A face lists three vertices or more, counted from 1."
+            raise BodyError(problem, file=path, place=f"line {number}", remedy=remedy)
+        faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]
+    if not faces:
+        raise BodyError("the mesh has no faces", file=path, remedy="Export it as OBJ with its faces.")
+    return np.array(vertices), np.array(faces, np.int64)
+
+
+def mesh_surface(
+    path: str | PathLike[str], segment: int, *, unit: str = "m", mirror: bool = False, place: str | None = None
+) -> MeshSurface:
+    """Surface of a segment from an OBJ file in the segment's frame.
+
+    Parameters
+    ----------
+    unit : "m", "cm" or "mm", of the file.
+    mirror : bool, its image on the other side of z = 0.
+    place : str, named in messages.
+
+    Raises
+    ------
+    BodyError
+        See `read_obj` and `MeshSurface`; an unknown unit; a mesh that is longer than 10 m: taken for metres?
+    """
+    if unit not in UNITS:
+        raise BodyError(choices("unit", unit, UNITS), file=path, place=place, remedy="Give one of these.")
+    try:
+        vertices, faces = read_obj(path)
+        vertices = vertices * UNITS[unit]
+        length = float(np.ptp(vertices, axis=0).max())
+        if length > LONGEST:
+            remedy = 'State the unit of its file, such as unit = "mm".'
+            raise BodyError(f"the mesh is {length:.4g} m long", remedy=remedy)
+        surface = MeshSurface(segment, vertices, faces)
+    except BodyError as error:
+        where = ", ".join(text for text in (place, error.place) if text)
+        raise BodyError(error.problem, file=path, place=where or None, remedy=error.remedy) from error
+    return surface.mirrored() if mirror else surface

@@ -1,0 +1,41 @@
+"""All surfaces of a body, packed for the kernels that search them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces.cylinder import TaperedCylinder
+from kinefit.bodies.surfaces.grid import GridTable, pack_grids
+from kinefit.bodies.surfaces.mesh import MeshSurface
+
+
+class SurfaceTables(NamedTuple):
+    """Surfaces of a body by kind.
+
+    Parameters
+    ----------
+    cylinders : (C, 18)
+        segment, start (3) [m] in the root frame at rest, directions of a, b and the axis (9), length [m],
+        a0, b0 and how much they grow along the axis (4).
+    grids : GridTable of its meshes, None where it has none.
+    """
+
+    cylinders: NDArray
+    grids: GridTable | None
+
+
+def tables(surfaces: Sequence[TaperedCylinder | MeshSurface], rest: NDArray) -> SurfaceTables:
+    """Tables of surfaces; rest (S, 3) [m] joint centres in the root frame at rest."""
+    cylinders = [s for s in surfaces if isinstance(s, TaperedCylinder)]
+    meshes = [s for s in surfaces if isinstance(s, MeshSurface)]
+    out = np.empty((len(cylinders), 18))
+    for line, c in zip(out, cylinders):
+        (a0, b0), (a1, b1) = c.radii
+        growth = [a0, b0, (a1 - a0) / c.length, (b1 - b0) / c.length]
+        line[:] = [c.segment, *np.add(c.start, rest[c.segment]), *c.axes.ravel(), c.length, *growth]
+    out.flags.writeable = False
+    return SurfaceTables(out, pack_grids(meshes, rest) if meshes else None)

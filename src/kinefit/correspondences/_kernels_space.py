@@ -1,0 +1,218 @@
+"""Where the body cannot be: space that a depth sensor saw through, and space that other parts of it fill."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+from kinefit.geometry._kernels_camera import HEIGHT, ROT, TRANS, WIDTH, project_jacobian
+
+OUTLINE = 3  # [cells] by which outlines of body and picture differ anyway
+
+
+@jit
+def nearest_cells(depth, farthest, cell, shown, tolerance, nearest):
+    """Nearest cell that the body could stand in, for every cell of `cell` x `cell` pixels.
+
+    A cell can hold the body where at least half of its pixels (of every second row and column) measured something up
+    to `farthest` [m]: an unbiased edge. shown (h', w') [m]: the body's own depth at any size, inf for none; where that
+    explains a pixel within `tolerance`, there is no need for more of the body, nor beside such a cell, as outlines
+    never agree; (0, 0) for none. nearest (h, w) int32: row * w + column, -1 where there is none at all. Exact: nearest
+    in each column, then the lower envelope of parabolas along each row (Felzenszwalb & Huttenlocher 2012).
+    """
+    h, w = nearest.shape
+    rows, columns = depth.shape
+    step = 2 if cell > 1 else 1
+    compared = shown.size > 0
+    taken = np.zeros((h, w), np.bool_)
+    for i in range(h):
+        last = (i + 1) * cell if (i + 1) * cell < rows else rows
+        for j in range(w):
+            end = (j + 1) * cell if (j + 1) * cell < columns else columns
+            own = shown[i * shown.shape[0] // h, j * shown.shape[1] // w] if compared else math.inf
+            balance, known = 0, 0
+            for a in range(i * cell, last, step):
+                for b in range(j * cell, end, step):
+                    m = depth[a, b]
+                    balance += 1 if 0.0 < m <= farthest else -1
+                    known += 1 if abs(m - own) <= tolerance else 0
+            nearest[i, j] = i if balance >= 0 else -1
+            taken[i, j] = known > 0
+    if compared:
+        for i in range(h):
+            for j in range(w):
+                if taken[i, j]:
+                    for a in range(i - 1 if i > 0 else 0, i + 2 if i + 2 < h else h):
+                        for b in range(j - 1 if j > 0 else 0, j + 2 if j + 2 < w else w):
+                            nearest[a, b] = -1
+    for i in range(1, h):  # row of the nearest in the column: from above, then from below
+        for j in range(w):
+            nearest[i, j] = nearest[i, j] if nearest[i, j] >= 0 else nearest[i - 1, j]
+    for i in range(h - 2, -1, -1):
+        for j in range(w):
+            own, below = nearest[i, j], nearest[i + 1, j]
+            nearest[i, j] = below if below >= 0 and (own < 0 or abs(below - i) < i - own) else own
+    apex, height, bound = np.empty(w, np.int64), np.empty(w), np.empty(w + 1)
+    line = np.empty(w, np.int32)
+    for i in range(h):
+        top = -1
+        for j in range(w):
+            if nearest[i, j] < 0:
+                continue
+            gap = nearest[i, j] - i
+            y = float(gap * gap + j * j)
+            at = -math.inf
+            while top >= 0:
+                at = (y - height[top]) / (2.0 * (j - apex[top]))
+                if at > bound[top]:
+                    break
+                top -= 1
+                at = -math.inf
+            top += 1
+            apex[top], height[top], bound[top] = j, y, at
+        if top < 0:
+            continue
+        bound[top + 1] = math.inf
+        k = 0
+        for j in range(w):
+            while bound[k + 1] < j:
+                k += 1
+            line[j] = nearest[i, apex[k]] * w + apex[k]
+        for j in range(w):
+            nearest[i, j] = line[j]
+
+
+@jit
+def free_space_rows(
+    frames, owner, rest, normal, camera, depth, nearest, missing, cell, tolerance, reach, weight,
+    data, segment, group, start,
+):  # fmt: skip
+    """One row for each sample that faces the camera and that the sensor saw through, towards the nearest cell.
+
+    owner (N,), rest and normal (3, N) in the root frame at rest; camera packed; depth (H, W) [m], 0 for none; nearest
+    and missing (h, w) from `nearest_cells`, of all cells and of those that the body does not explain yet: a sample
+    more than `OUTLINE` cells astray goes to the latter, where there are any within reach; tolerance, reach [m]; weight
+    [1/px²]. Returns the next free line.
+    """
+    r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
+    r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
+    r20, r21, r22 = camera[ROT + 6], camera[ROT + 7], camera[ROT + 8]
+    t0, t1, t2 = camera[TRANS], camera[TRANS + 1], camera[TRANS + 2]
+    cx, cy, cz = -(r00 * t0 + r10 * t1 + r20 * t2), -(r01 * t0 + r11 * t1 + r21 * t2), -(r02 * t0 + r12 * t1 + r22 * t2)
+    width, height, columns = camera[WIDTH], camera[HEIGHT], nearest.shape[1]
+    half = 0.5 * cell
+    i = start
+    for k in range(owner.size):
+        f = frames[owner[k]]
+        a, b, c = rest[0, k], rest[1, k], rest[2, k]
+        x = f[0] * a + f[1] * b + f[2] * c + f[9]
+        y = f[3] * a + f[4] * b + f[5] * c + f[10]
+        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        a, b, c = normal[0, k], normal[1, k], normal[2, k]
+        nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
+        if nx * (cx - x) + ny * (cy - y) + nz * (cz - z) <= 0.0:
+            continue
+        found = project_jacobian(camera, x, y, z)
+        if not found[0]:
+            continue
+        u, v = found[1], found[2]
+        if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
+            continue
+        iu, iv = int(u + 0.5), int(v + 0.5)
+        if not depth[iv, iu] > r20 * x + r21 * y + r22 * z + t2 + tolerance:
+            continue
+        gap, gx, gy, gz, g2, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for place in range(2):
+            target = nearest[iv // cell, iu // cell] if place == 0 else missing[iv // cell, iu // cell]
+            if target < 0 or (place == 1 and gap <= OUTLINE * cell):
+                break
+            du = (target % columns) * cell + half - 0.5 - u
+            dv = (target // columns) * cell + half - 0.5 - v
+            distance = math.sqrt(du * du + dv * dv)
+            if distance <= half:
+                break
+            du, dv = du / distance, dv / distance
+            tx, ty, tz = du * found[3] + dv * found[6], du * found[4] + dv * found[7], du * found[5] + dv * found[8]
+            square = tx * tx + ty * ty + tz * tz
+            t = 1.0 / math.sqrt(square)
+            if place == 0 or (distance - half) * t <= reach:
+                gap, gx, gy, gz, g2, g = (
+                    distance - half,
+                    tx,
+                    ty,
+                    tz,
+                    square,
+                    t,
+                )  # to the edge of the cell, not its middle
+        if gap <= 0.0 or gap * g > reach:
+            continue
+        data[0, i], data[1, i], data[2, i] = x, y, z
+        data[3, i], data[4, i], data[5, i] = gx * g, gy * g, gz * g
+        data[6, i], data[7, i] = gap * g, weight * g2
+        segment[i], group[i] = owner[k], k
+        i += 1
+    return i
+
+
+@jit
+def closest_on_segments(p0, p1, p2, d0, d1, d2, q0, q1, q2, e0, e1, e2):
+    """Where (s, t in 0..1) the segments p + s d and q + t e are nearest to each other (Ericson 2005, 5.1.9)."""
+    r0, r1, r2 = p0 - q0, p1 - q1, p2 - q2
+    a, e, f = d0 * d0 + d1 * d1 + d2 * d2, e0 * e0 + e1 * e1 + e2 * e2, e0 * r0 + e1 * r1 + e2 * r2
+    c, b = d0 * r0 + d1 * r1 + d2 * r2, d0 * e0 + d1 * e1 + d2 * e2
+    tiny = 1e-12  # [m²]: a point
+    if a <= tiny and e <= tiny:
+        return 0.0, 0.0
+    if a <= tiny:
+        t = f / e
+        return 0.0, 0.0 if t < 0.0 else (1.0 if t > 1.0 else t)
+    if e <= tiny:
+        s = -c / a
+        return 0.0 if s < 0.0 else (1.0 if s > 1.0 else s), 0.0
+    square = a * e - b * b
+    s = (b * f - c * e) / square if square > 1e-9 * a * e else 0.5
+    s = 0.0 if s < 0.0 else (1.0 if s > 1.0 else s)
+    t = (b * s + f) / e
+    if t < 0.0:
+        t, s = 0.0, -c / a
+    elif t > 1.0:
+        t, s = 1.0, (b - c) / a
+    return 0.0 if s < 0.0 else (1.0 if s > 1.0 else s), t
+
+
+@jit
+def capsule_gaps(frames, owner, starts, ends, pairs, point_a, point_b, direction, distance):
+    """Distance between the axes of pairs (P, 2) of capsules.
+
+    owner (C,) segments; starts, ends (C, 3) in the root frame at rest.
+    Out: point_a, point_b (P, 3) in the world, where they are nearest; direction (P, 3) unit from b to a; distance (P,).
+    """
+    for k in range(pairs.shape[0]):
+        i, j = pairs[k, 0], pairs[k, 1]
+        f, g, a, b = frames[owner[i]], frames[owner[j]], starts[i], starts[j]
+        p0 = f[0] * a[0] + f[1] * a[1] + f[2] * a[2] + f[9]
+        p1 = f[3] * a[0] + f[4] * a[1] + f[5] * a[2] + f[10]
+        p2 = f[6] * a[0] + f[7] * a[1] + f[8] * a[2] + f[11]
+        q0 = g[0] * b[0] + g[1] * b[1] + g[2] * b[2] + g[9]
+        q1 = g[3] * b[0] + g[4] * b[1] + g[5] * b[2] + g[10]
+        q2 = g[6] * b[0] + g[7] * b[1] + g[8] * b[2] + g[11]
+        x, y, z = ends[i, 0] - a[0], ends[i, 1] - a[1], ends[i, 2] - a[2]
+        d0, d1, d2 = f[0] * x + f[1] * y + f[2] * z, f[3] * x + f[4] * y + f[5] * z, f[6] * x + f[7] * y + f[8] * z
+        x, y, z = ends[j, 0] - b[0], ends[j, 1] - b[1], ends[j, 2] - b[2]
+        e0, e1, e2 = g[0] * x + g[1] * y + g[2] * z, g[3] * x + g[4] * y + g[5] * z, g[6] * x + g[7] * y + g[8] * z
+        s, t = closest_on_segments(p0, p1, p2, d0, d1, d2, q0, q1, q2, e0, e1, e2)
+        p0, p1, p2 = p0 + s * d0, p1 + s * d1, p2 + s * d2
+        q0, q1, q2 = q0 + t * e0, q1 + t * e1, q2 + t * e2
+        n0, n1, n2 = p0 - q0, p1 - q1, p2 - q2
+        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        distance[k] = length
+        if length < 1e-9:  # the axes cross: apart is along their common perpendicular
+            n0, n1, n2 = d1 * e2 - d2 * e1, d2 * e0 - d0 * e2, d0 * e1 - d1 * e0
+            length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            if length < 1e-12:
+                n0, n1, n2, length = 1.0, 0.0, 0.0, 1.0
+        point_a[k, 0], point_a[k, 1], point_a[k, 2] = p0, p1, p2
+        point_b[k, 0], point_b[k, 1], point_b[k, 2] = q0, q1, q2
+        direction[k, 0], direction[k, 1], direction[k, 2] = n0 / length, n1 / length, n2 / length

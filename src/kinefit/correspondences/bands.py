@@ -1,0 +1,119 @@
+"""Elastic bands that hold the parts of a body together at its joints (P2 3.4, fig. 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet, TaperedCylinder
+from kinefit.correspondences.coincidence import coincidence_rows
+from kinefit.errors import BodyError
+from kinefit.rows import PairRows
+
+_WIDTH = 0.05  # [m] half the width of a joint between parts without cylinders: that of an elbow
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Pairs of points that elastic bands pull together; K bands.
+
+    Parameters
+    ----------
+    parent, child : PointSet of K points each, on both parts of a joint; they fall together at rest.
+    joint : (K,) int, segment whose joint each band belongs to.
+    """
+
+    parent: PointSet
+    child: PointSet
+    joint: NDArray
+
+    def __len__(self) -> int:
+        return len(self.joint)
+
+
+def universal_band(centre: ArrayLike) -> NDArray:
+    """(1, 3) [m] one band at a joint's centre: three free turns, such as a shoulder's (P2 fig. 2a)."""
+    return np.asarray(centre, float).reshape(1, 3)
+
+
+def hinge_bands(centre: ArrayLike, axis: ArrayLike, half_width: float, count: int = 2) -> NDArray:
+    """(count, 3) [m] bands evenly along a line: one free turn about it, such as an elbow's (P2 fig. 2b)."""
+    direction = np.asarray(axis, float) / np.linalg.norm(axis)
+    return np.asarray(centre, float) + half_width * np.linspace(-1.0, 1.0, count)[:, None] * direction
+
+
+def elliptic_bands(centre: ArrayLike, half_axes: ArrayLike, count: int = 4) -> NDArray:
+    """(count, 3) [m] bands along an ellipse with half axes (2, 3) [m]: no free turn, such as a neck's (P2 fig. 2c)."""
+    a, b = np.asarray(half_axes, float)
+    turn = 2 * np.pi * np.arange(count)[:, None] / count
+    return np.asarray(centre, float) + np.cos(turn) * a + np.sin(turn) * b
+
+
+def joint_bands(
+    body: Body, *, elliptic: Collection[str] = ("neck",), along_line: int = 2, along_ellipse: int = 4
+) -> Bands:
+    """Bands of all joints of a body: a fixed joint becomes elliptic, a revolute one a hinge, all others universal.
+
+    Parameters
+    ----------
+    body : Body
+        With its joints; bands of `free_parts(body)` are the same, as segments keep their indices.
+    elliptic : names of joints that turn about three axes, but little: those become elliptic, too.
+        Names that the body does not have count for nothing.
+    along_line, along_ellipse : int
+        Bands of a hinge and of an elliptic joint.
+
+    Raises
+    ------
+    BodyError
+        Fewer than two bands of a hinge, or than three of an ellipse.
+    """
+    if along_line < 2 or along_ellipse < 3:
+        problem = f"{along_line} bands of a hinge and {along_ellipse} of an elliptic joint"
+        raise BodyError(problem, remedy="Give two or more, and three or more.")
+    tree = body.tree
+    points, owners = [], []
+    for s in range(1, len(tree.segments)):
+        turns = tree.axes[tree.dof_start[s] : tree.dof_start[s + 1]]
+        if tree.prismatic[tree.dof_start[s] : tree.dof_start[s + 1]].any():
+            raise BodyError("bands hold no sliding joint", place=body.joints[s], remedy="Cut bodies whose joints turn.")
+        if len(turns) == 0 or body.joints[s] in elliptic:
+            bands = elliptic_bands(np.zeros(3), _section(body, s), along_ellipse)
+        elif len(turns) == 1:
+            width = float(np.linalg.norm(_section(body, s), axis=1).mean())
+            bands = hinge_bands(np.zeros(3), turns[0], width, along_line)
+        else:
+            bands = universal_band(np.zeros(3))
+        points.append(bands)
+        owners.append(np.full(len(bands), s))
+    x, joint = (np.concatenate(v) if v else v for v in (points, owners))
+    joint = np.asarray(joint, np.int64)
+    names = tuple(f"{tree.segments[s]}_{k}" for k, s in enumerate(joint))
+    x = np.asarray(x, float).reshape(-1, 3)
+    parent = PointSet(names, tree.parents[joint], x + tree.offsets[joint])
+    return Bands(parent, PointSet(names, joint, x), joint)
+
+
+def band_rows(body: Body, state: BodyState, bands: Bands, *, sigma: ArrayLike = 0.005) -> PairRows:
+    """Three pair rows a band: the points of both parts should meet (P2 4.2.6).
+
+    Parameters
+    ----------
+    body : Body
+        Of free parts (`bodies.free_parts`); the joints of an ordinary one are never stretched.
+    sigma : scalar or (K,) [m]
+        How far a band gives.
+    """
+    return coincidence_rows(body, state, bands.parent, bands.child, sigma=sigma)
+
+
+def _section(body: Body, segment: int) -> NDArray:
+    """(2, 3) [m] half axes of the section of a part at its joint."""
+    own = [c for c in body.surfaces if isinstance(c, TaperedCylinder) and c.segment == segment]
+    if not own:
+        return _WIDTH * np.eye(3)[[0, 2]]
+    nearest = min(own, key=lambda c: float(np.linalg.norm(c.start)))
+    return nearest.axes[:2] * np.array(nearest.radii[0])[:, None]

@@ -1,0 +1,135 @@
+"""The hundred sequences of P2's experiment, simulated: ten movements by ten people, in depth and in 2D features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from kinefit.bodies import Body
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import Motion
+from kinefit.observations import DepthFrame, Frame, KeypointFrame
+from kinefit.simulation._postures import MOVEMENTS
+from kinefit.simulation.movements import Person, movement, people
+from kinefit.simulation.pictures import ColourSensor
+from kinefit.simulation.placing import beside, in_front
+from kinefit.simulation.scenes import Scene
+from kinefit.simulation.sensors import TOF, DepthSensor, measured_depth
+
+Inputs = Literal["3d", "2d", "fusion"]
+INPUTS: tuple[Inputs, ...] = ("3d", "2d", "fusion")
+
+FEATURES = ("nose_tip", "l_wrist", "r_wrist")
+"""Landmarks that a tracker of skin colour follows: the face and both hands."""
+
+_HEAD_SIZE = (320, 240)  # [px] of one camera of P2's stereo head (P2 3.1)
+_BASELINE = 0.1  # [m] from the depth camera to the colour camera
+_FEATURE_NOISE = 2.0  # [px] of the middle of a blob of skin colour: a fifth of a face's width at 3 m
+_FEATURE_DEPTH = 0.08  # [m] by which the middle of a hand, or a wrist, may lie behind its surface
+_RATE = 10.0  # [Hz] P2: 10 to 14
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """One sequence: a known motion and what the sensors saw of it.
+
+    Parameters
+    ----------
+    number : int
+    person : Person
+    truth : Motion
+    rig : Rig of the depth camera "depth" and the colour camera "colour".
+    sensor : DepthSensor
+    depth : DepthFrame for each frame.
+    features : KeypointFrame for each frame, of the body's landmarks in `FEATURES`.
+    """
+
+    number: int
+    person: Person
+    truth: Motion
+    rig: Rig
+    sensor: DepthSensor
+    depth: tuple[DepthFrame, ...]
+    features: tuple[KeypointFrame, ...]
+
+    def seen(self, inputs: Inputs) -> list[tuple[Frame, ...]]:
+        """What the sensors of one experiment saw, for each time: depth (3D), face and hands (2D), or both."""
+        if inputs == "3d":
+            return [(d,) for d in self.depth]
+        if inputs == "2d":
+            return [(f,) for f in self.features]
+        return list(zip(self.depth, self.features))
+
+    @property
+    def accuracy(self) -> dict[str, float]:
+        """Standard deviations of the sensors: [m] of depth at the person's distance, [px] of features."""
+        distance = float(np.linalg.norm(self.rig["depth"].centre_world - self.truth.Ts_world_root[0, :3, 3]))
+        return {"depth": float(self.sensor.sigma(distance)), "colour": _FEATURE_NOISE}
+
+
+def sequences(
+    count: int = 100,
+    *,
+    body: Body | None = None,
+    sensor: DepthSensor = TOF,
+    rate: float = _RATE,
+    room: bool = True,
+    seed: int = 0,
+) -> Iterator[Sequence]:
+    """The first `count` of a hundred sequences; every ten hold each movement and each person once.
+
+    Parameters
+    ----------
+    body : Body, optional
+        That the people are made of; default the catalogue's "humanoid10".
+    sensor : DepthSensor
+    rate : float [Hz] of all sensors.
+    room : bool, whether there are a floor, walls and a table.
+    seed : int, of the people and of all errors.
+    """
+    crowd, names = people(body, seed=seed), tuple(MOVEMENTS)
+    for number in range(count):
+        k = number % len(names)
+        person = crowd[(k + number // len(names)) % len(crowd)]
+        yield sequence(names[k], person, sensor=sensor, rate=rate, room=room, seed=seed, number=number)
+
+
+def sequence(
+    name: str,
+    person: Person,
+    *,
+    sensor: DepthSensor = TOF,
+    rate: float = _RATE,
+    room: bool = True,
+    seed: int = 0,
+    number: int = 0,
+) -> Sequence:
+    """One movement of one person as its sensors saw it; see `sequences`."""
+    truth = movement(name, person.body, rate=rate, speed=person.speed)
+    camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
+    head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal).camera()
+    colour = beside(head.with_pose(camera.T_camera_world), "colour", _BASELINE)
+    scene = Scene.of(truth, camera if room else None)
+    depth, features = [], []
+    for frame, time in enumerate(truth.times):
+        random = np.random.default_rng([seed, number, frame])
+        depth.append(DepthFrame("depth", float(time), measured_depth(scene, frame, camera, sensor, random)))
+        features.append(_features(scene, frame, colour, random))
+    return Sequence(number, person, truth, Rig((camera, colour)), sensor, tuple(depth), tuple(features))
+
+
+def _features(scene: Scene, frame: int, camera: Camera, random: np.random.Generator) -> KeypointFrame:
+    """Face and hands in the colour image, where nothing hides them."""
+    points = scene.motion.body.landmarks.select(FEATURES)
+    x = scene.motion.body.positions(scene.motion.state(frame), points)
+    uv, depth = camera.project(x), scene.view(frame, camera).raster.depth
+    z = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    u, v = np.round(np.nan_to_num(uv, nan=-1.0)).astype(int).T
+    inside = (u >= 0) & (v >= 0) & (u < camera.size[0]) & (v < camera.size[1])
+    seen = np.zeros(len(points), bool)
+    seen[inside] = z[inside] < depth[v[inside], u[inside]] + _FEATURE_DEPTH
+    uv = np.where(seen[:, None], uv + _FEATURE_NOISE * random.standard_normal(uv.shape), np.nan)
+    return KeypointFrame(camera.name, float(scene.motion.times[frame]), FEATURES, uv, seen.astype(float))

@@ -1,0 +1,221 @@
+"""P2's experiment, graded by the truth instead of by eye: 3D alone, 2D alone, and both (P2 5, table I)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.errors import ObservationError
+from kinefit.evaluation.sequences import INPUTS, Inputs, Sequence
+from kinefit.motion import Motion
+from kinefit.recipes.voodoo import Settings, voodoo
+from kinefit.simulation.retarget import known_motion
+
+Method = Callable[[Sequence, Inputs, BodyState], Motion]
+"""Tracks a sequence with some of its sensors from a given pose; its body has the true one's landmarks."""
+
+GOOD_MEAN = 0.060  # [m] half the width of a thigh: drawn over the picture, limbs cover their counterparts
+GOOD_POINT = 0.150  # [m] width of a thigh: beyond it, a drawn limb lies beside the one in the picture
+GOOD_SHARE = 0.05  # of the frames in which a point may be worse: less than a fifth of a second, nobody sees it
+LOST_POINT = 0.250  # [m] length of a forearm: the limb is somewhere else
+LOST_SHARE = 0.10  # of the frames: not for a moment only
+_AT_THE_END = 0.2  # [s] what is off until the end has not been found again
+_STRETCHED = np.radians(25.0)  # between an arm and the direction to the sensor
+
+POINTS = (
+    "neck", "skull_vertex", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip",
+    "l_knee", "r_knee", "l_ankle", "r_ankle",
+)  # fmt: skip
+"""Landmarks that are graded: joint centres, and the top of the head."""
+
+
+class Grade(NamedTuple):
+    """2 good congruence, 1 acceptable deviations, 0 lost (P2 5); `mean` and `worst` error of the points [m]."""
+
+    grade: int
+    mean: float
+    worst: float
+
+
+class Graded(NamedTuple):
+    """One sequence: its movement, its grade, and the share of frames with arms stretched at the sensor that show it.
+
+    `stretched` is NaN where no arm is.
+    """
+
+    movement: str
+    grade: Grade
+    stretched: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All sequences tracked with one choice of sensors.
+
+    Parameters
+    ----------
+    inputs : "3d", "2d" or "fusion"
+    graded : of every sequence, in order.
+    """
+
+    inputs: Inputs
+    graded: tuple[Graded, ...]
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Sequences of grade 0, 1 and 2."""
+        grades = [g.grade.grade for g in self.graded]
+        return grades.count(0), grades.count(1), grades.count(2)
+
+    @property
+    def mean_grade(self) -> float:
+        """Mean grade, P2's φ."""
+        return float(np.mean([g.grade.grade for g in self.graded]))
+
+    @property
+    def error(self) -> float:
+        """[m] mean error of all points in all sequences."""
+        return float(np.mean([g.grade.mean for g in self.graded]))
+
+
+def point_errors(truth: Motion, fitted: Motion) -> NDArray:
+    """(F, K) [m] distances of the points in `POINTS` that both bodies have.
+
+    Raises
+    ------
+    ObservationError
+        Motions of different lengths, or bodies without such points in common.
+    """
+    if len(truth) != len(fitted):
+        problem = f"{len(fitted)} tracked frames of {len(truth)}"
+        raise ObservationError(problem, remedy="Give a pose for every frame, lost ones as they were before.")
+    names = tuple(n for n in POINTS if n in truth.body.landmarks.names and n in fitted.body.landmarks.names)
+    if not names:
+        raise ObservationError("two bodies without a joint in common", remedy=f"Name landmarks: {', '.join(POINTS)}.")
+    a, b = (m.positions(m.body.landmarks.select(names)) for m in (truth, fitted))
+    return np.asarray(np.linalg.norm(b - a, axis=-1))
+
+
+def grade(truth: Motion, fitted: Motion) -> Grade:
+    """Grade a tracked motion.
+
+    2: mean error of all joints up to 60 mm, and none over 150 mm in more than 5 % of the frames.
+    0: a joint over 250 mm in more than 10 % of the frames, or throughout the last fifth of a second.
+    1: anything between.
+    """
+    errors = point_errors(truth, fitted)
+    last = max(int(np.ceil(_AT_THE_END * truth.rate)), 1)
+    mean, worst = float(errors.mean()), float(errors.max())
+    far = errors > LOST_POINT
+    if (far.mean(axis=0) > LOST_SHARE).any() or far[-last:].all(axis=0).any():
+        return Grade(0, mean, worst)
+    good = mean <= GOOD_MEAN and ((errors > GOOD_POINT).mean(axis=0) <= GOOD_SHARE).all()
+    return Grade(2 if good else 1, mean, worst)
+
+
+def evaluate(
+    runs: Iterable[Sequence],
+    method: Method,
+    *,
+    inputs: Iterable[Inputs] = INPUTS,
+    start: Callable[[Sequence], BodyState] | None = None,
+    step: Callable[[int], None] | None = None,
+) -> dict[Inputs, Summary]:
+    """Track every sequence with every choice of sensors, and grade it.
+
+    Parameters
+    ----------
+    runs : see `evaluation.sequences.sequences`
+    method : `voodoo_method`, `fusion_method` or another.
+    start : the pose to begin with; default: the truth's first.
+    step : called with the number of sequences done.
+    """
+    chosen = tuple(inputs)
+    graded: dict[Inputs, list[Graded]] = {i: [] for i in chosen}
+    for done, run in enumerate(runs, 1):
+        state = run.truth.state(0) if start is None else start(run)
+        for i in chosen:
+            fitted = method(run, i, state)
+            graded[i].append(Graded(run.truth.name, grade(run.truth, fitted), stretched_share(run, fitted)))
+        if step is not None:
+            step(done)
+    return {i: Summary(i, tuple(g)) for i, g in graded.items()}
+
+
+def stretched_share(run: Sequence, fitted: Motion) -> float:
+    """Share of the frames with an arm stretched at the depth sensor in which all such hands are found to 150 mm.
+
+    NaN where no arm is: within 25 degrees of the direction to the sensor, and no elbow bent by more than that.
+    """
+    eye = run.rig["depth"].centre_world
+    names = tuple(f"{side}_{joint}" for side in "lr" for joint in ("shoulder", "elbow", "wrist"))
+    x, y = (m.positions(m.body.landmarks.select(names)).reshape(len(m), 2, 3, 3) for m in (run.truth, fitted))
+    to_sensor = _unit(eye - x[:, :, 0])
+    arm = np.cos(_STRETCHED) < np.sum(_unit(x[:, :, 2] - x[:, :, 0]) * to_sensor, axis=-1)
+    straight = np.cos(_STRETCHED) < np.sum(_unit(x[:, :, 1] - x[:, :, 0]) * _unit(x[:, :, 2] - x[:, :, 1]), axis=-1)
+    stretched = arm & straight
+    found = np.linalg.norm(y[:, :, 2] - x[:, :, 2], axis=-1) <= GOOD_POINT
+    frames = stretched.any(axis=1)
+    if not frames.any():
+        return float("nan")
+    return float(np.mean((found | ~stretched).all(axis=1)[frames]))
+
+
+def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
+    """P2's three conclusions, each with whether it holds here.
+
+    Fusion is better than one of its sensors alone where its mean error is smaller, and its mean grade no lower. Arms
+    are recognised where nine of ten frames show them.
+    """
+    fusion = summaries["fusion"]
+    shares = [g.stretched for g in fusion.graded if np.isfinite(g.stretched)]
+    out = {}
+    singles: tuple[tuple[Inputs, str], ...] = (("3d", "3D"), ("2d", "2D"))
+    for inputs, text in singles:
+        alone = summaries[inputs]
+        better = fusion.mean_grade >= alone.mean_grade and fusion.error < alone.error
+        out[f"fusion is better than {text} alone"] = better
+    out["arms stretched at the sensor are recognised"] = bool(shares) and float(np.mean(shares)) >= 0.9
+    return out
+
+
+def voodoo_method(run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None) -> Motion:
+    """P2 as printed: parts that move freely, tied by bands."""
+    parts = free_parts(run.truth.body)
+    fits = voodoo(run.seen(inputs), run.truth.body, start, run.rig, settings)
+    return _motion(run, parts, [parts_state(parts, fit.frames) for fit in fits])
+
+
+def fusion_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
+    """The fusion tracker: a tree of hard joints, limits, robust weights, visibility."""
+    from kinefit.tracking.fusion import FusionTracker
+
+    tracker = FusionTracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy)
+    tracker.start_at(start)
+    return _motion(run, run.truth.body, [tracker.update(seen).state for seen in run.seen(inputs)])
+
+
+METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_method}
+
+
+def found_start(run: Sequence) -> BodyState:
+    """Pose found in the first depth image with none given."""
+    from kinefit.tracking.depth_start import start_from_points
+
+    depth = np.asarray(run.depth[0].depth)
+    return start_from_points(run.truth.body, None, run.rig["depth"], depth, up=(0.0, 1.0, 0.0))[0].state
+
+
+def _motion(run: Sequence, body: Body, states: list[BodyState]) -> Motion:
+    roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
+    return known_motion(body, run.truth.rate, roots, angles, up=run.truth.up, name=run.truth.name)
+
+
+def _unit(v: NDArray) -> NDArray:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12))

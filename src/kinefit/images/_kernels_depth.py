@@ -1,0 +1,94 @@
+"""Compiled passes over depth images: flying pixels, points, normals. Arrays in, arrays out."""
+
+from __future__ import annotations
+
+import math
+
+from kinefit._jit import jit
+
+
+@jit
+def drop_flying(depth, near, far, noise, slope, out):
+    """Copy (H, W) `depth` to `out`, 0 outside of [near, far] and where two opposite neighbours both differ too much.
+
+    Too much is more than max(noise, slope * depth) [m]; a pixel beside nothing has no support from that side.
+    """
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            z = depth[v, u]
+            out[v, u] = z if z >= near and z <= far else 0.0
+    if slope <= 0.0:
+        return
+    for v in range(height):
+        above, below = v - 1 if v > 0 else v, v + 1 if v + 1 < height else v
+        for u in range(width):
+            z = out[v, u]
+            if z > 0.0:
+                t = slope * z
+                t = t if t > noise else noise
+                a, b = depth[v, u - 1 if u > 0 else u], depth[v, u + 1 if u + 1 < width else u]
+                c, d = depth[above, u], depth[below, u]
+                across = abs(a - z) > t and abs(b - z) > t
+                along = abs(c - z) > t and abs(d - z) > t
+                out[v, u] = 0.0 if across or along else z
+
+
+@jit
+def points(depth, table, R, t, step, near, far, out):
+    """World points of every step-th pixel in [near, far]; returns how many of `out` (N, 3) are filled.
+
+    `table` (2, H, W) holds x/z and y/z of every pixel's ray, NaN where there is none; R (3, 3), t (3,) take the
+    camera's frame to the world.
+    """
+    height, width = depth.shape
+    r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22, tx, ty, tz = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
+    n = 0
+    for v in range(step // 2, height, step):
+        for u in range(step // 2, width, step):
+            z = depth[v, u]
+            if z > 0.0 and z >= near and z <= far:
+                a, b = table[0, v, u], table[1, v, u]
+                if abs(a) < math.inf and abs(b) < math.inf:
+                    x, y = a * z, b * z
+                    out[n, 0] = r00 * x + r01 * y + r02 * z + tx
+                    out[n, 1] = r10 * x + r11 * y + r12 * z + ty
+                    out[n, 2] = r20 * x + r21 * y + r22 * z + tz
+                    n += 1
+    return n
+
+
+@jit
+def normals(depth, table, R, step, reach, noise, slope, out):
+    """World normals of the pixels that `points` takes (with no range gate), zero where the surface breaks off.
+
+    Cross product of the chords between the neighbours `reach` pixels away; turned to the sensor.
+    """
+    height, width = depth.shape
+    n = 0
+    for v in range(step // 2, height, step):
+        for u in range(step // 2, width, step):
+            z = depth[v, u]
+            if not (z > 0.0 and abs(table[0, v, u]) < math.inf and abs(table[1, v, u]) < math.inf):
+                continue
+            out[n, 0] = out[n, 1] = out[n, 2] = 0.0
+            if u >= reach and v >= reach and u + reach < width and v + reach < height:
+                zl, zr, za, zb = depth[v, u - reach], depth[v, u + reach], depth[v - reach, u], depth[v + reach, u]
+                t = slope * z * reach
+                t = t if t > noise else noise
+                if abs(zl - z) <= t and abs(zr - z) <= t and abs(za - z) <= t and abs(zb - z) <= t:
+                    ax = table[0, v, u + reach] * zr - table[0, v, u - reach] * zl
+                    ay = table[1, v, u + reach] * zr - table[1, v, u - reach] * zl
+                    az = float(zr) - zl
+                    bx = table[0, v + reach, u] * zb - table[0, v - reach, u] * za
+                    by = table[1, v + reach, u] * zb - table[1, v - reach, u] * za
+                    bz = float(zb) - za
+                    nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+                    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+                    if length > 0.0 and length < math.inf:
+                        nx, ny, nz = nx / length, ny / length, nz / length
+                        for i in range(3):
+                            out[n, i] = R[i, 0] * nx + R[i, 1] * ny + R[i, 2] * nz
+            n += 1
+    return n

@@ -1,0 +1,210 @@
+"""Stereo pairs to depth: rectified from the rig, matched by semi-global matching (Hirschmüller 2008, OpenCV's SGBM)."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError, ObservationError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import transform
+from kinefit.images.depth import to_points
+from kinefit.observations import DepthFrame
+
+_BLOCK = 5  # [px] OpenCV advises 3 to 11; below it noise matches, above it limbs grow at their edges
+_WIDEST = math.tan(math.radians(60.0))  # what a fisheye lens sees beyond that would fill a plane with few rays
+_LEAST_SHARED = 0.05  # of the first view, below which two cameras do not look at the same thing
+
+
+class StereoRectifier:
+    """Two cameras of a rig as one depth sensor.
+
+    The rectified view looks along the mean of both optical axes, its x along the line from the first camera to the
+    second, so pairs that stand above each other or were named the other way round work as well: their view is turned.
+    Maps are made once, through the cameras' own models, whatever their lenses.
+
+    Parameters
+    ----------
+    left, right : Camera
+    near, far : float [m] between which depth is sought: the range of disparities, so the cost, follows from it.
+    name : str, of the depth sensor; default that of the first camera with "_stereo".
+
+    Attributes
+    ----------
+    camera : Camera, rectified view from the first camera's centre, without distortion: that of the depth images.
+    baseline : float [m]
+
+    Raises
+    ------
+    CalibrationError
+        Cameras at one place, or that do not look at the same thing within the range.
+    ObservationError
+        A range that is none, or that would need disparities of more than half of the image's width.
+    """
+
+    def __init__(self, left: Camera, right: Camera, *, near: float = 0.5, far: float = 5.0, name: str = "") -> None:
+        place = f"cameras {left.name} and {right.name}"
+        if not 0.0 < near < far < math.inf:
+            raise ObservationError(f"a range of {near} to {far} m", place=place, remedy="Give 0 < near < far.")
+        across = right.centre_world - left.centre_world
+        self.baseline = float(np.linalg.norm(across))
+        if self.baseline < 1e-4:
+            problem = f"both stand at one place ({1e3 * self.baseline:.2g} mm apart)"
+            raise CalibrationError(problem, place=place, remedy="Is the calibration in metres, of these two?")
+        self.left, self.right, self.near, self.far = left, right, near, far
+        R = _rotation(left, right, across / self.baseline)
+        focal = float(np.mean([left.matrix[0, 0], left.matrix[1, 1], right.matrix[0, 0], right.matrix[1, 1]]))
+        low, high = _view(left, R)
+        low_right, high_right = _view(right, R)
+        size = np.ceil(focal * (high - low)).astype(int) + 1
+        cx, cy = -focal * low
+        offset = 0.5 * focal * float((low_right + high_right - low - high)[0])  # of both principal points [px]
+        self._offset, self._focal = offset, focal
+        matrix = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
+        pose = transform(R, -R @ left.centre_world)
+        self.camera = Camera(name or f"{left.name}_stereo", (int(size[0]), int(size[1])), matrix, T_camera_world=pose)
+        self._maps = [_map(camera, R, matrix, shift, size) for camera, shift in ((left, 0.0), (right, offset))]
+        first = offset + focal * self.baseline / far
+        count = focal * self.baseline * (1.0 / near - 1.0 / far)
+        self._check(place, first, count)
+        self._least, self._count = math.floor(first), 16 * math.ceil((count + 2.0) / 16.0)
+
+    def _check(self, place: str, first: float, count: float) -> None:
+        width = self.camera.size[0]
+        if count > 0.5 * width:
+            closest = self._focal * self.baseline / (0.5 * width + self._focal * self.baseline / self.far)
+            problem = f"from {self.near} m on, points move by {count:.0f} px of {width} between the two images"
+            raise ObservationError(problem, place=place, remedy=f"Give near={closest:.2f} or more, or a smaller image.")
+        seen = [np.isfinite(m).all(axis=-1) for m in self._maps]
+        shared = 0.0
+        for d in (first, first + 0.5 * count, first + count):
+            u = np.arange(width) - round(d)
+            inside = (u >= 0) & (u < width)
+            if not inside.any():
+                continue
+            shared = max(shared, float(np.mean(seen[0][:, inside] & seen[1][:, u[inside]])) * float(inside.mean()))
+        if shared < _LEAST_SHARED:
+            problem = f"only {100 * shared:.0f} % of the first one's view is seen by the other"
+            remedy = "Choose two that look at the same thing, or another range."
+            raise CalibrationError(problem, place=place, remedy=remedy)
+
+    def rectify(self, left: NDArray, right: NDArray) -> tuple[NDArray, NDArray]:
+        """Both images (h, w) or (h, w, 3) uint8 as the rectified views see them, (H, W) or (H, W, 3)."""
+        out = []
+        for image, camera, maps in zip((left, right), (self.left, self.right), self._maps):
+            if image.ndim not in (2, 3) or image.shape[1::-1] != camera.size or image.dtype != np.uint8:
+                problem = f"an image of shape {image.shape} and type {image.dtype}, calibrated at {camera.size}"
+                remedy = "Give 8-bit images of that size, or camera.scaled(size)."
+                raise ObservationError(problem, place=f"camera {camera.name}", remedy=remedy)
+            out.append(cv2.remap(image, np.nan_to_num(maps, nan=-1e4), None, cv2.INTER_LINEAR))
+        return out[0], out[1]
+
+    def disparity(self, left: NDArray, right: NDArray) -> NDArray:
+        """(H, W) float32 [px] focal length · baseline / depth of every pixel of the rectified view; NaN for none.
+
+        Matches that differ from right to left by more than a pixel, that have a rival within 10 %, and patches of
+        fewer than 100 pixels are dropped (OpenCV's advice for all three).
+        """
+        views = [v if v.ndim == 2 else cv2.cvtColor(v, cv2.COLOR_BGR2GRAY) for v in self.rectify(left, right)]
+        matcher = cv2.StereoSGBM.create(
+            minDisparity=self._least, numDisparities=self._count, blockSize=_BLOCK, P1=8 * _BLOCK**2,
+            P2=32 * _BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=10, speckleWindowSize=100,
+            speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )  # fmt: skip
+        width = self.camera.size[0]
+        margins = max(self._least + self._count, 0), max(-self._least, 0)  # SGBM leaves out what may match outside
+        wide = [cv2.copyMakeBorder(v, 0, 0, *margins, cv2.BORDER_REPLICATE) for v in views]
+        raw = matcher.compute(*wide)[:, margins[0] : margins[0] + width].astype(np.float32) / 16.0
+        moved = raw - np.float32(self._offset)
+        least, most = (self._focal * self.baseline / z for z in (self.far, self.near))
+        lost = (raw < self._least) | (moved < least) | (moved > most) | ~self._seen(raw)
+        return np.where(lost, np.float32(np.nan), moved)
+
+    def _seen(self, raw: NDArray) -> NDArray:
+        """(H, W) bool: the pixel lies in the first image, and its match in the second."""
+        first, second = (np.isfinite(m).all(axis=-1) for m in self._maps)
+        height, width = raw.shape
+        match = np.rint(np.arange(width) - raw).astype(int)
+        inside = (match >= 0) & (match < width)
+        return first & inside & second[np.arange(height)[:, None], np.clip(match, 0, width - 1)]
+
+    def depth(self, left: NDArray, right: NDArray) -> NDArray:
+        """(H, W) float32 [m] along the optical axis of `camera`; 0 where nothing matched."""
+        moved = self.disparity(left, right)
+        return np.nan_to_num(np.float32(self._focal * self.baseline) / moved, nan=0.0)
+
+    def frame(self, left: NDArray, right: NDArray, time: float) -> DepthFrame:
+        """What the pair saw at a time [s], as a depth sensor whose camera is `camera`."""
+        return DepthFrame(self.camera.name, time, self.depth(left, right))
+
+    def deviation(self, depth: float, matching: float = 0.5) -> float:
+        """[m] standard deviation of a depth [m] where matches are off by `matching` [px]: z² / (f b) · matching."""
+        return depth**2 / (self._focal * self.baseline) * matching
+
+
+def stereo_points(
+    left: NDArray, right: NDArray, rig: Rig, names: tuple[str, str], *, near: float = 0.5, far: float = 5.0
+) -> tuple[NDArray, NDArray]:
+    """World points (N, 3) [m] of a stereo pair, and its disparity (H, W) [px], NaN for none.
+
+    For many pairs make one `StereoRectifier` and keep it.
+
+    Parameters
+    ----------
+    left, right : (h, w) or (h, w, 3) uint8
+    rig : Rig; names of both cameras in it.
+    near, far : float [m] between which depth is sought.
+
+    Raises
+    ------
+    CalibrationError, ObservationError
+        As `StereoRectifier`, and images of another size than calibrated.
+    """
+    pair = StereoRectifier(rig[names[0]], rig[names[1]], near=near, far=far)
+    moved = pair.disparity(left, right)
+    depth = np.nan_to_num(np.float32(pair.camera.matrix[0, 0] * pair.baseline) / moved, nan=0.0)
+    return to_points(depth, pair.camera), moved
+
+
+def _rotation(left: Camera, right: Camera, x: NDArray) -> NDArray:
+    """(3, 3) world to rectified view: x along the baseline, z the mean optical axis as far as it is at right angles."""
+    z = left.T_camera_world[2, :3] + right.T_camera_world[2, :3]
+    z = z - (z @ x) * x
+    length = float(np.linalg.norm(z))
+    if length < 0.1 or left.T_camera_world[2, :3] @ right.T_camera_world[2, :3] <= 0.0:
+        place = f"cameras {left.name} and {right.name}"
+        remedy = "Choose two that look the same way, side by side."
+        raise CalibrationError("they look away from each other, or along their baseline", place=place, remedy=remedy)
+    z = z / length
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _view(camera: Camera, R: NDArray) -> tuple[NDArray, NDArray]:
+    """Lower and upper x/z and y/z (2,) of a camera's image in the rectified view."""
+    w, h = camera.size
+    u, v = np.linspace(0, w - 1, 33), np.linspace(0, h - 1, 33)
+    border = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    ray = camera.ray(border) @ R.T
+    ray = ray[np.isfinite(ray).all(axis=1)]
+    ray = ray[ray[:, 2] > 1e-3]
+    if not len(ray):
+        remedy = "Choose two that look the same way, side by side."
+        raise CalibrationError("it looks away from the other", place=f"camera {camera.name}", remedy=remedy)
+    tangents = np.clip(ray[:, :2] / ray[:, 2:], -_WIDEST, _WIDEST)
+    return tangents.min(axis=0), tangents.max(axis=0)
+
+
+def _map(camera: Camera, R: NDArray, matrix: NDArray, shift: float, size: NDArray) -> NDArray:
+    """(H, W, 2) float32 [px] where the rectified view's pixels lie in a camera's image; NaN outside of it.
+
+    `shift` [px] is by how much the view's principal point lies left of the matrix's.
+    """
+    u, v = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
+    x, y = (u - matrix[0, 2] + shift) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]
+    uv = camera.project(camera.centre_world + np.stack([x, y, np.ones_like(x)], axis=-1) @ R)
+    inside = np.all((uv >= -0.5) & (uv <= np.array(camera.size) - 0.5), axis=-1)
+    uv[~inside] = np.nan
+    return uv.astype(np.float32)

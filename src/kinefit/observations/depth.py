@@ -1,0 +1,171 @@
+"""Recordings of depth: the frames of one sensor, read when they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.observations.frames import DepthFrame, PointCloud
+
+_GAP = 1.5  # usual steps of time: half a frame late is jitter, more is a frame that is missing
+
+
+def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
+    """Read-only (F,) [s]; a typed error names the first frame that is not later than the one before it."""
+    times = np.array(times, dtype=float).ravel()
+    back = np.flatnonzero(~(np.diff(times) > 0.0)) + 1
+    bad = np.flatnonzero(~np.isfinite(times))
+    if not len(times) or len(bad) or len(back):
+        frame = int(bad[0] if len(bad) else back[0] if len(back) else 0)
+        told = ", ".join(f"{t:.6g} s" for t in times[max(frame - 1, 0) : frame + 1])
+        raise ObservationError(
+            f"times of the frames of {sensor} do not increase ({told})" if len(times) else f"{sensor} has no frames",
+            file=source or None, place=f"frame {frame}" if len(times) else None,
+            remedy="Sort the frames by time and leave out doubled ones; a clock that was set back needs two takes.",
+        )  # fmt: skip
+    times.flags.writeable = False
+    return times
+
+
+@dataclass(frozen=True, eq=False)
+class _Recording:
+    """What recordings of depth images and of clouds have in common."""
+
+    sensor: str
+    rate: float
+    times: NDArray
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def gaps(self) -> NDArray:
+        """(G,) frames that come more than half a step too late: some before them are missing, or the clock jumped."""
+        return np.flatnonzero(np.diff(self.times) > _GAP / self.rate) + 1
+
+    def nearest(self, time: float) -> int:
+        """The frame nearest to a time [s] of the take."""
+        i = int(np.searchsorted(self.times, time))
+        return min((k for k in (i - 1, i) if 0 <= k < len(self)), key=lambda k: abs(self.times[k] - time))
+
+    def at_step(self, step: int, rate: float) -> int | None:
+        """The frame that counts at a step of a take's common time, t = step / rate: the nearest, within half a step.
+
+        Every frame counts at one step alone: a slow sensor leaves steps without, of a fast one frames are left out.
+        """
+        i = self.nearest(step / rate)
+        return i if -0.5 <= round(self.times[i] * rate - step, 6) < 0.5 else None
+
+
+@dataclass(frozen=True, eq=False)
+class DepthVideo(_Recording):
+    """Depth images of one sensor.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of its camera in the rig.
+    rate : float [Hz]
+    times : (F,) [s] in the take; strictly increasing.
+    size : (width, height) [px]
+    image : callable
+        Frame number -> (H, W) [m] along the optical axis; what is not positive and finite counts as not measured.
+    near, far : float [m]
+        Range gate: nothing measured outside of it is handed out.
+    camera : Camera or None
+        What the recording itself tells of its sensor.
+    background : DepthVideo or None
+        The same sensor, standing where it stands, before the empty scene.
+    on_body : bool
+        Whether everything but the body was taken out already.
+    source : str
+        File or folder, for messages.
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase, a rate or a range that cannot be.
+    """
+
+    size: tuple[int, int]
+    image: Callable[[int], NDArray]
+    near: float = 0.0
+    far: float = np.inf
+    camera: Camera | None = None
+    background: DepthVideo | None = None
+    on_body: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
+        if not (0.0 < self.rate < 1e6 and 0.0 <= self.near < self.far):
+            raise ObservationError(
+                f"rate {self.rate:g} Hz, range {self.near:g} to {self.far:g} m of {self.sensor}",
+                file=self.source or None, remedy="Give frames per second, and a range in metres, the nearer end first.",
+            )  # fmt: skip
+        if self.background is not None and self.background.size != self.size:
+            raise ObservationError(
+                f"the background of {self.sensor} has {self.background.size} px, its frames have {self.size}",
+                file=self.background.source or None, remedy="Record the empty scene with the same settings.",
+            )  # fmt: skip
+
+    def frame(self, i: int) -> DepthFrame:
+        """Frame number `i`, negative ones from the end; read now."""
+        i = range(len(self))[i]
+        depth = np.array(self.image(i), np.float32)
+        if depth.shape != self.size[::-1]:
+            raise ObservationError(
+                f"the image has shape {depth.shape}, not {self.size[::-1]}", file=self.source or None,
+                place=f"frame {i} of {self.sensor}", remedy="All frames of one sensor are of one size.",
+            )  # fmt: skip
+        depth[~((depth >= self.near) & (depth <= self.far))] = 0.0
+        return DepthFrame(self.sensor, float(self.times[i]), depth)
+
+
+@dataclass(frozen=True, eq=False)
+class CloudVideo(_Recording):
+    """Clouds of points of one sensor, without the order of an image.
+
+    Parameters
+    ----------
+    sensor : str
+    rate : float [Hz]
+    times : (F,) [s] in the take; strictly increasing.
+    points : callable
+        Frame number -> (N, 3) [m] in the sensor's frame.
+    T_world_sensor : (4, 4) [m]
+    viewpoint : bool
+        Whether the sensor stood at the origin of its frame: only surfaces that face it can have been seen.
+    on_body : bool
+    source : str
+    """
+
+    points: Callable[[int], NDArray]
+    T_world_sensor: NDArray | None = None
+    viewpoint: bool = True
+    near: float = 0.0
+    far: float = np.inf
+    on_body: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
+        T = np.eye(4) if self.T_world_sensor is None else np.array(self.T_world_sensor, float)
+        T.flags.writeable = False
+        object.__setattr__(self, "T_world_sensor", T)
+
+    def frame(self, i: int) -> PointCloud:
+        """Frame number `i`, negative ones from the end; read now."""
+        i, T = range(len(self))[i], self.T_world_sensor
+        assert T is not None
+        x = np.asarray(self.points(i), float).reshape(-1, 3)
+        x = x[np.isfinite(x).all(axis=1)]
+        away = np.linalg.norm(x, axis=1)
+        x = x[(away > 0.0) & (away >= self.near) & (away <= self.far)]
+        viewpoint = T[:3, 3] if self.viewpoint else None
+        return PointCloud(self.sensor, float(self.times[i]), x @ T[:3, :3].T + T[:3, 3], viewpoint, self.on_body)

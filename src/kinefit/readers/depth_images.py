@@ -1,0 +1,183 @@
+"""Depth images as files: folders of 16-bit PNG or TIFF, raw 16-bit files, numpy archives."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.geometry.camera import Camera
+
+PICTURES = (".png", ".tif", ".tiff")
+_SATURATED = 65535  # the highest count of a 16-bit sensor: too far or too bright
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSource:
+    """Where depth comes from, before its unit is known.
+
+    Parameters
+    ----------
+    count : int
+        Frames.
+    image : callable
+        Frame number -> (H, W), counts or metres.
+    size : (width, height) [px]
+    unit : float [m]
+        Of one count, as the format has it.
+    stated : bool
+        Whether the file itself tells the unit, and not only custom.
+    times : (F,) [s] or None
+    camera : Camera or None
+    rate : float [Hz] or None
+    names : tuple of str
+        Of the files, one a frame, where there is one for each.
+    """
+
+    count: int
+    image: Callable[[int], NDArray]
+    size: tuple[int, int]
+    unit: float
+    stated: bool = False
+    times: NDArray | None = None
+    camera: Camera | None = None
+    rate: float | None = None
+    names: tuple[str, ...] = ()
+
+
+def natural(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Key that sorts names by the numbers in them: 2.png before 10.png."""
+    parts = re.split(r"(\d+)", name)
+    return tuple((1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts)
+
+
+def listed(path: Path) -> list[Path]:
+    """Files of a folder, of a pattern such as frames/depth_*.png, or the one file; in natural order."""
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
+    elif "*" in path.name:
+        found = [file for file in path.parent.glob(path.name) if file.is_file()]
+    else:
+        found = [path] if path.is_file() else []
+    return sorted(found, key=lambda file: natural(file.name))
+
+
+def picture_source(files: list[Path]) -> DepthSource:
+    """Depth in 16-bit pictures (counts) or 32-bit float TIFF (metres), one file a frame."""
+    first = _picture(files[0])
+    unit = 0.001 if first.dtype == np.uint16 else 1.0
+    if len(files) == 1 and cv2.imcount(str(files[0])) > 1:  # one TIFF of many pages
+        pages = cv2.imcount(str(files[0]))
+        return DepthSource(pages, lambda i: _counts(_page(files[0], i)), first.shape[::-1], unit)
+    return DepthSource(
+        len(files), lambda i: _counts(_picture(files[i])), first.shape[::-1], unit, names=tuple(f.name for f in files)
+    )
+
+
+def _page(file: Path, i: int) -> NDArray:
+    ok, pages = cv2.imreadmulti(str(file), i, 1, flags=cv2.IMREAD_UNCHANGED)
+    if not ok or len(pages) != 1:
+        raise FileError("a page that cannot be decoded", file=file, place=f"frame {i}", remedy="Copy it again.")
+    return pages[0]
+
+
+def _picture(file: Path) -> NDArray:
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=file, remedy="Check the path.") from error
+    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if picture is None:
+        raise FileError("a picture that cannot be decoded", file=file, remedy="It is cut or damaged: copy it again.")
+    if picture.ndim != 2 or picture.dtype not in (np.uint16, np.float32, np.float64):
+        channels = 1 if picture.ndim == 2 else picture.shape[2]
+        raise ObservationError(
+            f"a picture of {picture.itemsize * 8} bits in {channels} channel(s), which is no depth", file=file,
+            remedy="Depth is one channel of 16 bits, or of float. Is this the colour, or a picture for the eye? "
+            "Name only the depth files: depth_*.png.",
+        )  # fmt: skip
+    return picture
+
+
+def _counts(picture: NDArray) -> NDArray:
+    depth = picture.astype(np.float32)
+    if picture.dtype == np.uint16:
+        depth[picture == _SATURATED] = 0.0
+    return depth
+
+
+def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
+    """Little-endian 16-bit counts, row by row and nothing else: one file a frame, or all frames in one file.
+
+    Of a folder the files take part whose names differ by their numbers alone, the largest such group.
+    """
+    alike = Counter(re.sub(r"\d+", "#", file.name) for file in files).most_common(1)[0][0]
+    files = [file for file in files if re.sub(r"\d+", "#", file.name) == alike]
+    length = files[0].stat().st_size
+    if size is None:
+        raise ObservationError(
+            f"raw files of {length} bytes, and the size of the image is not told", file=files[0],
+            remedy="Give size = [width, height]; 614400 bytes are 640x480 in 16 bits.",
+        )  # fmt: skip
+    width, height = size
+    frame = 2 * width * height
+    for file in files:
+        have = file.stat().st_size
+        if have == 0 or have % frame or (len(files) > 1 and have != frame):
+            raise ObservationError(
+                f"{have} bytes, but {width}x{height} px of 16 bits are {frame}", file=file,
+                remedy="Correct the size, and leave out files of another kind: name them by a pattern (depth-*).",
+            )  # fmt: skip
+    per_file = length // frame
+
+    def image(i: int) -> NDArray:
+        file, place = (files[i], 0) if len(files) > 1 else (files[0], i)
+        data = np.fromfile(file, "<u2", width * height, offset=place * frame)
+        if len(data) < width * height:
+            raise FileError("is shorter than before", file=file, place=f"frame {i}", remedy="Copy it again.")
+        return _counts(data.reshape(height, width))
+
+    count = len(files) if len(files) > 1 else per_file
+    return DepthSource(count, image, size, 0.001, names=tuple(f.name for f in files) if len(files) > 1 else ())
+
+
+def array_source(path: Path) -> DepthSource:
+    """Depth in a numpy archive: `depth` (F, H, W) or (H, W); `times` (F,) [s], `unit` [m], `rate` [Hz] as it has."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            content = {key: archive[key] for key in ("depth", "times", "unit", "rate") if key in archive}
+            keys = sorted(archive)
+    except (OSError, ValueError, AttributeError) as error:
+        raise FileError(f"no numpy archive ({error})", file=path, remedy="Write it with numpy.savez.") from error
+    depth = content.get("depth")
+    if depth is None or depth.ndim not in (2, 3) or not depth.size or depth.dtype.kind not in "uif":
+        shape = "" if depth is None else f", `depth` has shape {depth.shape} of {depth.dtype}"
+        raise ObservationError(
+            f"it holds {', '.join(keys) or 'nothing'}{shape}", file=path,
+            remedy="Give `depth` (frames, height, width), in metres or in whole counts with `unit` [m].",
+        )  # fmt: skip
+    depth = depth if depth.ndim == 3 else depth[None]
+    times = content.get("times")
+    if times is not None and times.shape != (len(depth),):
+        raise ObservationError(
+            f"{times.shape} times for {len(depth)} frames", file=path, remedy="Give `times` (frames,) in seconds."
+        )
+    number = {}
+    for key in ("unit", "rate"):
+        if key in content:
+            value = content[key]
+            if value.size != 1 or value.dtype.kind not in "uif":
+                raise ObservationError(f"`{key}` is no number", file=path, remedy="Give one number.")
+            number[key] = float(value.ravel()[0])
+    unit = number.get("unit", 1.0 if depth.dtype.kind == "f" else 0.001)
+    return DepthSource(
+        len(depth), lambda i: _counts(depth[i]), depth.shape[:0:-1], unit, "unit" in number, times,
+        rate=number.get("rate"),
+    )  # fmt: skip

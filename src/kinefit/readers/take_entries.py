@@ -1,0 +1,95 @@
+"""The tables of a take file as typed records; every default stands here and nowhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+
+class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the take file; paths are absolute once it is read."""
+
+
+class CalibrationEntry(_Entry, frozen=True, kw_only=True):
+    """`[calibration]`: where the cameras stood."""
+
+    file: Path
+    unit: str = "auto"  # of its translations, where the format does not tell
+
+
+class CameraEntry(_Entry, frozen=True, kw_only=True):
+    """`[[camera]]`: one camera of the calibration, with its video or the size of its picture."""
+
+    name: str
+    video: Path | None = None
+    size: tuple[int, int] | None = None  # [px] (width, height) of the picture; default: the video's
+    image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the picture
+    rotation: Literal[0, 90, 180, 270] = 0  # [deg] the picture is the calibration's, turned clockwise
+    time_offset: float = 0.0  # [s] added to frame / rate
+
+
+class KeypointsEntry(_Entry, frozen=True, kw_only=True):
+    """`[[keypoints]]`: what a detector saw in one camera."""
+
+    camera: str
+    file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    format: Literal["openpose", "mediapipe", "caliscope", "detect"] = "openpose"
+    set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe
+    frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
+    rate: float | None = None  # [Hz]; default: the camera's video, or the take
+    accuracy: float = 8.0  # [px] standard deviation, in the calibration's image
+
+
+class MarkersEntry(_Entry, frozen=True, kw_only=True):
+    """`[[markers]]`: a marker recording."""
+
+    file: Path
+    unit: str | None = None  # where the file does not tell it
+    set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
+    time_offset: float = 0.0  # [s]
+    accuracy: float = 0.005  # [m] standard deviation
+
+
+class DepthEntry(_Entry, frozen=True, kw_only=True):
+    """`[[depth]]`: a depth sensor."""
+
+    name: str
+    camera: str | None = None  # its camera in the calibration; default: of its own name
+    file: Path  # or folder, or pattern (frames/depth_*.png)
+    unit: float | None = None  # [m] of one count; default: what the file tells, else millimetres
+    size: tuple[int, int] | None = None  # [px] (width, height), of raw files
+    range: tuple[float, float] | None = None  # [m] (near, far): what is measured outside of it is dropped
+    intrinsics: tuple[float, float, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
+    distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
+    rate: float | None = None  # [Hz]; default: what the file tells, the take's, the videos'
+    time_unit: float | None = None  # [s] of the last number in every file's name, where that is the time
+    time_offset: float = 0.0  # [s] time of the first frame
+    accuracy: float = 0.01  # [m] standard deviation of a depth
+    background: Path | None = None  # the same sensor before the empty scene
+    on_body: bool = False  # everything but the body was taken out already
+
+
+class StereoEntry(_Entry, frozen=True, kw_only=True):
+    """`[[stereo]]`: two cameras of the take whose videos give depth."""
+
+    left: str
+    right: str
+    range: tuple[float, float] = (0.5, 6.0)  # [m] along the left camera's axis
+    accuracy: float = 0.5  # [px] standard deviation of a disparity
+
+    @property
+    def name(self) -> str:
+        """Name of the depth sensor that the two are."""
+        return f"{self.left}-{self.right}"
+
+
+class _Head(_Entry, frozen=True, kw_only=True):
+    name: str | None = None
+    rate: float | None = None
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    body: str = "humanoid"
+    height: float | None = None
+    subject: Path | None = None
+    frames: tuple[int, int] | None = None

@@ -1,0 +1,1 @@
+"""Published methods, each short, over the parts of the library."""

@@ -1,0 +1,107 @@
+"""The five inputs of VooDoo (P2 4.1) from what sensors saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.errors import ObservationError
+from kinefit.geometry import lines
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.images.depth import to_points
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+
+_COLUMNS = 160  # of a depth image that take part, about: those of the time-of-flight camera of P2
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What all sensors saw at one time, by what is known of it; lengths [m] in the world, a weight for each.
+
+    Parameters
+    ----------
+    free : (N, 3) points on any surface
+    on_body : (N, 3) points on the body, on any of its limbs
+    on_limb : (N, 3) points on the limb `limb` (N,)
+    points, places : points of the body, and where they were measured (K, 3)
+    features, lines : points of the body, and the Plücker lines (K, 6) that they were seen on
+    """
+
+    free: NDArray
+    free_weight: NDArray
+    on_body: NDArray
+    on_body_weight: NDArray
+    on_limb: NDArray
+    on_limb_weight: NDArray
+    limb: NDArray
+    points: PointSet
+    places: NDArray
+    places_weight: NDArray
+    features: PointSet
+    lines: NDArray
+    lines_weight: NDArray
+
+
+def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str, float]) -> Sight:
+    """Sort what the sensors saw at one time, and weigh it: by a feature's name, else its sensor's, else 1.
+
+    Raises
+    ------
+    ObservationError
+        A weight that is negative or not finite; a camera that is not in the rig (as `Rig`).
+    """
+    for name, weight in weights.items():
+        if not 0.0 <= weight < np.inf:
+            raise ObservationError(f"the weight of {name} is {weight}", remedy="Give 0 or more.")
+    clouds: list[list] = [[], [], []]  # free, on the body, on a limb: (points, weight, limb)
+    found: list[list] = [[], []]  # places and lines: (points of the body, values, weights)
+    for frame in frames:
+        weight = weights.get(frame.sensor, 1.0)
+        if isinstance(frame, DepthFrame):
+            step = max(frame.size[0] // _COLUMNS, 1)
+            clouds[0].append((to_points(frame.depth, rig[frame.sensor], step=step), weight, -1))
+        elif isinstance(frame, PointCloud):
+            limb = -1 if frame.segment is None else body.tree.segment(frame.segment)
+            clouds[2 if limb >= 0 else int(frame.on_body)].append((frame.points, weight, limb))
+        elif isinstance(frame, MarkerFrame):
+            known = body.markers(frame.marker_set) if frame.marker_set else body.landmarks
+            found[0].append(_named(known, frame.names, frame.positions, weights, weight))
+        elif isinstance(frame, KeypointFrame):
+            known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
+            found[1].append(_named(known, frame.names, _rays(frame, rig[frame.sensor]), weights, weight))
+    x = [np.concatenate([p for p, _, _ in part] or [np.zeros((0, 3))]) for part in clouds]
+    w = [np.concatenate([np.full(len(p), a) for p, a, _ in part] or [np.zeros(0)]) for part in clouds]
+    limbs = np.concatenate([np.full(len(p), k) for p, _, k in clouds[2]] or [np.zeros(0, np.int64)])
+    return Sight(x[0], w[0], x[1], w[1], x[2], w[2], limbs, *_all(found[0], 3), *_all(found[1], 6))
+
+
+def _rays(frame: KeypointFrame, camera: Camera) -> NDArray:
+    """(K, 6) Plücker lines in the world, NaN for keypoints that were not seen."""
+    directions, out = camera.ray(frame.uv), np.full((len(frame.names), 6), np.nan)
+    seen = np.isfinite(directions).all(axis=1) & (frame.confidence > 0.0)
+    if seen.any():
+        out[seen] = lines.line_along(camera.centre_world, directions[seen])
+    return out
+
+
+def _named(
+    known: PointSet, names: Sequence[str], values: NDArray, weights: Mapping[str, float], weight: float
+) -> tuple[PointSet, NDArray, NDArray]:
+    here = [k for k, name in enumerate(names) if name in known.names]
+    chosen = tuple(names[k] for k in here)
+    return known.select(chosen), values[here], np.array([weights.get(name, weight) for name in chosen])
+
+
+def _all(parts: list, columns: int) -> tuple[PointSet, NDArray, NDArray]:
+    if not parts:
+        return PointSet((), np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros((0, columns)), np.zeros(0)
+    sets, values, weights = zip(*parts)
+    points = PointSet(
+        tuple(n for s in sets for n in s.names), np.concatenate([s.segments for s in sets]),
+        np.concatenate([s.points for s in sets]),
+    )  # fmt: skip
+    return points, np.concatenate(values), np.concatenate(weights)

@@ -1,0 +1,153 @@
+"""Ten movements made of formulas, and the people who do them: the sequences of P2's experiment (P2 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, TaperedCylinder, load_body
+from kinefit.errors import ObservationError, choices
+from kinefit.geometry import se3
+from kinefit.motion import Motion
+from kinefit.simulation._postures import MOVEMENTS
+from kinefit.simulation.retarget import known_motion
+
+DURATION = 4.0  # [s] at speed 1
+_SOLE = 0.02  # [m] over which feet share the support: that of a foot being lifted
+_FOOT = 0.04  # of the stature: no ankle lies as low
+_THICK = 0.015  # [m] of a foot below the axis of its toes
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Who moves, and how fast.
+
+    Parameters
+    ----------
+    body : Body
+    speed : float, 1 for the movement's usual duration of four seconds.
+    azimuth : float [rad]
+        Where a sensor stands, seen from above, counter-clockwise from straight ahead.
+    """
+
+    body: Body
+    speed: float
+    azimuth: float
+
+
+def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: float = 1.0) -> Motion:
+    """One of the ten movements: point, walk, wave, shake_hands, bow, clap, sit_down, kick, squat, arms_at_sensor.
+
+    Parameters
+    ----------
+    name : str
+    body : Body, optional
+        The catalogue's "humanoid10" (default) or "humanoid", or one with coordinates of their names.
+    rate : float [Hz]
+    speed : float
+        The movement takes 4 s / speed.
+
+    Returns
+    -------
+    Motion
+        World y up, the person looks along x at the start, the floor at height zero; known exactly.
+
+    Raises
+    ------
+    ObservationError
+        An unknown movement; a rate or speed that is not positive.
+    """
+    if name not in MOVEMENTS:
+        raise ObservationError(choices("movement", name, MOVEMENTS))
+    if not (0.0 < rate < np.inf and 0.0 < speed < np.inf):
+        problem = f"a movement at {rate} Hz and speed {speed}"
+        raise ObservationError(problem, remedy="Give positive numbers.")
+    body = load_body("humanoid10") if body is None else body
+    count = max(round(rate * DURATION / speed), 2)
+    posture = MOVEMENTS[name](np.linspace(0.0, 1.0, count))
+    angles = np.zeros((count, len(body.tree.coordinates)))
+    for coordinate, degrees in posture.degrees.items():
+        if coordinate in body.tree.coordinates:
+            angles[:, body.tree.coordinate(coordinate)] = np.radians(degrees)
+    angles = np.clip(angles, body.tree.lower, body.tree.upper)
+    heading, lean, roll = (np.radians(np.broadcast_to(v, count)) for v in (posture.heading, posture.lean, posture.roll))
+    zero = np.zeros(count)
+    R = (
+        se3.exp_so3(np.column_stack([zero, heading, zero]))
+        @ se3.exp_so3(np.column_stack([zero, zero, -lean]))
+        @ se3.exp_so3(np.column_stack([roll, zero, zero]))
+    )
+    Ts_world_root = _planted(body, R, angles)
+    return known_motion(body, rate, Ts_world_root, angles, up="y", name=name)
+
+
+def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple[Person, ...]:
+    """People of 1.50 to 2.00 m, thin and stout, slow and fast (speeds 0.6 to 1.6), seen from the front and half beside.
+
+    Every property runs evenly over its range; who has which is drawn by the seed. Limbs are up to 4 % longer or
+    shorter than a body of that stature has them, girths 0.85 to 1.2 times as large.
+    """
+    body = load_body("humanoid10") if body is None else body
+    random = np.random.default_rng(seed)
+
+    def spread(low: float, high: float) -> NDArray:
+        return random.permutation(np.linspace(low, high, count) if count > 1 else [0.5 * (low + high)])
+
+    statures, girths, speeds = spread(1.5, 2.0), spread(0.85, 1.2), spread(0.6, 1.6)
+    azimuths = np.radians(spread(-20.0, 20.0))
+    out = []
+    for stature, girth, speed, azimuth in zip(statures, girths, speeds, azimuths):
+        factors = stature / body.stature * random.uniform(0.96, 1.04, len(body.scale_groups))
+        out.append(Person(_stouter(body.scaled(factors), girth), float(speed), float(azimuth)))
+    return tuple(out)
+
+
+def _stouter(body: Body, girth: float) -> Body:
+    """The body with the half axes of all cylinders multiplied."""
+    surfaces = []
+    for s in body.surfaces:
+        if isinstance(s, TaperedCylinder):
+            (a0, b0), (a1, b1) = s.radii
+            s = replace(s, radii=((girth * a0, girth * b0), (girth * a1, girth * b1)))
+        surfaces.append(s)
+    return replace(body, surfaces=tuple(surfaces))
+
+
+def _planted(body: Body, R_world_root: NDArray, angles: NDArray) -> NDArray:
+    """T_world_root (F, 4, 4) such that the lowest foot stands on the floor and does not slip."""
+    Ts = se3.transform(R_world_root, np.zeros((len(angles), 3)))
+    poses = body.tree.segment_poses(Ts, angles)
+    feet = [np.mean([se3.apply(poses[:, k], point) for k, point in foot], axis=0) for foot in _feet(body)]
+    x = np.stack(feet, axis=1)  # (F, feet, 3)
+    height = x[..., 1]
+    share = np.exp(-(height - height.min(axis=1, keepdims=True)) / _SOLE)
+    share /= share.sum(axis=1, keepdims=True)
+    place = np.zeros((len(angles), 3))
+    carried = 0.5 * (share[1:] + share[:-1])[..., None] * np.diff(x, axis=0)
+    place[1:] = -np.cumsum(carried.sum(axis=1), axis=0)
+    place[:, 1] = _standing_height(body) - np.sum(share * height, axis=1)
+    Ts[:, :3, 3] = place
+    return Ts
+
+
+def _feet(body: Body) -> list[list[tuple[int, NDArray]]]:
+    """Points of both feet, left and right, with their segments: ends of the cylinders that are lowest at rest."""
+    tips = _tips(body)
+    if not tips:
+        return [[(s, np.zeros(3)) for s in range(len(body.tree.segments))]]
+    x = np.array([body.tree.rest[s] + p for s, p in tips])
+    low = x[:, 1] < x[:, 1].min() + _FOOT * max(body.stature, 1e-3)
+    sides = [low & (x[:, 2] < 0.0), low & (x[:, 2] >= 0.0)]
+    return [[tip for tip, here in zip(tips, side) if here] for side in sides if side.any()]
+
+
+def _standing_height(body: Body) -> float:
+    """[m] of the middle of the feet above the floor when the body stands at rest."""
+    low = min((body.tree.rest[s, 1] + p[1] for s, p in _tips(body)), default=0.0)
+    return float(np.mean([body.tree.rest[s, 1] + p[1] for foot in _feet(body) for s, p in foot]) - low + _THICK)
+
+
+def _tips(body: Body) -> list[tuple[int, NDArray]]:
+    return [(c.segment, np.array(p)) for c in body.surfaces if isinstance(c, TaperedCylinder) for p in (c.start, c.end)]

@@ -1,0 +1,272 @@
+"""A whole recording of a known motion by depth, stereo and colour cameras: files, calibration and take file."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError, ObservationError, choices
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import Motion
+from kinefit.readers.calibration import write_calibration
+from kinefit.simulation.keypoints import simulate_keypoints
+from kinefit.simulation.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
+from kinefit.simulation.placing import in_front, places
+from kinefit.simulation.room import room as room_around
+from kinefit.simulation.scenes import Scene
+from kinefit.simulation.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
+
+SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
+"""What `write_recording` simulates."""
+
+_UNIT = 0.001  # [m] of one count of a depth image
+_KEYPOINT_NOISE = 1.5  # [px]
+_KEYPOINT_ACCURACY = 2.0  # [px] in the take: what the noise and the small outliers come to
+_DISPARITY_ACCURACY = 0.5  # [px]
+_PREVIEW = 240  # [px] height
+_FRAME = re.compile(r"\d{6}\.png")
+
+Step = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """What there is to write: the scene, one camera for every name, and where to say how far it has come."""
+
+    scene: Scene
+    rig: Rig
+    seed: int
+    step: Step
+
+    def frames(self, name: str) -> Iterator[int]:
+        count = len(self.scene.motion)
+        for frame in range(count):
+            self.step(name, frame, count)
+            yield frame
+        self.step(name, count, count)
+
+
+def write_recording(
+    motion: Motion,
+    folder: str | os.PathLike[str],
+    sensors: Sequence[str] = ("kinect",),
+    *,
+    distance: float | None = None,
+    azimuth: float = 0.0,
+    height: float = 1.2,
+    room: bool = True,
+    seed: int = 0,
+    step: Step | None = None,
+    beside: Callable[[Path], None] | None = None,
+    body: str | os.PathLike[str] | None = None,
+) -> Path:
+    """Write what sensors in front of a person would have seen of a motion, as a take.
+
+    Parameters
+    ----------
+    motion : Motion
+        One frame of it is one frame of every sensor.
+    folder : path
+        Made where it does not exist; files of the same names in it are replaced.
+    sensors : of `SENSORS`
+        "tof", "kinect": 16-bit PNG in millimetres; "stereo": two grey videos without loss; "colour": a video;
+        "keypoints": a detector's points in the colour camera.
+    distance, azimuth, height : [m], [rad], [m]
+        Where they stand, see `in_front`; by default each as near as it can see all of the motion.
+    room : bool
+        Floor, walls and a table around the body.
+    seed : int
+        Of all errors.
+    step : callable(what, done, total), optional
+    beside : callable(folder), optional
+        Writes more files to stand beside the take (the truth); they appear with the rest or not at all.
+
+    body : path, optional
+        Body file that the take shall name; default: the name of the motion's body, as the catalogue has it.
+
+    Returns
+    -------
+    Path
+        The take file, written last.
+
+    Raises
+    ------
+    ObservationError
+        A sensor that does not exist, or that cannot see all of the motion within its range.
+    ExportError
+        The folder cannot be written; then no take file is there.
+    """
+    folder, chosen = Path(folder), list(dict.fromkeys(sensors))
+    for name in chosen:
+        if name not in SENSORS:
+            raise ObservationError(choices("sensor", name, SENSORS))
+    if not chosen:
+        raise ObservationError("no sensor is named", remedy=f"Name some of: {', '.join(SENSORS)}.")
+    cameras = _cameras(motion, chosen, distance, azimuth, height)
+    scene = Scene.of(motion)
+    if room:
+        middle = places(motion).mean(axis=0)
+        farthest = max(cameras, key=lambda camera: float(np.linalg.norm(camera.centre_world - middle)))
+        scene = Scene(motion, scene.mesh, room_around(motion, farthest))
+    job = _Job(scene, Rig(tuple(cameras)), seed, step or (lambda what, done, total: None))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+            staging = Path(name)
+            entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
+            write_calibration(job.rig, staging / "calibration.toml")
+            _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
+            (staging / "take.toml").write_text(_take(motion, entries, str(body or motion.body.name)), encoding="utf-8")
+            if beside is not None:
+                beside(staging)
+            _move(staging, folder)
+    except OSError as error:  # PyAV's errors of files are of this kind too
+        raise ExportError(
+            f"the recording cannot be written ({error.strerror or error})", file=folder,
+            remedy="Name a folder that can be written, on a disk with free space.",
+        ) from error
+    return folder / "take.toml"
+
+
+def _cameras(
+    motion: Motion, chosen: Iterable[str], distance: float | None, azimuth: float, height: float
+) -> list[Camera]:
+    out = []
+
+    def place(sensor: DepthSensor | ColourSensor, name: str) -> Camera:
+        return in_front(
+            motion, sensor.camera(name=name), distance=distance, azimuth=azimuth, height=height, near=sensor.near,
+            far=sensor.far,
+        )  # fmt: skip
+
+    for name in chosen:
+        if name in DEPTH_SENSORS:
+            out.append(place(DEPTH_SENSORS[name], name))
+        elif name == "stereo":
+            out.extend(STEREO.pair(place(STEREO, "stereo_left")))
+        elif "colour" not in [camera.name for camera in out]:
+            out.append(place(COLOUR, "colour"))
+    return out
+
+
+def _write_sensor(job: _Job, sensor: str, chosen: Sequence[str], folder: Path) -> list[str]:
+    """Write the files of one sensor; its entries in the take file."""
+    if sensor in DEPTH_SENSORS:
+        return _write_depth(job, DEPTH_SENSORS[sensor], folder)
+    if sensor == "stereo":
+        names = ("stereo_left", "stereo_right")
+        for name in names:
+            _write_video(job, name, STEREO, folder / f"{name}.mkv", grey=True)
+        entries = [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mkv"\n' for name in names]
+        pair = f'[[stereo]]\nleft = "{names[0]}"\nright = "{names[1]}"\naccuracy = {_DISPARITY_ACCURACY}  # px\n'
+        return [*entries, pair]
+    if sensor == "colour":
+        _write_video(job, "colour", COLOUR, folder / "colour.mp4", grey=False)
+        return ['[[camera]]\nname = "colour"\nvideo = "colour.mp4"\n']
+    entry = [] if "colour" in chosen else [f'[[camera]]\nname = "colour"\nsize = {list(COLOUR.size)}\n']
+    return entry + [_write_keypoints(job, folder)]
+
+
+def _write_depth(job: _Job, sensor: DepthSensor, folder: Path) -> list[str]:
+    camera, motion = job.rig[sensor.name], job.scene.motion
+    video = simulate_depth(motion, camera, sensor, seed=job.seed, scene=job.scene)
+    (folder / sensor.name).mkdir()
+    for frame in job.frames(sensor.name):
+        counts = np.round(video.frame(frame).depth / _UNIT).astype(np.uint16)
+        _save(folder / sensor.name / f"{frame:06d}.png", counts)
+    away = float(np.linalg.norm(places(motion).mean(axis=0) - camera.centre_world))
+    return [
+        f'[[depth]]\nname = "{sensor.name}"\nfile = "{sensor.name}"\nunit = {_UNIT}\nrate = {float(motion.rate)}\n'
+        f"range = [{sensor.near}, {sensor.far}]\naccuracy = {float(sensor.sigma(away)):.4f}\n"
+    ]
+
+
+def _save(path: Path, image: NDArray) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"no picture could be written to {path.name}")
+
+
+def _write_video(job: _Job, name: str, sensor: ColourSensor, path: Path, *, grey: bool) -> None:
+    camera = job.rig[name]
+    lossy = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    with av.open(str(path), "w") as container:
+        rate = Fraction(job.scene.motion.rate).limit_denominator(1001)
+        stream = container.add_stream("ffv1" if grey else lossy, rate=rate)
+        stream.width, stream.height = camera.size
+        stream.pix_fmt = "gray" if grey else "yuv420p"
+        for frame in job.frames(name):
+            image = picture(job.scene, frame, camera, sensor, grey=grey, seed=job.seed)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray" if grey else "bgr24")))
+        container.mux(stream.encode())
+
+
+def _write_keypoints(job: _Job, folder: Path) -> str:
+    rig = Rig((job.rig["colour"],))
+    (seen,) = simulate_keypoints(
+        job.scene.motion, rig, "MEDIAPIPE_33", noise_px=_KEYPOINT_NOISE, outliers=0.02, missing=0.05, seed=job.seed
+    )
+    points = np.concatenate([seen.points[:, 0], seen.confidence[:, 0, :, None]], axis=-1)
+    np.save(folder / "mediapipe_colour.npy", np.nan_to_num(points).astype(np.float32))
+    return (
+        f'[[keypoints]]\ncamera = "colour"\nfile = "mediapipe_colour.npy"\nformat = "mediapipe"\n'
+        f"accuracy = {_KEYPOINT_ACCURACY}\n"
+    )
+
+
+def preview(scene: Scene, rig: Rig, *, frame: int | None = None, seed: int = 0) -> NDArray:
+    """Picture (240, W, 3) BGR of what the sensors of a recording see in one frame, by default the middle one.
+
+    Depth as colours: near red, far blue, black where nothing was measured.
+    """
+    frame = len(scene.motion) // 2 if frame is None else frame
+    points, shown = places(scene.motion).reshape(len(scene.motion), -1, 3)[frame], []
+    for camera in rig:
+        if camera.name in DEPTH_SENSORS:
+            video = simulate_depth(scene.motion, camera, DEPTH_SENSORS[camera.name], seed=seed, scene=scene)
+            z = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+            image = depth_picture(video.frame(frame).depth, z.min() - 0.5, z.max() + 1.5)
+        else:
+            grey = camera.name != "colour"
+            image = picture(scene, frame, camera, STEREO if grey else COLOUR, grey=grey, seed=seed)
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image
+        size = (round(_PREVIEW * camera.size[0] / camera.size[1]), _PREVIEW)
+        few = camera.size[1] < _PREVIEW
+        shown.append(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if few else cv2.INTER_AREA))
+    return np.hstack(shown)
+
+
+def _take(motion: Motion, entries: Sequence[str], body: str) -> str:
+    head = [
+        "# Simulated from a known motion. No recording of a person.\n",
+        f"[take]\nname = {json.dumps(motion.name, ensure_ascii=False)}\nrate = {float(motion.rate)}\n"
+        f'up = "{motion.up}"\nbody = {json.dumps(body, ensure_ascii=False)}\n',
+        '[calibration]\nfile = "calibration.toml"\n',
+    ]
+    return "\n".join([*head, *entries])
+
+
+def _move(staging: Path, folder: Path) -> None:
+    """Let the new files take the place of old ones; the take file goes first and comes last."""
+    (folder / "take.toml").unlink(missing_ok=True)
+    for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
+        target = folder / path.name
+        if path.is_dir() and target.is_dir():
+            for old in target.iterdir():  # frames of a longer recording; nothing else is touched
+                if _FRAME.fullmatch(old.name):
+                    old.unlink()
+            for new in path.iterdir():
+                new.replace(target / new.name)
+        else:
+            shutil.move(path, target)

@@ -1,0 +1,67 @@
+"""Kernels of the judgement of segments: two layers of a drawn body, and what was measured at their pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kinefit._jit import jit
+
+OWN, ALONE, SHARED, EMPTY, COVERED, UNKNOWN = range(6)
+COUNTS = 6
+
+
+@jit
+def add_layer(layer, label, front, behind, owner, counts):
+    """Add one segment's depth (N,) [m], inf for none, to the nearest (front) and second nearest (behind) depth.
+
+    owner (N,) int32: label of the front; counts (S, COUNTS): `OWN` gets the segment's pixels. Without branches, so
+    that the compiler handles many pixels at a time.
+    """
+    far, name = np.float32(np.inf), np.int32(label)
+    for i in range(layer.size):
+        z, f, b = layer[i], front[i], behind[i]
+        second = z if z > f else f
+        behind[i] = second if second < b else b
+        owner[i] = name if z < f else owner[i]
+        front[i] = z if z < f else f
+    own = np.int32(0)
+    for i in range(layer.size):
+        own += np.int32(1) if layer[i] < far else np.int32(0)
+    counts[label, OWN] = own
+
+
+@jit
+def judge(front, behind, owner, depth, across, down, focal, slack, constant, quadratic, counts):
+    """Count every segment's foremost pixels by what was measured there.
+
+    depth (H, W) [m], 0 for none, `across` and `down` times as wide and high as front, behind and owner (h, w); a
+    measurement agrees within slack + constant + quadratic z² [m], at the pixel or at one of four that are `slack`
+    beside it at that depth; focal [px] of the full image.
+    """
+    height, width = depth.shape
+    for v in range(front.shape[0]):
+        iv = int((v + 0.5) * down)
+        for u in range(front.shape[1]):
+            z = front[v, u]
+            if not z < 1e30:
+                continue
+            iu = int((u + 0.5) * across)
+            m = depth[iv, iu]
+            bound = slack + constant + quadratic * z * z
+            agrees = abs(m - z) <= bound
+            if not agrees:
+                beside = int(slack * focal / z + 0.5)
+                above = iv - beside if iv >= beside else 0
+                below = iv + beside if iv + beside < height else height - 1
+                left = iu - beside if iu >= beside else 0
+                right = iu + beside if iu + beside < width else width - 1
+                agrees = abs(depth[above, iu] - z) <= bound or abs(depth[below, iu] - z) <= bound
+                agrees = agrees or abs(depth[iv, left] - z) <= bound or abs(depth[iv, right] - z) <= bound
+            z = behind[v, u]
+            if agrees:
+                kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE
+            elif m <= 0.0:
+                kind = UNKNOWN
+            else:
+                kind = EMPTY if m > front[v, u] else COVERED
+            counts[owner[v, u], kind] += 1

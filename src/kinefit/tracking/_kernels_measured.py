@@ -1,0 +1,38 @@
+"""Kernels of measured points: which pixels of a depth image may be the body's."""
+
+from __future__ import annotations
+
+from kinefit._jit import jit
+from kinefit.geometry._kernels_camera import ROT, TRANS
+
+
+@jit
+def gated_points(depth, rays, camera, low, high, first_row, last_row, first_column, last_column, step, out):
+    """World points (3, N) of every `step`-th pixel of a window that lie in the box low..high (3,) [m]; how many."""
+    r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
+    r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
+    r20, r21, r22 = camera[ROT + 6], camera[ROT + 7], camera[ROT + 8]
+    t0, t1, t2 = camera[TRANS], camera[TRANS + 1], camera[TRANS + 2]
+    n = 0
+    for v in range(first_row, last_row, step):
+        for u in range(first_column, last_column, step):
+            m = depth[v, u]
+            if m <= 0.0:
+                continue
+            a, b, c = m * rays[0, v, u] - t0, m * rays[1, v, u] - t1, m - t2
+            x = r00 * a + r10 * b + r20 * c
+            y = r01 * a + r11 * b + r21 * c
+            z = r02 * a + r12 * b + r22 * c
+            if low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2] and n < out.shape[1]:
+                out[0, n], out[1, n], out[2, n] = x, y, z
+                n += 1
+    return n
+
+
+@jit
+def soften(data, scale):
+    """Geman-McClure factors of residuals at `scale` [m] into the weights of rows (8, N), in place."""
+    inverse = 1.0 / (scale * scale)
+    for i in range(data.shape[1]):
+        q = 1.0 + data[6, i] * data[6, i] * inverse
+        data[7, i] /= q * q

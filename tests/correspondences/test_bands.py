@@ -1,0 +1,96 @@
+"""Elastic bands: what they leave free and what they hold (P2 fig. 2)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit.bodies import load_body
+from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.bodies.surfaces import sample
+from kinefit.correspondences import band_rows, joint_bands, surface_rows
+from kinefit.correspondences.bands import elliptic_bands, hinge_bands, universal_band
+from kinefit.errors import BodyError
+from kinefit.geometry import se3
+from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+
+RANDOM = np.random.default_rng(0)
+
+
+def stretched(points, omega):
+    """Largest stretch of bands at points (K, 3) when one side turns about the joint's centre."""
+    return np.linalg.norm(points @ se3.exp_so3(np.asarray(omega, float)).T - points, axis=1).max()
+
+
+def test_a_universal_joint_turns_freely():
+    assert stretched(universal_band(np.zeros(3)), RANDOM.normal(size=3)) == 0.0
+
+
+def test_a_hinge_turns_about_its_axis_only():
+    axis = np.array([1.0, 2.0, -1.0])
+    points = hinge_bands(np.zeros(3), axis, 0.05, 3)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), [0.05, 0.0, 0.05], atol=1e-15)
+    assert stretched(points, axis) < 1e-12
+    across = np.cross(axis, [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(stretched(points, 0.3 * across / np.linalg.norm(across)), 2 * 0.05 * np.sin(0.15))
+
+
+def test_an_elliptic_joint_turns_about_nothing():
+    points = elliptic_bands(np.zeros(3), [[0.06, 0.0, 0.0], [0.0, 0.0, 0.04]], 4)
+    for axis, reach in zip(np.eye(3), (0.04, 0.06, 0.06)):
+        np.testing.assert_allclose(stretched(points, 0.2 * axis), 2 * reach * np.sin(0.1))
+
+
+@pytest.mark.parametrize("name", ["humanoid10", "humanoid", "arm"])
+def test_bands_of_closed_joints_are_slack(name):
+    body = load_body(name)
+    bands, parts = joint_bands(body, elliptic=()), free_parts(body)
+    angles = RANDOM.uniform(body.tree.lower, body.tree.upper)
+    frames, _ = body.tree.forward(se3.exp(RANDOM.normal(size=6)), angles)
+    rows = band_rows(parts, parts_state(parts, frames), bands)
+    assert len(rows) == 3 * len(bands) > 0
+    np.testing.assert_allclose(rows.residual, 0.0, atol=1e-12)
+    kinds = {int(s): int(np.sum(bands.joint == s)) for s in bands.joint}
+    for s in range(1, len(body.tree.segments)):
+        turns = body.tree.dof_start[s + 1] - body.tree.dof_start[s]
+        assert kinds[s] == {0: 4, 1: 2}.get(int(turns), 1)
+
+
+def test_bands_pull_parts_together_again():
+    body = load_body("humanoid10")
+    parts, bands = free_parts(body), joint_bands(body)
+    usual = body.usual_state()
+    frames, _ = body.tree.forward(usual.T_world_root, usual.angles)
+    apart = parts_state(parts, frames).retract(0.1 * RANDOM.normal(size=parts.tree.n_dofs))
+    assert np.abs(band_rows(parts, apart, bands).residual).max() > 0.1
+    fit = levenberg_marquardt(parts, apart, lambda s: [band_rows(parts, s, bands)])
+    np.testing.assert_allclose(band_rows(parts, fit.state, bands).residual, 0.0, atol=1e-6)
+
+
+def test_a_joint_solve_of_skin_and_bands_finds_the_pose():
+    """All parts at once, over the same rows as a tree: 3,000 points of the skin, not told their limb."""
+    body = load_body("humanoid10")
+    parts, bands = free_parts(body), joint_bands(body, elliptic=())
+    start = body.usual_state()
+    angles = np.array(start.angles)
+    angles[[body.tree.coordinate("arm_flex_r"), body.tree.coordinate("knee_angle_l")]] += [0.3, 0.2]
+    truth, _ = body.tree.forward(start.T_world_root, angles)
+    rest, _, segment = sample(body, 3000)
+    f = truth[segment]
+    x = (f[:, :9].reshape(-1, 3, 3) @ rest[:, :, None])[..., 0] + f[:, 9:]
+    frames, _ = body.tree.forward(start.T_world_root, start.angles)
+    state = parts_state(parts, frames)
+    for _ in range(15):
+        rows = [surface_rows(parts, state, x, max_distance=0.15), band_rows(parts, state, bands)]
+        state = gauss_newton(parts, state, rows, damping=10.0).state
+    expected = body.positions(replace(start, angles=angles), body.landmarks)
+    np.testing.assert_allclose(parts.positions(state, parts.landmarks), expected, atol=1e-4)
+
+
+def test_what_has_no_bands_is_told():
+    body = load_body("arm")
+    with pytest.raises(BodyError, match="1 bands of a hinge"):
+        joint_bands(body, along_line=1)
+    sliding = replace(body, tree=replace(body.tree, prismatic=np.ones(len(body.tree.coordinates), bool)))
+    with pytest.raises(BodyError, match="sliding"):
+        joint_bands(sliding)

@@ -1,0 +1,155 @@
+"""Grades by the truth, the simulated sequences, and the experiment as a whole on two of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit.bodies import BodyState, PointSet, load_body
+from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.cli import main
+from kinefit.errors import ObservationError
+from kinefit.evaluation.sequences import FEATURES, sequence, sequences
+from kinefit.evaluation.voodoo import (
+    Grade,
+    Graded,
+    Summary,
+    conclusions,
+    evaluate,
+    grade,
+    point_errors,
+    stretched_share,
+    voodoo_method,
+)
+from kinefit.simulation.movements import movement, people
+from kinefit.simulation.retarget import known_motion
+
+TRUTH = movement("bow", rate=10.0)
+
+
+def off(metres, frames):
+    """The truth with the whole body aside in some frames."""
+    roots = np.array(TRUTH.Ts_world_root)
+    roots[frames, 2, 3] += metres
+    return replace(TRUTH, Ts_world_root=roots)
+
+
+@pytest.mark.parametrize(
+    ("metres", "frames", "expected"),
+    [
+        (0.0, slice(None), 2), (0.055, slice(None), 2), (0.065, slice(None), 1),  # the mean, 60 mm
+        (0.16, slice(0, 2), 2), (0.16, slice(0, 3), 1),  # a point over 150 mm in 5 % of 40 frames, and in more
+        (0.26, slice(0, 4), 1), (0.26, slice(0, 5), 0),  # over 250 mm in 10 %, and in more
+        (0.26, slice(37, 39), 2), (0.26, slice(38, 40), 0),  # found again before the end, or not
+    ],
+)  # fmt: skip
+def test_grades_are_as_stated(metres, frames, expected):
+    found = grade(TRUTH, off(metres, frames))
+    assert found.grade == expected
+    np.testing.assert_allclose(found.worst, metres, atol=1e-12)
+    np.testing.assert_allclose(found.mean, metres * len(range(40)[frames]) / 40, atol=1e-12)
+
+
+def test_a_single_limb_can_be_lost():
+    angles = np.array(TRUTH.angles)
+    angles[:, TRUTH.body.tree.coordinate("arm_flex_r")] += 1.2
+    assert grade(TRUTH, replace(TRUTH, angles=angles)).grade == 0
+
+
+def test_a_body_of_free_parts_is_graded_as_the_tree_it_was_cut_from():
+    parts, states = free_parts(TRUTH.body), []
+    for frame in range(len(TRUTH)):
+        state = TRUTH.state(frame)
+        frames, _ = TRUTH.body.tree.forward(state.T_world_root, state.angles)
+        states.append(parts_state(parts, frames))
+    cut = known_motion(parts, 10.0, np.array([s.T_world_root for s in states]), np.array([s.angles for s in states]))
+    np.testing.assert_allclose(point_errors(TRUTH, cut), 0.0, atol=1e-9)
+
+
+def test_motions_that_cannot_be_compared_are_told():
+    short = movement("bow", rate=5.0)
+    with pytest.raises(ObservationError, match="20 tracked frames of 40"):
+        grade(TRUTH, short)
+    arm = replace(load_body("arm"), landmarks=PointSet((), np.zeros(0, int), np.zeros((0, 3))))
+    zeros = np.zeros((40, len(arm.tree.coordinates)))
+    with pytest.raises(ObservationError, match="in common"):
+        grade(TRUTH, known_motion(arm, 10.0, np.tile(np.eye(4), (40, 1, 1)), zeros))
+
+
+@pytest.fixture(scope="module")
+def run():
+    return sequence("arms_at_sensor", people()[2])  # the fastest
+
+
+def test_a_sequence_holds_what_both_cameras_saw(run):
+    assert len(run.truth) == 25 == len(run.depth) == len(run.features)
+    depth, colour = run.rig["depth"], run.rig["colour"]
+    assert run.depth[0].size == depth.size == (160, 124) and colour.size == (320, 240)
+    points = run.truth.body.landmarks.select(FEATURES)
+    assert run.features[0].names == FEATURES
+    gap = np.array([f.uv - colour.project(run.truth.body.positions(run.truth.state(k), points))
+                    for k, f in enumerate(run.features)])  # fmt: skip
+    seen = np.isfinite(gap[..., 0])
+    assert seen.mean() > 0.9 and 1.0 < np.nanstd(gap) < 3.0
+    assert [len(frames) for frames in (run.seen("3d")[0], run.seen("2d")[0], run.seen("fusion")[0])] == [1, 1, 2]
+    x = run.truth.body.positions(run.truth.state(0), points)[1]
+    u, v = np.round(depth.project(x)).astype(int)
+    z = (depth.T_camera_world[:3, :3] @ x + depth.T_camera_world[:3, 3])[2]
+    window = np.asarray(run.depth[0].depth)[v - 2 : v + 3, u - 2 : u + 3]
+    assert np.abs(window[window > 0] - z).min() < 0.1
+
+
+def test_hidden_features_are_not_seen():
+    behind = replace(people()[2], azimuth=np.pi)
+    seen = [np.isfinite(f.uv[0, 0]) for f in sequence("bow", behind).features]
+    assert not any(seen)  # the face, from behind
+
+
+def test_the_same_seed_gives_the_same_sequences_each_person_and_movement_once():
+    a, b = (list(sequences(2, seed=3)) for _ in range(2))
+    for one, other in zip(a, b):
+        np.testing.assert_array_equal(one.depth[3].depth, other.depth[3].depth)
+        np.testing.assert_array_equal(one.features[3].uv, other.features[3].uv)
+    assert a[0].truth.name != a[1].truth.name and a[0].person.body.stature != a[1].person.body.stature
+
+
+def test_a_perfect_method_gets_full_marks_and_one_that_stays_does_not(run):
+    perfect = evaluate([run], lambda r, inputs, start: r.truth)
+    assert all(s.counts == (0, 0, 1) and s.error < 1e-9 for s in perfect.values())
+    np.testing.assert_allclose(perfect["fusion"].graded[0].stretched, 1.0)
+
+    def stays(r, inputs, start: BodyState):
+        return replace(r.truth, angles=np.tile(start.angles, (len(r.truth), 1)),
+                       Ts_world_root=np.tile(start.T_world_root, (len(r.truth), 1, 1)))  # fmt: skip
+
+    still = evaluate([run], stays, inputs=("3d",))
+    assert still["3d"].counts == (1, 0, 0) and still["3d"].graded[0].stretched == 0.0
+
+
+def test_no_arm_is_stretched_in_a_bow():
+    bow = sequence("bow", people()[2])
+    assert np.isnan(stretched_share(bow, bow.truth))
+
+
+def summary(inputs, grades, error, stretched=1.0):
+    return Summary(inputs, tuple(Graded("m", Grade(g, error, error), stretched) for g in grades))
+
+
+def test_conclusions_hold_where_grade_and_error_are_better():
+    alone = {"3d": summary("3d", [1, 2], 0.05), "2d": summary("2d", [0, 0], 0.2)}
+    assert all(conclusions(alone | {"fusion": summary("fusion", [2, 2], 0.03)}).values())
+    worse = conclusions(alone | {"fusion": summary("fusion", [2, 2], 0.06, stretched=0.5)})
+    assert list(worse.values()) == [False, True, False]
+
+
+def test_the_published_method_follows_arms_stretched_at_the_sensor(run):
+    found = evaluate([run], voodoo_method)
+    assert found["fusion"].graded[0].grade.grade >= 1 and found["fusion"].error < 0.06
+    assert found["fusion"].error < found["3d"].error < found["2d"].error
+
+
+def test_the_command_prints_the_table():
+    told = CliRunner().invoke(main, ["evaluate", "--count", "1", "--method", "voodoo", "-v"])
+    assert told.exit_code == 0, told.output
+    assert "mean grade" in told.stdout and "fusion is better than 3D alone" in told.stdout and "point" in told.stdout

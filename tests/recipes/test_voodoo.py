@@ -1,0 +1,156 @@
+"""VooDoo's steps, each against what the paper says of it, and the whole on points of a known body."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit.bodies import load_body
+from kinefit.bodies.surfaces import nearest, sample
+from kinefit.correspondences import joint_bands
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.recipes import _voodoo_boxes as boxing
+from kinefit.recipes import _voodoo_steps as steps
+from kinefit.recipes._voodoo_input import sight_of
+from kinefit.recipes.voodoo import Settings, voodoo
+
+BODY = load_body("humanoid10")
+STATE = BODY.usual_state()
+FRAMES, _ = BODY.tree.forward(STATE.T_world_root, STATE.angles)
+BOXES = boxing.boxes_of(BODY)
+CAMERA = Camera("cam", (160, 120), np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]]), (), "radtan",
+                np.array([[0, 0, 1.0, 0], [0, -1, 0, 0], [1, 0, 0, 4], [0, 0, 0, 1]]))  # fmt: skip
+RIG = Rig((CAMERA,))
+
+
+def skin(count=2000, state=STATE, seed=0):
+    """Points on the body's surface, and their segments."""
+    rest, _, segment = sample(BODY, count, seed=seed)
+    frames, _ = BODY.tree.forward(state.T_world_root, state.angles)
+    f = frames[segment]
+    return (f[:, :9].reshape(-1, 3, 3) @ rest[:, :, None])[..., 0] + f[:, 9:], segment
+
+
+def test_the_bodys_own_points_are_in_its_boxes():
+    x, segment = skin()
+    assert boxing.in_body_box(x, BOXES, FRAMES, 1e-9).all()
+    depth = boxing.depth_in_boxes(x, BOXES, FRAMES, 1e-9)
+    assert (depth[np.arange(len(x)), segment] >= 0.0).all()
+    np.testing.assert_allclose(boxing.depth_in_boxes(x, BOXES, FRAMES, 0.1) - depth, 0.1, atol=1e-8)
+
+
+def test_the_body_box_is_enlarged_by_what_is_asked_for():
+    x, _ = skin(20000)
+    below = x[np.argmin(x[:, 1])] - [0.0, 0.3, 0.0]
+    assert not boxing.in_body_box(below[None], BOXES, FRAMES, 0.15)[0]
+    assert boxing.in_body_box(below[None], BOXES, FRAMES, 0.3)[0]
+
+
+def test_the_three_rules_of_overlap():
+    forearm, upper, thigh = (BODY.tree.segment(n) for n in ("forearm_r", "upperarm_r", "thigh_r"))
+    depth = np.full((1, len(FRAMES)), -1.0)
+    depth[0, [forearm, upper, thigh]] = 0.05, 0.02, 0.01
+    allowed = {rule: set(np.flatnonzero(boxing.assigned(depth, BOXES, rule)[0]))
+               for rule in ("shared", "exclusive", "adjacent")}  # fmt: skip
+    assert allowed == {"shared": {forearm, upper, thigh}, "exclusive": {forearm}, "adjacent": {forearm, upper}}
+    assert not boxing.assigned(np.full((1, len(FRAMES)), -1.0), BOXES, "exclusive").any()
+
+
+def test_points_become_fewer_limb_by_limb():
+    member = np.zeros((1000, 3), bool)
+    member[:800, 0] = member[800:990, 1] = member[990:, 2] = True
+    point, limb = steps.fewer(member, factor=4.0, minimum=60, maximum=150)
+    assert np.bincount(limb).tolist() == [150, 60, 10]
+    assert member[point, limb].all() and len(set(point)) == len(point)
+
+
+def test_closest_points_are_of_their_limb_and_within_the_bound():
+    x, segment = skin(500)
+    _, normals, _ = sample(BODY, 500, seed=0)
+    away = x + 0.03 * (FRAMES[segment][:, :9].reshape(-1, 3, 3) @ normals[:, :, None])[..., 0]
+    pairs = steps.closest_points(BODY, FRAMES, away, np.arange(500.0), segment, 0.05)
+    np.testing.assert_array_equal(pairs.limb, segment)
+    np.testing.assert_array_equal(pairs.weight, np.arange(500.0))
+    expected = nearest(BODY, STATE, away, max_distance=0.05, only=segment).point
+    np.testing.assert_allclose(pairs.source, expected, atol=1e-12)
+    assert len(steps.closest_points(BODY, FRAMES, away, np.ones(500), segment, 1e-3).limb) < 50
+
+
+def test_the_nearest_points_of_rays():
+    points = BODY.landmarks.select(("nose_tip", "r_wrist"))
+    x = BODY.positions(STATE, points)
+    n = np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    off = np.array([[0.8, -0.6, 0.0], [1.0, 0.0, 0.0]]) * 0.07
+    lines = np.concatenate([n, np.cross(x + off + 3.0 * n, n)], axis=1)
+    pairs = steps.points_on_lines(BODY, FRAMES, points, lines, np.array([30.0, 20.0]))
+    np.testing.assert_allclose(pairs.target - pairs.source, off, atol=1e-12)
+    lines[0] = np.nan
+    assert steps.points_on_lines(BODY, FRAMES, points, lines, np.array([30.0, 20.0])).weight.tolist() == [20.0]
+
+
+def test_quality_is_the_weighted_mean_square():
+    x = np.zeros((2, 3))
+    pairs = steps.Pairs(x, np.array([[0.1, 0, 0], [0, 0.2, 0]]), np.array([3.0, 1.0]), np.zeros(2, int))
+    np.testing.assert_allclose(steps.quality(pairs), (3 * 0.01 + 0.04) / 4)
+    assert steps.quality(steps.Pairs(x[:0], x[:0], np.zeros(0), np.zeros(0, int))) == 0.0
+
+
+def test_five_inputs_are_told_apart():
+    depth = np.zeros((120, 160))
+    depth[60, 80] = 4.0
+    x = np.arange(9.0).reshape(3, 3)
+    seen = (
+        DepthFrame("cam", 0.0, depth), PointCloud("laser", 0.0, x), PointCloud("suit", 0.0, x[:2], on_body=True),
+        PointCloud("glove", 0.0, x[:1], segment="forearm_r"),
+        MarkerFrame("mocap", 0.0, ("r_knee", "nobody"), x[:2]),
+        KeypointFrame("cam", 0.0, ("nose_tip", "r_wrist"), [[80.0, 60.0], [np.nan, np.nan]], [1.0, 0.0]),
+    )  # fmt: skip
+    sight = sight_of(seen, BODY, RIG, {"laser": 2.0, "nose_tip": 30.0, "mocap": 5.0})
+    np.testing.assert_allclose(sight.free[0], [0.0, 0.0, 0.0], atol=1e-12)  # 4 m before the camera
+    assert sight.free_weight.tolist() == [1.0, 2.0, 2.0, 2.0] and len(sight.on_body) == 2
+    assert sight.limb.tolist() == [BODY.tree.segment("forearm_r")]
+    assert sight.points.names == ("r_knee",) and sight.places_weight.tolist() == [5.0]
+    assert sight.features.names == ("nose_tip", "r_wrist") and sight.lines_weight.tolist() == [30.0, 1.0]
+    np.testing.assert_allclose(sight.lines[0], [1, 0, 0, 0, 0, 0], atol=1e-12)
+    assert np.isnan(sight.lines[1]).all()
+    with pytest.raises(ObservationError, match="weight of cam is -1"):
+        sight_of(seen, BODY, RIG, {"cam": -1.0})
+
+
+def moved(angle):
+    """The body with an arm flexed and a knee bent."""
+    angles = np.array(STATE.angles)
+    angles[BODY.tree.coordinate("arm_flex_r")] += angle
+    angles[BODY.tree.coordinate("knee_angle_l")] += angle
+    return replace(STATE, angles=angles)
+
+
+def test_a_body_all_of_whose_skin_is_seen_is_found():
+    """Every point told its limb: bands and Horn's step alone find the pose."""
+    truth = moved(0.3)
+    x, segment = skin(4000, truth)
+    seen = [PointCloud("scan", 0.0, x[segment == s], segment=name) for s, name in enumerate(BODY.tree.segments)]
+    settings = Settings(factor=1.0, maximum=400, quality=1e-8, steps=60)
+    (fit,) = voodoo([seen], BODY, STATE, RIG, settings)
+    frames, _ = BODY.tree.forward(truth.T_world_root, truth.angles)
+    for name in ("r_wrist", "l_ankle", "neck", "r_elbow"):
+        points = BODY.landmarks.select((name,))
+        found, true = (steps.places(BODY, f, points) for f in (fit.frames, frames))
+        np.testing.assert_allclose(found, true, atol=0.015)
+    assert fit.steps == 60 or fit.quality <= 1e-8
+
+
+def test_a_good_fit_stops_at_once_and_the_steps_are_counted():
+    x, _ = skin(500)
+    near, spent = (next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, Settings(quality=q, steps=4))))
+                   for q in (1e-3, 0.0))  # fmt: skip
+    assert near.steps == 0 and np.array_equal(near.frames, FRAMES)
+    assert spent.steps == 4
+
+
+def test_nothing_seen_leaves_the_body_where_it_was():
+    fit = next(iter(voodoo([[PointCloud("s", 0.0, np.zeros((0, 3)))]], BODY, STATE, RIG)))
+    np.testing.assert_allclose(fit.frames, FRAMES, atol=2e-2)  # the neck's bands pull: it is bent in the usual pose
+    assert np.isfinite(fit.frames).all() and len(joint_bands(BODY)) == 16
