@@ -47,7 +47,7 @@ def turned(body, state, name, radians):
 
 def test_truth_is_trusted(scene):
     body, state, camera, layers = scene
-    verdict = judge_segments(body, state, layers, seen(body, state, camera, 0.01), camera, noise=(0.01, 0.0))
+    verdict = judge_segments(body, state, layers, seen(body, state, camera, 0.01), camera, noise=(0.01, 0.0)).evidence
     visible = ~verdict.hidden
     assert visible.sum() >= 0.8 * len(body.tree.segments)
     assert not verdict.lost.any()
@@ -66,7 +66,7 @@ def test_every_limb_put_elsewhere_is_flagged(scene):
         away = np.linalg.norm(layers.mesh.posed(frames) - truth, axis=1)
         count = np.maximum(np.bincount(layers.mesh.segment), 1)
         far = np.bincount(layers.mesh.segment, away) / count > 0.3
-        verdict = judge_segments(body, other, layers, depth, camera)
+        verdict = judge_segments(body, other, layers, depth, camera).evidence
         assert (verdict.lost | verdict.hidden)[far].all(), body.tree.coordinates[d]
         moved += far.sum()
     assert moved >= 4
@@ -78,20 +78,20 @@ def test_what_stands_behind_something_is_hidden_and_not_lost(scene):
     depth[:] = np.minimum(depth, 0.8)  # a board before all of it
     verdict = judge_segments(body, state, layers, depth, camera)
     drawn = verdict.counts[:, kernels.OWN] > 0
-    assert verdict.hidden.all() and not verdict.lost.any()
+    assert verdict.evidence.hidden.all() and not verdict.evidence.lost.any()
     assert (verdict.covered[drawn & (verdict.counts[:, 1:].sum(axis=1) > 0)] == 1.0).all()
 
 
 def test_a_body_that_is_not_there_is_lost(scene):
     body, state, camera, layers = scene
     empty = np.full((240, 320), WALL, np.float32)
-    verdict = judge_segments(body, state, layers, empty, camera)
+    verdict = judge_segments(body, state, layers, empty, camera).evidence
     assert (verdict.lost | verdict.hidden).all() and verdict.lost.sum() >= 0.7 * len(verdict.lost)
 
 
 def test_no_measurement_tells_nothing(scene):
     body, state, camera, layers = scene
-    verdict = judge_segments(body, state, layers, np.zeros((240, 320), np.float32), camera)
+    verdict = judge_segments(body, state, layers, np.zeros((240, 320), np.float32), camera).evidence
     assert verdict.hidden.all() and not verdict.lost.any() and not verdict.quality.any()
 
 
@@ -99,7 +99,7 @@ def test_verdicts_of_sensors_add_up(scene):
     body, state, camera, layers = scene
     clear = judge_segments(body, state, layers, seen(body, state, camera), camera)
     nothing = judge_segments(body, state, layers, np.zeros((240, 320), np.float32), camera)
-    assert np.array_equal((clear + nothing).supported, clear.supported)
+    assert np.array_equal((clear.evidence + nothing.evidence).agreeing, clear.evidence.agreeing)
 
 
 def test_layers_against_plain_numpy():

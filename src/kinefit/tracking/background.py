@@ -1,0 +1,72 @@
+"""What stands still about a body: learnt from depth images while it is tracked, and marked in them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Camera
+from kinefit.tracking import _kernels_background as kernels
+
+_COLUMNS = 320  # of the cells: finer ones cost more, and a wrist at 3 m is four wide
+_DEVIATIONS = 3.0  # beyond which a depth is something new
+_ABOUT = 2  # pixels of the drawn body (at most 160 columns) by which it may lie beside the measured one
+_MOVED = 0.4  # share of known cells that lie behind what was known: the sensor has moved
+
+
+class Background:
+    """The scene behind a body, for one depth camera that stands still.
+
+    At the first image all that is not the body is taken for background. From then on what is seen for the first time
+    away from the body is background at once; near it (a table that it walks up to, a thing that is put down) after
+    `wait` images in which no part of the body is thought to be there. What is farther than was known shows that what
+    was known has gone.
+
+    Parameters
+    ----------
+    camera : Camera of the depth images
+    sigma : float [m] standard deviation of a depth at the body; it is taken to grow with the depth squared.
+    wait : int, images
+    """
+
+    def __init__(self, camera: Camera, sigma: float, wait: int) -> None:
+        self.camera, self.wait, self._sigma = camera, wait, sigma
+        width, height = camera.size
+        self._cell = max(width // _COLUMNS, 1)
+        shape = -(-height // self._cell), -(-width // self._cell)
+        self._mean, self._spread, self._count, self._waiting = np.zeros((4, *shape))
+        self._variance: NDArray | None = None
+        self._empty = True
+
+    def learn(self, depth: NDArray, shown: NDArray, box: tuple[NDArray, NDArray], sure: bool) -> None:
+        """Learn from an image (H, W) [m] once the body has been found in it.
+
+        Parameters
+        ----------
+        shown : (h, w) [m] the body's own depth, inf where it is not.
+        box : (3,), (3,) [m] corners of the box that the body may be in.
+        sure : bool
+            Whether all of the body has been found: what is near it is learnt only then.
+        """
+        seen = np.isfinite(shown)
+        if self._variance is None:
+            at = float(np.median(shown[seen])) if seen.any() else 2.0
+            self._variance = np.array((0.25, 0.75 / at**4)) * self._sigma**2
+        if self._empty and not sure:
+            return
+        about = np.empty(shown.shape, np.float32)
+        kernels.widened(shown, _ABOUT, about)
+        kernels.learn(
+            depth, self.camera.ray_table, self.camera.packed, *box, about, self._cell, (0, 0), self._mean.shape,
+            self._variance, _DEVIATIONS**2, 1 if self._empty else self.wait, sure,
+            self._mean, self._spread, self._count, self._waiting,
+        )  # fmt: skip
+        self._empty = False
+
+    def marked(self, depth: NDArray) -> NDArray:
+        """A copy of an image (H, W) [m], negative where it shows what stands still."""
+        out = np.array(depth, np.float32)
+        if not self._empty:
+            window = (0, 0), self._mean.shape
+            kernels.mark(out, self._mean, self._spread, self._count, self._cell, _DEVIATIONS**2, *window)
+        return out
