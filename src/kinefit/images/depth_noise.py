@@ -49,7 +49,7 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
 
     What `clean` finds to be flying goes first. Then a pixel becomes the mean of those of its window that differ from it
     by no more than noise explains; surfaces do not mix. One that few others are like, noise and slant allowed for, is on
-    no surface and goes too.
+    no surface and goes too. An image of scattered pixels, most of them without neighbours, stays as it is.
 
     Parameters
     ----------
@@ -66,8 +66,12 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
     depth = np.where((depth > 0.0) & (depth < np.inf), depth, np.float32(0.0))
     sigma = noise_of(depth) if sigma is None else np.asarray(sigma, np.float32)
     noise = np.float32(_ALIKE) * sigma
-    if (depth > 0.0).any():
-        depth = clean(depth, camera, noise=max(float(np.median(noise[depth > 0.0])), _NOISE))
+    seen = depth > 0.0
+    if not seen.any():
+        return depth
+    raw, depth = depth, clean(depth, camera, noise=max(float(np.median(noise[seen])), _NOISE))
+    if 2 * np.count_nonzero(depth) < np.count_nonzero(seen):
+        return raw
     surface = np.maximum(noise, np.float32(slope_of(camera)) * depth)
     total, alike, support = np.zeros_like(depth), np.zeros_like(depth), np.zeros(depth.shape, np.uint8)
     h, w = depth.shape

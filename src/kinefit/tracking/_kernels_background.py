@@ -12,23 +12,24 @@ MOST = 50.0  # measurements that the newest one is weighed against: a sensor tha
 
 @jit
 def learn(
-    depth, rays, camera, low, high, drawn, cell, first, last, variance, gate, wait, told, mean, spread, count, waiting
+    depth, rays, camera, low, high, drawn, cell, row, step, variance, gate, wait, told, mean, spread, count, waiting, bound
 ):
-    """Learn one image, cell by cell (its upper left pixel), within a window of cells first..last (2,) (row, column).
+    """Learn one image, cell by cell (its upper left pixel), every `step`-th row of cells from `row` on.
 
     depth (H, W) [m], 0 for none; rays, camera as in `gated_points`; low, high (3,) [m]: box that the body may be in;
     drawn (h, w) at any size: the body's own depth, inf where it and what is about it is not; variance = (a, b): of a
     depth z, a + b z⁴, where it is not learnt yet; gate: deviations squared; wait: how often a new thing in the box must
     be seen; told: whether such things may be learnt at all.
-    In place: mean [m], spread [m²] of it, count of measurements (0: not known), waiting (negative: for a new mean).
+    In place: mean [m], spread [m²] of it, count of measurements (0: not known), waiting: how often a new thing was seen;
+    bound [m]: mean less √gate deviations, what is nearer is something new; inf where nothing is known.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
     r20, r21, r22 = camera[ROT + 6], camera[ROT + 7], camera[ROT + 8]
     t0, t1, t2 = camera[TRANS], camera[TRANS + 1], camera[TRANS + 2]
     rows, columns = mean.shape
-    for i in range(first[0], last[0]):
-        for j in range(first[1], last[1]):
+    for i in range(row, rows, step):
+        for j in range(columns):
             v, u = i * cell, j * cell
             z = float(depth[v, u])
             if z <= 0.0:
@@ -43,6 +44,7 @@ def learn(
                 spread[i, j] += (part - spread[i, j]) / (n + 4.0)  # what is usual counts for four
                 count[i, j] = n
                 waiting[i, j] = 0.0
+                bound[i, j] = mean[i, j] - math.sqrt(gate * spread[i, j])
                 continue
             if known and off < 0.0:
                 waiting[i, j] = 0.0
@@ -58,27 +60,21 @@ def learn(
                 if waiting[i, j] < wait:
                     continue
             mean[i, j], spread[i, j], count[i, j], waiting[i, j] = z, usual, 1.0, 0.0
+            bound[i, j] = z - math.sqrt(gate * usual)
 
 
 @jit
-def mark(depth, mean, spread, count, cell, gate, first, last):
-    """Turn the sign of pixels of an image, in place, that show no more than what stands still (or lies behind it).
-
-    A pixel is something new where it is nearer than the mean by more than √gate deviations.
-    """
+def mark(depth, bound, cell, first, last):
+    """Turn the sign of pixels of an image, in place, that show no more than what stands still, or lies behind it."""
     height, width = depth.shape
     for i in range(first[0], last[0]):
-        for j in range(first[1], last[1]):
-            if count[i, j] <= 0.0:
-                continue
-            bound = mean[i, j] - math.sqrt(gate * spread[i, j])
-            top, left = i * cell, j * cell
-            bottom = top + cell if top + cell < height else height
-            right = left + cell if left + cell < width else width
-            for v in range(top, bottom):
-                for u in range(left, right):
-                    if depth[v, u] > bound:
-                        depth[v, u] = -depth[v, u]
+        bottom = (i + 1) * cell if (i + 1) * cell < height else height
+        for v in range(i * cell, bottom):
+            for j in range(first[1], last[1]):
+                right = (j + 1) * cell if (j + 1) * cell < width else width
+                for u in range(j * cell, right):
+                    z = depth[v, u]
+                    depth[v, u] = -z if z > bound[i, j] else z
 
 
 @jit

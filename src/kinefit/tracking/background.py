@@ -11,7 +11,7 @@ from kinefit.tracking import _kernels_background as kernels
 _COLUMNS = 320  # of the cells: finer ones cost more, and a wrist at 3 m is four wide
 _DEVIATIONS = 3.0  # beyond which a depth is something new
 _ABOUT = 2  # pixels of the drawn body (at most 160 columns) by which it may lie beside the measured one
-_MOVED = 0.4  # share of known cells that lie behind what was known: the sensor has moved
+_TURNS = 4  # of the rows of cells: with each image one of so many is learnt
 
 
 class Background:
@@ -35,8 +35,9 @@ class Background:
         self._cell = max(width // _COLUMNS, 1)
         shape = -(-height // self._cell), -(-width // self._cell)
         self._mean, self._spread, self._count, self._waiting = np.zeros((4, *shape))
+        self._bound = np.full(shape, np.inf)
         self._variance: NDArray | None = None
-        self._empty = True
+        self._empty, self._turn = True, 0
 
     def learn(self, depth: NDArray, shown: NDArray, box: tuple[NDArray, NDArray], sure: bool) -> None:
         """Learn from an image (H, W) [m] once the body has been found in it.
@@ -57,16 +58,18 @@ class Background:
         about = np.empty(shown.shape, np.float32)
         kernels.widened(shown, _ABOUT, about)
         kernels.learn(
-            depth, self.camera.ray_table, self.camera.packed, *box, about, self._cell, (0, 0), self._mean.shape,
-            self._variance, _DEVIATIONS**2, 1 if self._empty else self.wait, sure,
-            self._mean, self._spread, self._count, self._waiting,
+            depth, self.camera.ray_table, self.camera.packed, *box, about, self._cell,
+            *((0, 1) if self._empty else (self._turn, _TURNS)), self._variance, _DEVIATIONS**2,
+            1 if self._empty else max(self.wait // _TURNS, 1), sure,
+            self._mean, self._spread, self._count, self._waiting, self._bound,
         )  # fmt: skip
-        self._empty = False
+        self._empty, self._turn = False, (self._turn + 1) % _TURNS
 
-    def marked(self, depth: NDArray) -> NDArray:
-        """A copy of an image (H, W) [m], negative where it shows what stands still."""
+    def marked(self, depth: NDArray, first: tuple[int, int], last: tuple[int, int]) -> NDArray:
+        """A copy of an image (H, W) [m], negative where it shows what stands still; within rows and columns first..last."""
         out = np.array(depth, np.float32)
         if not self._empty:
-            window = (0, 0), self._mean.shape
-            kernels.mark(out, self._mean, self._spread, self._count, self._cell, _DEVIATIONS**2, *window)
+            low, high = ((a // self._cell, b // self._cell) for a, b in (first, (last[0] - 1, last[1] - 1)))
+            end = high[0] + 1, high[1] + 1
+            kernels.mark(out, self._bound, self._cell, low, end)
         return out

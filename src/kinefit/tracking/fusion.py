@@ -20,12 +20,14 @@ from kinefit.solvers.equations import Covariance, Equations, inverse, joint_std
 from kinefit.solvers.least_squares import gauss_newton
 from kinefit.tracking._depth_search import Search
 from kinefit.tracking.background import Background
-from kinefit.tracking.depth_measurement import CloudMeasurement, DepthMeasurement, Surface
+from kinefit.tracking.cloud_measurement import CloudMeasurement
+from kinefit.tracking.depth_measurement import DepthMeasurement
 from kinefit.tracking.evidence import Evidence
 from kinefit.tracking.fusion_search import LEAP, dofs_of_limbs, find_limbs, find_starts
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import Prediction, belief, forgetting
+from kinefit.tracking.surface import Surface
 
 _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than that must be the more certain
 
@@ -233,7 +235,8 @@ class FusionTracker:
             loss = replace(s.loss, scale=s.loss.scale * bound / s.near)  # far points pull too, while all is far off
             step = gauss_newton(self.body, state, self._rows(state, held, measurements, bound), loss=loss)
             state = step.state
-            if step.norm < s.tolerance and bound <= s.near:
+            gain = float(step.delta @ step.equations.gradient)  # twice the fall of the cost: squared deviations
+            if gain < s.tolerance**2 * len(step.delta) and bound <= s.near:
                 break
             bound = max(bound * s.shrink, s.near)
         return state, step.equations, iteration
@@ -285,14 +288,14 @@ class FusionTracker:
         if view is None:
             return result
         search = Search(self.body, view, self.up, np.random.default_rng(0))
-        lost, free = result.lost, dofs_of_limbs(self.body, seek)
+        free = dofs_of_limbs(self.body, seek)
         held = result.state, forgetting(inverse(np.diag(result.dof_std**2)), free)
         now = best = search.score.of(result.state) - LEAP * _against(result.state, measurements)
         for state, least in find_limbs(search, result.state, seek):
             found = self._fitted(time, frames, state, held)
             value = search.score.of(found.state) - LEAP * _against(found.state, measurements)
             surfaces = [m for m in measurements if isinstance(m, DepthMeasurement | CloudMeasurement)]
-            seen = not (self._judged(found.state, surfaces).hidden & lost).any()  # else it would hide, not be found
+            seen = not (self._judged(found.state, surfaces).hidden & seek).any()  # else it would hide, not be found
             if seen and value > max(best, now + least * self._leap(time, result, found, seek)):
                 best, result, self._lost_since = value, found, time
                 self._prediction.go_on(found.state, found.dof_std, np.where(free, 0.0, self._prediction.velocity))

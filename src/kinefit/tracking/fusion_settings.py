@@ -25,8 +25,8 @@ class FusionSettings:
     shrink : float
         By which the bound shrinks from iteration to iteration.
     iterations : int, at most
-    tolerance : float [m, rad]
-        Norm of a step below which a frame is done.
+    tolerance : float [standard deviations]
+        Of each degree of freedom, on average: a smaller step ends a frame.
     patch : float [m]
         Size of a patch of surface over which the errors of depth are alike (shape, and the sensor's own): as many
         measurements count as there are patches.
@@ -66,7 +66,7 @@ class FusionSettings:
     near: float = 0.03
     shrink: float = 0.5
     iterations: int = 8
-    tolerance: float = 2e-3
+    tolerance: float = 0.3
     patch: float = 0.05
     render_every: int = 4
     depth: float = 0.01

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body
 from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -100,13 +100,14 @@ def _part(mesh: BodyMesh, segment: int) -> tuple[int, slice, NDArray]:
 
 
 def judge_segments(
-    body: Body, state: BodyState, layers: Layers, depth: NDArray, camera: Camera, *,
+    vertices_world: NDArray, layers: Layers, depth: NDArray, camera: Camera, *,
     noise: tuple[float, float] = (0.002, 0.002), slack: float = 0.015,
 ) -> SegmentVerdict:  # fmt: skip
-    """Judge every segment of a state by one depth image.
+    """Judge every segment of a body by one depth image.
 
     Parameters
     ----------
+    vertices_world : (V, 3) [m] its mesh in the pose to be judged.
     layers : Layers of this body and camera; overwritten.
     depth : (H, W) [m]
         0 where nothing was measured; negative where it is known to be something else's, see `Background`.
@@ -122,8 +123,7 @@ def judge_segments(
     if depth.shape != (camera.size[1], camera.size[0]):
         problem = f"a depth image of {depth.shape[1]}x{depth.shape[0]} px, camera {camera.name} has {camera.size}"
         raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    layers.draw(layers.mesh.posed(frames))
+    layers.draw(vertices_world)
     width, height = layers.camera.size
     kernels.judge(
         layers.front, layers.behind, layers.owner, depth, camera.size[0] / width, camera.size[1] / height,
