@@ -32,7 +32,8 @@ def noise_of(depth: NDArray) -> NDArray:
     second = np.full((2, *whole.shape), np.nan, np.float32)
     second[0, 1:-1] = whole[2:] - 2.0 * whole[1:-1] + whole[:-2]
     second[1, :, 1:-1] = whole[:, 2:] - 2.0 * whole[:, 1:-1] + whole[:, :-2]
-    blocks = np.abs(second).reshape(2, rows, _BLOCK, columns, _BLOCK).transpose(1, 3, 0, 2, 4).reshape(rows, columns, -1)
+    blocks = np.abs(second).reshape(2, rows, _BLOCK, columns, _BLOCK).transpose(1, 3, 0, 2, 4)
+    blocks = blocks.reshape(rows, columns, -1)
     blocks.sort(axis=-1)  # NaN last
     count = np.isfinite(blocks).sum(axis=-1)
     middle = np.take_along_axis(blocks, np.maximum(count - 1, 0)[..., None] // 2, axis=-1)[..., 0]
@@ -48,8 +49,8 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
     """A depth image with most of its noise and without flying pixels: the sigma filter (Lee, CVGIP 24, 1983).
 
     What `clean` finds to be flying goes first. Then a pixel becomes the mean of those of its window that differ from it
-    by no more than noise explains; surfaces do not mix. One that few others are like, noise and slant allowed for, is on
-    no surface and goes too. An image of scattered pixels, most of them without neighbours, stays as it is.
+    by no more than noise explains; surfaces do not mix. One that few others are like, noise and slant allowed for, is
+    on no surface and goes too. An image of scattered pixels, most of them without neighbours, stays as it is.
 
     Parameters
     ----------

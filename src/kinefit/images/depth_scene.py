@@ -101,7 +101,7 @@ def find_floor(
     if len(x) < 100:
         return None
     rng = np.random.default_rng(seed)
-    some = x[rng.choice(len(x), min(len(x), 3000), replace=False)]
+    some = x[rng.choice(len(x), min(len(x), 2000), replace=False)]
     three = some[rng.integers(0, len(some), (_FLOOR_ROUNDS, 3))]
     normal = np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
     length = np.linalg.norm(normal, axis=1)

@@ -51,8 +51,7 @@ class Background:
         """
         seen = np.isfinite(shown)
         if self._variance is None:
-            at = float(np.median(shown[seen])) if seen.any() else 2.0
-            self._variance = np.array((0.25, 0.75 / at**4)) * self._sigma**2
+            self._variance = self._usual(float(np.median(shown[seen])) if seen.any() else 2.0)
         if self._empty and not sure:
             return
         about = np.empty(shown.shape, np.float32)
@@ -64,6 +63,21 @@ class Background:
             self._mean, self._spread, self._count, self._waiting, self._bound,
         )  # fmt: skip
         self._empty, self._turn = False, (self._turn + 1) % _TURNS
+
+    def know(self, depth: NDArray) -> None:
+        """Take an image (H, W) [m] of the empty scene for what stands still; 0 where that is not known."""
+        z = np.asarray(depth, float)[:: self._cell, :: self._cell]
+        known = z > 0.0
+        if self._variance is None:
+            self._variance = self._usual(float(np.median(z[known])) if known.any() else 2.0)
+        self._mean[known], self._count[known] = z[known], 4.0  # as sure as a few images make it
+        self._spread[:] = self._variance[0] + self._variance[1] * z**4
+        self._bound[known] = (z - _DEVIATIONS * np.sqrt(self._spread))[known]
+        self._empty = False
+
+    def _usual(self, at: float) -> NDArray:
+        """(2,) a, b of the variance a + b z⁴ that is sigma² at a depth [m]."""
+        return np.array((0.25, 0.75 / at**4)) * self._sigma**2
 
     def marked(self, depth: NDArray, first: tuple[int, int], last: tuple[int, int]) -> NDArray:
         """A copy of an image (H, W) [m], negative where it shows what stands still; within rows and columns first..last."""

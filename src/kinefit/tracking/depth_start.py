@@ -7,7 +7,7 @@ the person is explained by the body drawn there, less what is drawn where the se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,9 +91,11 @@ def start_from_points(
         The body has no surfaces.
     """
     found: list[tuple[Search, BodyState]] = []
-    views, others = _views(body, points, camera, depth, up)
+    views: list[DepthView] = []
+    more = _views(body, points, camera, depth, up)
     for attempt in range(max(attempts, 1)):
-        searches = _searches(body, views + others * (attempt > 0), up, seed + attempt)
+        views += next(more, [])
+        searches = _searches(body, views, up, seed + attempt)
         found += [(search, state) for search in searches for state in search.best(count)]
         if max(_meant(*f) for f in found) > _GOOD:
             break
@@ -139,8 +141,8 @@ def restart_limb(
     if lost - {s for limb in chosen for s in limb}:
         names = ", ".join(body.tree.segments[s] for limb in limbs(body) for s in limb)
         raise BodyError("a segment of the trunk cannot be sought alone", remedy=f"Choose among: {names}.")
-    views, others = _views(body, points, camera, depth, up)
-    search = max(_searches(body, views + others, up, seed), key=lambda s: s.score.of(state))
+    views = [view for some in _views(body, points, camera, depth, up) for view in some]
+    search = max(_searches(body, views, up, seed), key=lambda s: s.score.of(state))
     ends = search.ends(state)
     found = [(state, search.score.of(state))]
     for limb in chosen:
@@ -205,8 +207,8 @@ def _searches(body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int) 
 
 def _views(
     body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike
-) -> tuple[list[DepthView], list[DepthView]]:
-    """Views of the persons that may be meant; and of parts of them, where those are a person beside other things."""
+) -> Iterator[list[DepthView]]:
+    """Views of the persons that may be meant; then of parts of them, where those may be a person by a table."""
     direction = _unit(up)
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces", remedy="Depth needs some; see the catalogue's bodies.")
@@ -219,13 +221,15 @@ def _views(
     if points is None:
         if depth is None:
             raise ObservationError("neither points nor a depth image", remedy="Give one of them.")
-        smooth = denoised(depth, camera)
-        blobs, others = _blobs(smooth, camera, direction)
-        if not blobs:
+        smooth, none = denoised(depth, camera), True
+        for blobs in _blobs(smooth, camera, direction):
+            yield [view_of(smooth, blob.mask, camera) for blob in blobs]
+            none = False
+        if none:
             raise TrackingError(
                 "nothing in the depth image is of a person's size", remedy=_scale_remedy(depth[depth > 0], body)
             )
-        return [view_of(smooth, b.mask, camera) for b in blobs], [view_of(smooth, b.mask, camera) for b in others]
+        return
     cloud = np.asarray(points, float).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     coarse, small = splat(cloud, camera)
@@ -238,22 +242,24 @@ def _views(
             remedy="Give the person's points only, in metres (are these millimetres?).",
         )
     if depth is None:
-        return [view_of(coarse, coarse > 0, small)], []
+        yield [view_of(coarse, coarse > 0, small)]
+        return
     near, sigma = _resized(coarse, depth.shape), noise_of(depth)
     person = (depth > 0) & (np.abs(depth - near) < 0.05 + 3.0 * sigma)
     smooth = denoised(depth, camera, sigma)
-    return [view_of(smooth, person, camera)], []
+    yield [view_of(smooth, person, camera)]
 
 
-def _blobs(depth: NDArray, camera: Camera, up: NDArray) -> tuple[list[Blob], list[Blob]]:
-    """Things of a person's size, the likeliest first; and others, if parts nearer to each other make one thing."""
+def _blobs(depth: NDArray, camera: Camera, up: NDArray) -> Iterator[list[Blob]]:
+    """Things of a person's size, the likeliest first; then those that are only things if less is joined to them."""
     floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
-    found: list[list[Blob]] = []
+    known: list[Blob] = []
     for gap in _GAPS:
-        known = [blob for blobs in found for blob in blobs]
         new = [b for b in people(depth, camera, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
-        found.append(sorted(new, key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))[:_MOST])
-    return (found[0], found[1]) if found[0] else (found[1], [])
+        new.sort(key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))
+        known += new
+        if new:
+            yield new[:_MOST]
 
 
 def _same(a: Blob, b: Blob) -> bool:

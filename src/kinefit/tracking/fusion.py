@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,6 +76,7 @@ class FusionTracker:
     rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
     accuracy : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
     up : (3,) upwards in the world, for a start with no pose given.
+    on_body : depth cameras whose images show nothing but the body: no background is learnt.
 
     Attributes
     ----------
@@ -85,13 +86,13 @@ class FusionTracker:
 
     def __init__(
         self, body: Body, rig: Rig, *, rate: float = 30.0, accuracy: Mapping[str, float] | None = None,
-        up: ArrayLike = (0.0, 1.0, 0.0), settings: FusionSettings | None = None,
+        up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: FusionSettings | None = None,
     ) -> None:  # fmt: skip
         if not 0.0 < rate < np.inf:
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
         self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
         self.settings = settings or FusionSettings()
-        self.accuracy = dict(accuracy or {})
+        self.accuracy, self._bare = dict(accuracy or {}), frozenset(on_body)
         bad = [f"{name}: {value}" for name, value in self.accuracy.items() if not 0.0 < value < np.inf]
         if bad:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
@@ -120,12 +121,40 @@ class FusionTracker:
         """The last frame's, None before a start."""
         return self._prediction.state
 
+    def know_background(self, sensor: str, depth: NDArray) -> None:
+        """Tell what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known.
+
+        Raises
+        ------
+        CalibrationError
+            A camera that the rig does not have.
+        ObservationError
+            An image of another size.
+        """
+        camera = self.rig[sensor]
+        if np.shape(depth) != camera.size[::-1]:
+            problem = f"a background of shape {np.shape(depth)}, camera {sensor} has {camera.size}"
+            raise ObservationError(problem, remedy="Give an image of this camera.")
+        background = self._background(camera, self.accuracy.get(sensor, self.settings.depth))
+        if background is not None:
+            background.know(depth)
+
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
         if len(state.angles) != len(self.body.tree.coordinates):
             problem = f"a state of {len(state.angles)} angles, body '{self.body.name}' has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
+
+    def backwards(self, state: BodyState) -> FusionTracker:
+        """A tracker of the same body and sensors that knows the same background, for the time before a state."""
+        out = FusionTracker(
+            self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, on_body=self._bare,
+            settings=self.settings,
+        )  # fmt: skip
+        out._backgrounds = self._backgrounds
+        out.start_at(state)
+        return out
 
     def change_body(self, body: Body) -> None:
         """Go on with another size, another surface, a part more or less (`bodies.parts`); pose and speed are kept."""
@@ -137,8 +166,13 @@ class FusionTracker:
             self._prediction.go_on(state, std, velocity)
         self._last = None
 
-    def update(self, frames: Sequence[Frame]) -> FusionResult | None:
+    def update(self, frames: Sequence[Frame], time: float | None = None) -> FusionResult | None:
         """Track one step of time from what the sensors saw then.
+
+        Parameters
+        ----------
+        frames : of any sensors; none where `time` is given: the body is then where it was thought to go.
+        time : float [s], default the frames' mean.
 
         Returns
         -------
@@ -152,7 +186,7 @@ class FusionTracker:
         CalibrationError, BodyError
             A camera, segment or keypoint set that is not known.
         """
-        time = _time_of(frames)
+        time = _time_of(frames, time)
         steps = self._steps(time)
         if steps is None:
             return self._last
@@ -207,7 +241,7 @@ class FusionTracker:
 
     def _background(self, camera: Camera, sigma: float) -> Background | None:
         wait = self.settings.background * self.rate
-        if not np.isfinite(wait):
+        if not np.isfinite(wait) or camera.name in self._bare:
             return None
         if camera.name not in self._backgrounds:
             self._backgrounds[camera.name] = Background(camera, sigma, max(round(wait), 2))
@@ -282,7 +316,7 @@ class FusionTracker:
         if not s.search or not waited or time - self._sought < s.search_every:
             return result
         self._sought = time
-        if result is None or result.lost[0] or result.quality < 0.4:
+        if result is None or result.lost[0] or result.quality < s.poor:
             return self._started(time, frames, result)
         view = next((view for m in measurements if (view := m.view()) is not None), None)
         if view is None:
@@ -311,7 +345,8 @@ class FusionTracker:
     def _started(self, time: float, frames: Sequence[Frame], result: FusionResult | None) -> FusionResult | None:
         for state in find_starts(self.body, self.rig, frames, self.up):
             found = self._fitted(time, frames, state, None)
-            if result is None or _better(found, result):
+            poor = found.lost[0] or found.quality < self.settings.poor
+            if not poor and (result is None or _better(found, result)):
                 result, self._lost_since = found, time
                 self._prediction.start(found.state, found.dof_std)
         return result
@@ -337,12 +372,13 @@ def _better(new: FusionResult, old: FusionResult) -> bool:
     return lost[0] < lost[1] or (lost[0] == lost[1] and new.quality > old.quality + 0.05)
 
 
-def _time_of(frames: Sequence[Frame]) -> float:
+def _time_of(frames: Sequence[Frame], time: float | None) -> float:
     for frame in frames:
         if not isinstance(frame, DepthFrame | PointCloud | KeypointFrame | MarkerFrame):
             problem = f"a {type(frame).__name__} among the frames"
             raise ObservationError(problem, remedy="Give DepthFrame, PointCloud, KeypointFrame or MarkerFrame.")
-    time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
+    if time is None:
+        time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
     if not np.isfinite(time):
         problem = "frames whose time is not finite" if len(frames) else "no frame"
         raise ObservationError(problem, remedy="Give what the sensors saw, each with its time in seconds.")

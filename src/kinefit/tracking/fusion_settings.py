@@ -53,6 +53,8 @@ class FusionSettings:
     search : bool
         Whether what is lost is sought: a limb takes 50 ms of one core, a whole body 2 s. Without it every frame takes
         as long as any other, and `start_at` is the only start.
+    poor : float in 0..1
+        Mean quality below which the whole body counts as lost, and is sought as at the start.
     doubtful : float in 0..1
         Quality of a segment below which its limb is sought together with one that is lost.
     search_after, search_every : float [s]
@@ -82,6 +84,7 @@ class FusionSettings:
     loss: Loss = field(default_factory=geman_mcclure)
     pause: float = 1.0
     search: bool = True
+    poor: float = 0.4
     doubtful: float = 0.6
     search_after: float = 0.0
-    search_every: float = 0.05
+    search_every: float = 0.1
