@@ -151,7 +151,8 @@ def _fusion(folder: Path) -> dict[str, float]:
     """Time and error with 5,000 points of the body a frame; the clouds are left in the folder."""
     from kinefit.bodies.surfaces import sample
 
-    least, first, iterations, error, told = [], [], [], [], {}
+    least, first, iterations, error = [], [], [], []
+    told: dict[str, Any] = {}
     for name in MOVEMENTS:
         stage = Stage(name)
         points = np.array([stage.points(i)[:POINTS] for i in range(len(stage.motion))])
@@ -165,13 +166,14 @@ def _fusion(folder: Path) -> dict[str, float]:
         print(f"# {name}: {np.median(least[-1]):.2f} ms, joints mean {error[-1].mean():.1f} mm")
     body = stage.motion.body
     x, normals, owners = sample(body, POINTS)
-    np.savez(folder / "clouds.npz", names=MOVEMENTS, samples=x - body.tree.rest[owners], normals=normals, owners=owners, **told)
+    told |= {"names": MOVEMENTS, "samples": x - body.tree.rest[owners], "normals": normals, "owners": owners}
+    np.savez(folder / "clouds.npz", **told)
     ms, once = np.concatenate(least), np.concatenate(first)
-    print(f"# {POINTS} points, {len(ms)} frames, least of {PASSES} passes: min {ms.min():.2f}, median {np.median(ms):.2f}, "
-          f"95 of 100 below {np.percentile(ms, 95):.2f} ms; first pass: median {np.median(once):.2f} ms; "
+    median, mm = float(np.median(once)), float(np.concatenate(error).mean())
+    print(f"# {POINTS} points, {len(ms)} frames, least of {PASSES} passes: min {ms.min():.2f}, median "
+          f"{np.median(ms):.2f}, 95 of 100 below {np.percentile(ms, 95):.2f} ms; first pass: median {median:.2f} ms; "
           f"{np.mean(iterations):.1f} iterations")  # fmt: skip
-    median = float(np.median(once))
-    return {"fusion_5000_ms": float(np.median(ms)), "fusion_median_ms": median, "fusion_mm": float(np.concatenate(error).mean())}
+    return {"fusion_5000_ms": float(np.median(ms)), "fusion_median_ms": median, "fusion_mm": mm}
 
 
 def _slope(_: Path) -> dict[str, float]:
@@ -195,8 +197,20 @@ def _slope(_: Path) -> dict[str, float]:
     return {"points_slope": float(np.log(times[50000] / times[5000]) / np.log(10.0))}
 
 
+def _surrounded(body: NDArray, room: NDArray) -> NDArray:
+    """The body's pixels (H, W) [m] and the pixels of a room that are nearest to them in the image, nine times as many."""
+    import cv2
+
+    away = cv2.distanceTransform((body == 0.0).astype(np.uint8), cv2.DIST_L2, 5)
+    away[(body > 0.0) | (room == 0.0)] = np.inf
+    count = min(9 * int((body > 0.0).sum()), int(np.isfinite(away).sum()))
+    out, nearest = np.array(body), np.argsort(away, axis=None, kind="stable")[:count]
+    out.flat[nearest] = room.flat[nearest]
+    return out
+
+
 def _background(_: Path) -> dict[str, float]:
-    """What a room behind the body costs in a depth image: the same pixels of the body, with and without it."""
+    """What background costs in a depth image: the same pixels of the body, alone and among nine times as many."""
     from kinefit.observations import DepthFrame
 
     stage = Stage("walk")
@@ -204,7 +218,7 @@ def _background(_: Path) -> dict[str, float]:
     shares = []
     for i in range(1, FEW):
         body, room = stage.depth(i), stage.depth(i, room=True)
-        both = np.where(body > 0.0, body, room)
+        both = _surrounded(body, room)
         shares.append(1.0 - (body > 0.0).sum() / (both > 0.0).sum())
         for kind, image in zip(images, (body, both)):
             images[kind].append(DepthFrame(stage.camera.name, float(stage.motion.times[i]), image))

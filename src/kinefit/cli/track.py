@@ -77,6 +77,7 @@ def run(
     take = read_take(path)
     _results.check_folder(out)
     files: dict[str, Path] = {}
+    notes: list[str] = []
     total = 0
     try:
         with _screen.bars() as step:
@@ -89,6 +90,7 @@ def run(
                 )
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
+            notes.extend(seen.notes)
             motion = replace(motion, provenance=provenance(take, **motion.provenance))
             _results.write_results(motion, out, formats, step, files)
             if overlays:
@@ -103,6 +105,8 @@ def run(
         if files and isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
         raise
+    for note in notes:
+        _screen.say(f"note: {note}")
     print_summary(motion, points=verbose)
     print_files(files)
     if total:

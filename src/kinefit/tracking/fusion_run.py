@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.errors import TrackingError
+from kinefit.errors import KinefitError, TrackingError
+from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion, Residuals
-from kinefit.observations import Frame, KeypointFrame, MarkerFrame
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame
+from kinefit.tracking.depth_start import sized_start
 from kinefit.tracking.fusion import FusionResult, FusionTracker
 from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.subject import Progress
@@ -20,6 +23,25 @@ Steps = Callable[[int], Sequence[Frame]]
 """Number of a step of time -> what the sensors saw then; nothing where none did."""
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
+
+
+@dataclass(frozen=True, eq=False)
+class Sized:
+    """A body of the person's size, the step and state that it was found in, and what there is to tell of it."""
+
+    body: Body
+    start: tuple[int, BodyState] | None = None
+    told: Mapping[str, Any] = field(default_factory=dict)
+
+
+def sized_by_depth(body: Body, frames: Mapping[int, DepthFrame], camera: Camera, up: NDArray) -> Sized:
+    """The body in the size of the person in some depth images, by step; as it is where nobody is found in them."""
+    try:
+        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, up=up)
+    except KinefitError as error:
+        return Sized(body, told={"size": f"not found: {error.problem}"})
+    step, best = max(zip(frames, starts), key=lambda found: found[1].score)
+    return Sized(fit.body, (step, best.state), {"size": dict(zip(fit.names, map(float, fit.factors)))})
 
 
 def run_steps(

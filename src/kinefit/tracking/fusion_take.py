@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies import Body, load_body
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
@@ -20,9 +20,8 @@ from kinefit.readers.take import Take
 from kinefit.readers.video import Video
 from kinefit.tracking.association import choose_people
 from kinefit.tracking.channels import make_channels
-from kinefit.tracking.depth_start import sized_start
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_run import run_steps
+from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.markers import known_markers
 from kinefit.tracking.subject import Progress, fit_subject
@@ -52,7 +51,7 @@ def fuse_take(
     """
     source = FrameSource(take, seen)
     up = np.array(UP_AXES[take.up])
-    found = _Found(load_body(take.body))
+    found = Sized(load_body(take.body))
     if size:
         found = _sized(found.body, take, source, up, progress)
     body = found.body
@@ -69,15 +68,6 @@ def fuse_take(
         tracker, lambda i: source.at(i, body), times, up=take.up, start=found.start, name=take.name,
         provenance=found.told, progress=progress,
     )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A body of the person's size, the step and state that it was found in, and what there is to tell of it."""
-
-    body: Body
-    start: tuple[int, BodyState] | None = None
-    told: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -195,27 +185,23 @@ def _markers(
     return MarkerFrame(sensor, time, names, markers.positions[frame], chosen)
 
 
-def _sized(body: Body, take: Take, source: FrameSource, up: NDArray, progress: Progress | None) -> _Found:
+def _sized(body: Body, take: Take, source: FrameSource, up: NDArray, progress: Progress | None) -> Sized:
     """The body in the person's size: by keypoints of two cameras where there are, else by depth."""
     seen = source.seen
     if len({k.camera for k in seen.keypoints}) >= 2:
         accuracy = [entry.accuracy for entry in take.keypoints]
         channels = make_channels(body, source.rig, seen.keypoints, source.people, accuracy)
         subject = fit_subject(body, channels, height=take.height, progress=progress)
-        return _Found(subject.body, told={"length_std_m": subject.length_std})
+        return Sized(subject.body, told={"length_std_m": subject.length_std})
     if take.height:
         body = body.scaled(np.full(len(body.scale_groups), take.height / body.stature))
     shown = source.first_depth()
     if shown is None:
-        return _Found(body, told={"size": "as told" if take.height else "of the catalogue"})
+        return Sized(body, told={"size": "as told" if take.height else "of the catalogue"})
     video, frames = shown
     if progress:
         progress("size", 0, 1)
-    try:
-        fit, starts = sized_start(body, [f.depth for f in frames.values()], source.rig[video.sensor], up=up)
-    except KinefitError as error:
-        return _Found(body, told={"size": f"not found: {error.problem}"})
+    found = sized_by_depth(body, frames, source.rig[video.sensor], up)
     if progress:
         progress("size", 1, 1)
-    best = max(zip(frames, starts), key=lambda found: found[1].score)
-    return _Found(fit.body, (best[0], best[1].state), {"size": dict(zip(fit.names, map(float, fit.factors)))})
+    return found
