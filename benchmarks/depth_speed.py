@@ -198,7 +198,7 @@ def _slope(_: Path) -> dict[str, float]:
 
 
 def _surrounded(body: NDArray, room: NDArray) -> NDArray:
-    """The body's pixels (H, W) [m] and the pixels of a room that are nearest to them in the image, nine times as many."""
+    """The body's pixels (H, W) [m] and those of a room that are nearest to them in the image, nine times as many."""
     import cv2
 
     away = cv2.distanceTransform((body == 0.0).astype(np.uint8), cv2.DIST_L2, 5)

@@ -12,6 +12,7 @@ from kinefit.images.depth import _NOISE, _image, clean, slope_of
 _BLOCK = 8  # [px] noise is told from about a hundred second differences: their median is right to a tenth
 _REACH = 2  # [px] window of 5 x 5: narrower than a forearm four metres from a camera of 160 x 124 pixels
 _ALIKE = 3.0 * np.sqrt(2.0)  # [standard deviations] the difference of two pixels of one surface that noise explains
+_FINE = 0.002  # [m] noise that no model of a person feels: cylinders are good to a centimetre
 _SUPPORT = 2 * _REACH + 2  # alike in the window, at least: a line of flying pixels along an edge has one less
 
 
@@ -50,7 +51,8 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
 
     What `clean` finds to be flying goes first. Then a pixel becomes the mean of those of its window that differ from it
     by no more than noise explains; surfaces do not mix. One that few others are like, noise and slant allowed for, is
-    on no surface and goes too. An image of scattered pixels, most of them without neighbours, stays as it is.
+    on no surface and goes too. An image with next to no noise stays as it is, and so does one of scattered pixels, most
+    of them without neighbours.
 
     Parameters
     ----------
@@ -68,7 +70,7 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
     sigma = noise_of(depth) if sigma is None else np.asarray(sigma, np.float32)
     noise = np.float32(_ALIKE) * sigma
     seen = depth > 0.0
-    if not seen.any():
+    if not seen.any() or float(np.median(sigma[seen])) < _FINE:
         return depth
     raw, depth = depth, clean(depth, camera, noise=max(float(np.median(noise[seen])), _NOISE))
     if 2 * np.count_nonzero(depth) < np.count_nonzero(seen):

@@ -12,21 +12,25 @@ MOST = 50.0  # measurements that the newest one is weighed against: a sensor tha
 
 @jit
 def learn(
-    depth, rays, camera, low, high, drawn, cell, row, step, variance, gate, wait, told, mean, spread, count, waiting, bound
-):
+    depth, rays, camera, low, high, drawn, cell, row, step, variance, gate, wait, told,
+    mean, spread, count, waiting, bound,
+):  # fmt: skip
     """Learn one image, cell by cell (its upper left pixel), every `step`-th row of cells from `row` on.
 
     depth (H, W) [m], 0 for none; rays, camera as in `gated_points`; low, high (3,) [m]: box that the body may be in;
-    drawn (h, w) at any size: the body's own depth, inf where it and what is about it is not; variance = (a, b): of a
-    depth z, a + b z⁴, where it is not learnt yet; gate: deviations squared; wait: how often a new thing in the box must
-    be seen; told: whether such things may be learnt at all.
-    In place: mean [m], spread [m²] of it, count of measurements (0: not known), waiting: how often a new thing was seen;
-    bound [m]: mean less √gate deviations, what is nearer is something new; inf where nothing is known.
+    drawn (h, w) at any size: inf where neither the body is nor what is about it; variance = (a, b): a + b z⁴ of a depth
+    z, where it is not learnt yet; gate: deviations squared; wait: how often a new thing in the box must be seen; told:
+    whether such things may be learnt at all.
+    In place: mean [m], spread [m²] of it, count of measurements (0: not known), waiting: how often a new thing was
+    seen; bound [m]: mean less √gate deviations: what is nearer is something new; inf where nothing is known.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
     r20, r21, r22 = camera[ROT + 6], camera[ROT + 7], camera[ROT + 8]
     t0, t1, t2 = camera[TRANS], camera[TRANS + 1], camera[TRANS + 2]
+    across, up, along = r20 * (high[0] - low[0]), r21 * (high[1] - low[1]), r22 * (high[2] - low[2])
+    front = t2 + r20 * low[0] + r21 * low[1] + r22 * low[2]  # depth at which the box begins
+    front += (across if across < 0.0 else 0.0) + (up if up < 0.0 else 0.0) + (along if along < 0.0 else 0.0)
     rows, columns = mean.shape
     for i in range(row, rows, step):
         for j in range(columns):
@@ -55,10 +59,17 @@ def learn(
             w = r02 * a + r12 * b + r22 * c
             near = low[0] < x < high[0] and low[1] < y < high[1] and low[2] < w < high[2]
             own = drawn[i * drawn.shape[0] // rows, j * drawn.shape[1] // columns] < math.inf
+            forget = own and z < front  # it hides the body, which may come out behind it at any time
             if near:
-                waiting[i, j] = waiting[i, j] + 1.0 if told and not own else 0.0
-                if waiting[i, j] < wait:
+                may = told and not own
+                waiting[i, j] = waiting[i, j] + 1.0 if may or known else 0.0
+                enough = waiting[i, j] >= wait
+                forget = known and (mean[i, j] < front or enough and not may)  # it has gone: this may be the body
+                if not enough and not forget:
                     continue
+            if forget:
+                count[i, j], waiting[i, j], bound[i, j] = 0.0, 0.0, math.inf
+                continue
             mean[i, j], spread[i, j], count[i, j], waiting[i, j] = z, usual, 1.0, 0.0
             bound[i, j] = z - math.sqrt(gate * usual)
 

@@ -80,7 +80,7 @@ class Background:
         return np.array((0.25, 0.75 / at**4)) * self._sigma**2
 
     def marked(self, depth: NDArray, first: tuple[int, int], last: tuple[int, int]) -> NDArray:
-        """A copy of an image (H, W) [m], negative where it shows what stands still; within rows and columns first..last."""
+        """A copy of an image (H, W) [m], negative where it shows what stands still within first..last (row, column)."""
         out = np.array(depth, np.float32)
         if not self._empty:
             low, high = ((a // self._cell, b // self._cell) for a, b in (first, (last[0] - 1, last[1] - 1)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,59 +10,23 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
-from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.errors import BodyError, ObservationError
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
-from kinefit.rows import AnyRows, ParameterRows
-from kinefit.solvers.equations import Covariance, Equations, inverse, joint_std
-from kinefit.solvers.least_squares import gauss_newton
+from kinefit.solvers.equations import inverse
 from kinefit.tracking._depth_search import Search
 from kinefit.tracking.background import Background
 from kinefit.tracking.cloud_measurement import CloudMeasurement
 from kinefit.tracking.depth_measurement import DepthMeasurement
-from kinefit.tracking.evidence import Evidence
+from kinefit.tracking.fused_fit import FusedFit, FusionResult, Held
 from kinefit.tracking.fusion_search import LEAP, dofs_of_limbs, find_limbs, find_starts
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
-from kinefit.tracking.prediction import Prediction, belief, forgetting
-from kinefit.tracking.surface import Surface
+from kinefit.tracking.prediction import Prediction, forgetting
+
+__all__ = ["FusionResult", "FusionTracker"]
 
 _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than that must be the more certain
-
-
-@dataclass(frozen=True, eq=False)
-class FusionResult:
-    """One tracked frame.
-
-    Parameters
-    ----------
-    time : float [s]
-    state : BodyState
-    dof_std : (6 + D,) [m, rad]
-    joint_std : (S, 3) [m]
-    segment_quality : (S,) in 0..1
-        Share of what the sensors can see of a segment that agrees with them; 0 where they see nothing of it.
-    lost : (S,) bool
-        Segments that what was measured speaks against.
-    hidden : (S,) bool
-        Segments that no sensor sees: held by the prediction and the prior alone.
-    iterations : int
-    """
-
-    time: float
-    state: BodyState
-    dof_std: NDArray
-    joint_std: NDArray
-    segment_quality: NDArray
-    lost: NDArray
-    hidden: NDArray
-    iterations: int
-
-    @property
-    def quality(self) -> float:
-        """Mean quality of all segments, in 0..1."""
-        return float(np.mean(self.segment_quality))
 
 
 class FusionTracker:
@@ -92,7 +55,7 @@ class FusionTracker:
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
         self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
         self.settings = settings or FusionSettings()
-        self.accuracy, self._bare = dict(accuracy or {}), frozenset(on_body)
+        self.accuracy = dict(accuracy or {})
         bad = [f"{name}: {value}" for name, value in self.accuracy.items() if not 0.0 < value < np.inf]
         if bad:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
@@ -100,17 +63,14 @@ class FusionTracker:
         self._last: FusionResult | None = None
         self._time: float | None = None
         self._sought = self._lost_since = -np.inf
-        self._backgrounds: dict[str, Background] = {}
+        self._backgrounds: dict[str, Background | None] = dict.fromkeys(on_body)
         self._wear(body)
 
     def _wear(self, body: Body) -> None:
         s = self.settings
         self.body = body
-        self.surface = Surface(body, s.samples) if body.surfaces else None
-        self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
-        self._seen = np.full(len(body.tree.segments), -1e9)
-        self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
-        self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
+        self._fit = FusedFit(body, self.rig, self.rate, self.accuracy, s, self._backgrounds)
+        self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
         self._prediction = Prediction(
             body, 1.0 / self.rate, angle_acceleration=s.angle_acceleration, root_acceleration=s.root_acceleration,
             memory=s.velocity_memory,
@@ -135,24 +95,23 @@ class FusionTracker:
         if np.shape(depth) != camera.size[::-1]:
             problem = f"a background of shape {np.shape(depth)}, camera {sensor} has {camera.size}"
             raise ObservationError(problem, remedy="Give an image of this camera.")
-        background = self._background(camera, self.accuracy.get(sensor, self.settings.depth))
+        background = self._fit.background(camera)
         if background is not None:
             background.know(depth)
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
         if len(state.angles) != len(self.body.tree.coordinates):
-            problem = f"a state of {len(state.angles)} angles, body '{self.body.name}' has {len(self.body.tree.coordinates)}"
+            problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
 
     def backwards(self, state: BodyState) -> FusionTracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
         out = FusionTracker(
-            self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, on_body=self._bare,
-            settings=self.settings,
-        )  # fmt: skip
-        out._backgrounds = self._backgrounds
+            self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings
+        )
+        out._backgrounds.update(self._backgrounds)
         out.start_at(state)
         return out
 
@@ -162,8 +121,8 @@ class FusionTracker:
         self._wear(body)
         if before.state is not None:
             state = carry_state(before.state, old, body)
-            std, velocity = (carry_dofs(v, old, body, missing=m) for v, m in ((before.std, np.inf), (before.velocity, 0)))
-            self._prediction.go_on(state, std, velocity)
+            std = carry_dofs(before.std, old, body, missing=np.inf)
+            self._prediction.go_on(state, std, carry_dofs(before.velocity, old, body))
         self._last = None
 
     def update(self, frames: Sequence[Frame], time: float | None = None) -> FusionResult | None:
@@ -190,11 +149,13 @@ class FusionTracker:
         steps = self._steps(time)
         if steps is None:
             return self._last
-        result, measurements = None, []
+        result: FusionResult | None = None
+        measurements: list[Measurement] = []
         if self._prediction.state is not None:
             held = self._prediction.ahead(steps)
-            measurements = self._measurements(frames, held[0])
-            result = self._take(time, *self._fit(held[0], held, measurements), measurements)
+            measurements = self._fit.measurements(frames, held[0])
+            result, posterior = self._fit.run(time, held[0], held, measurements)
+            self._take(result.state, posterior)
         result = self._recovered(time, frames, measurements, result)
         self._last = result
         if result is not None:
@@ -219,87 +180,12 @@ class FusionTracker:
         self.dropped += max(round(steps) - 1, 0)
         return min(steps, 10.0)
 
-    def _measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
-        s, out = self.settings, []
-        vertices = self.surface.posed(state) if self.surface else None
-        for frame in frames:
-            name = frame.sensor
-            if isinstance(frame, KeypointFrame):
-                out.append(KeypointMeasurement(frame, self.body, self.rig, self.accuracy.get(name, s.pixel)))
-            elif isinstance(frame, MarkerFrame):
-                out.append(MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker)))
-            else:
-                if self.surface is None or vertices is None:
-                    Surface(self.body, s.samples)  # tells what is missing
-                sigma = self.accuracy.get(name, s.depth)
-                if isinstance(frame, DepthFrame):
-                    camera = self.rig[name]
-                    out.append(DepthMeasurement(frame, camera, self.surface, vertices, sigma, s, self._background(camera, sigma)))
-                else:
-                    out.append(CloudMeasurement(frame, self.surface, vertices, sigma, s))
-        return out
-
-    def _background(self, camera: Camera, sigma: float) -> Background | None:
-        wait = self.settings.background * self.rate
-        if not np.isfinite(wait) or camera.name in self._bare:
-            return None
-        if camera.name not in self._backgrounds:
-            self._backgrounds[camera.name] = Background(camera, sigma, max(round(wait), 2))
-        return self._backgrounds[camera.name]
-
-    def _rows(
-        self, state: BodyState, held: tuple[BodyState, NDArray] | None, measurements: list[Measurement], bound: float
-    ) -> list[AnyRows]:
-        parts = [rows for m in measurements for rows in m.rows(state, bound)]
-        if held is not None:
-            parts.append(belief(state, *held))
-        usual = self.body.tree.usual
-        parts.append(ParameterRows(self._prior, (usual - state.angles)[self._prior - 6], self._prior_weight))
-        if self._pairs is not None:
-            s = self.settings
-            parts.append(collision_rows(self.body, state, pairs=self._pairs, margin=-s.flesh, sigma=s.collision))
-        return parts
-
-    def _fit(
-        self, state: BodyState, held: tuple[BodyState, NDArray] | None, measurements: list[Measurement],
-        far: float | None = None,
-    ) -> tuple[BodyState, Equations, int]:  # fmt: skip
-        s, bound = self.settings, self.settings.far if far is None else far
-        for iteration in range(1, s.iterations + 1):
-            loss = replace(s.loss, scale=s.loss.scale * bound / s.near)  # far points pull too, while all is far off
-            step = gauss_newton(self.body, state, self._rows(state, held, measurements, bound), loss=loss)
-            state = step.state
-            gain = float(step.delta @ step.equations.gradient)  # twice the fall of the cost: squared deviations
-            if gain < s.tolerance**2 * len(step.delta) and bound <= s.near:
-                break
-            bound = max(bound * s.shrink, s.near)
-        return state, step.equations, iteration
-
-    def _take(
-        self, time: float, state: BodyState, equations: Equations, iterations: int, measurements: list[Measurement]
-    ) -> FusionResult:
+    def _take(self, state: BodyState, posterior: NDArray) -> None:
         """Go on from a fit that took its prediction into account."""
-        posterior = inverse(equations.matrix)
         self._prediction.correct(state, posterior)
         chart = off_the_limits(self.body.tree, state.angles)
         if chart is not None:
             self._prediction.change_chart(*chart)
-        return self._result(time, state, posterior, iterations, measurements)
-
-    def _result(
-        self, time: float, state: BodyState, posterior: NDArray, iterations: int, measurements: list[Measurement]
-    ) -> FusionResult:
-        told = self._judged(state, measurements)
-        cov = Covariance(posterior, np.empty((len(posterior), 0)))
-        std = np.sqrt(np.maximum(np.diag(posterior), 0.0))
-        joints = joint_std(self.body, state, cov)
-        return FusionResult(time, state, std, joints, told.quality, told.lost, told.hidden, iterations)
-
-    def _judged(self, state: BodyState, measurements: list[Measurement]) -> Evidence:
-        told = Evidence.none(len(self.body.tree.segments))
-        for m in measurements:
-            told = told + m.evidence(state)
-        return told
 
     def _recovered(
         self, time: float, frames: Sequence[Frame], measurements: list[Measurement], result: FusionResult | None
@@ -308,12 +194,12 @@ class FusionTracker:
         s = self.settings
         if result is not None:
             seek = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
-            self._seen[~seek] = time
+            self._good[~seek] = time
             if not seek.any():
                 self._lost_since = time
                 return result
         waited = result is None or time - self._lost_since >= s.search_after
-        if not s.search or not waited or time - self._sought < s.search_every:
+        if not s.search or not waited or time - self._sought < s.search_every - 0.25 / self.rate:
             return result
         self._sought = time
         if result is None or result.lost[0] or result.quality < s.poor:
@@ -329,7 +215,7 @@ class FusionTracker:
             found = self._fitted(time, frames, state, held)
             value = search.score.of(found.state) - LEAP * _against(found.state, measurements)
             surfaces = [m for m in measurements if isinstance(m, DepthMeasurement | CloudMeasurement)]
-            seen = not (self._judged(found.state, surfaces).hidden & seek).any()  # else it would hide, not be found
+            seen = not (self._fit.judged(found.state, surfaces).hidden & seek).any()  # else it would hide, not be found
             if seen and value > max(best, now + least * self._leap(time, result, found, seek)):
                 best, result, self._lost_since = value, found, time
                 self._prediction.go_on(found.state, found.dof_std, np.where(free, 0.0, self._prediction.velocity))
@@ -337,7 +223,7 @@ class FusionTracker:
 
     def _leap(self, time: float, old: FusionResult, new: FusionResult, seek: NDArray) -> float:
         """How much faster than usual a limb would have moved since it was last seen where it was, 1 at least."""
-        elapsed = time - float(self._seen[seek].min())
+        elapsed = time - float(self._good[seek].min())
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)
         return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)
@@ -352,11 +238,9 @@ class FusionTracker:
         return result
 
     def _fitted(
-        self, time: float, frames: Sequence[Frame], state: BodyState, held: tuple[BodyState, NDArray] | None
+        self, time: float, frames: Sequence[Frame], state: BodyState, held: Held | None
     ) -> FusionResult:
-        measurements = self._measurements(frames, state)
-        fitted, equations, count = self._fit(state, held, measurements)
-        return self._result(time, fitted, inverse(equations.matrix), count, measurements)
+        return self._fit.run(time, state, held, self._fit.measurements(frames, state))[0]
 
 
 def _against(state: BodyState, measurements: list[Measurement]) -> float:

@@ -127,8 +127,8 @@ def _known_points(body: Body, rig: Rig, frames: Sequence[Frame]) -> tuple[PointS
         for camera, frame in views.items():
             for name, pixel, trust in zip(frame.names, frame.uv, frame.confidence):
                 if name in known.names:
-                    k = known.names.index(name), rig.index(camera)
-                    uv[k], confidence[k] = pixel, trust
+                    at = known.names.index(name), rig.index(camera)
+                    uv[at], confidence[at] = pixel, trust
         if len(views) > 1:
             found = triangulate_robust(rig, uv, confidence, max_residual_px=_AGREE)[0]
             for k in np.flatnonzero(np.isfinite(found).all(axis=1)):

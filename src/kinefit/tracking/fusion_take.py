@@ -14,7 +14,16 @@ from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
 from kinefit.motion import UP_AXES, Motion
-from kinefit.observations import DepthFrame, DepthVideo, Frame, KeypointFrame, Keypoints, MarkerFrame, Markers
+from kinefit.observations import (
+    CloudVideo,
+    DepthFrame,
+    DepthVideo,
+    Frame,
+    KeypointFrame,
+    Keypoints,
+    MarkerFrame,
+    Markers,
+)
 from kinefit.readers.load import Observations
 from kinefit.readers.take import Take
 from kinefit.readers.video import Video
@@ -117,7 +126,8 @@ class FrameSource:
             raise TakeError(problem, file=take.path, place=f"stereo {entry.name}", remedy="Add it to the [[camera]].")
         near, far = entry.range
         try:
-            rectifier = StereoRectifier(seen.rig[entry.left], seen.rig[entry.right], near=near, far=far, name=entry.name)
+            left, right = seen.rig[entry.left], seen.rig[entry.right]
+            rectifier = StereoRectifier(left, right, near=near, far=far, name=entry.name)
         except KinefitError as error:
             raise CalibrationError(error.problem, file=take.path, place=error.place, remedy=error.remedy) from error
         both = _Stereo(rectifier, Video(seen.videos[entry.left]), Video(seen.videos[entry.right]))
@@ -145,10 +155,11 @@ class FrameSource:
         """Frames of step `i` of the take; of keypoints the person that is followed."""
         seen, out = self.seen, list[Frame]()
         step = seen.frames[0] + i
-        for video in (*self.depth, *seen.clouds):
-            k = video.at_step(step, seen.rate)
+        recordings: tuple[DepthVideo | CloudVideo, ...] = (*self.depth, *seen.clouds)
+        for recording in recordings:
+            k = recording.at_step(step, seen.rate)
             if k is not None:
-                out.append(video.frame(k))
+                out.append(recording.frame(k))
         for keypoints, people in zip(seen.keypoints, self.people):
             frame = self._keypoints(keypoints, people, i, step / seen.rate)
             if frame is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -11,9 +12,9 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels, targets
 from kinefit.geometry.camera import Rig
 from kinefit.observations import KeypointFrame, MarkerFrame
-from kinefit.rows import AnyRows
-from kinefit.tracking.evidence import SHOWN, Evidence
+from kinefit.rows import AnyRows, Rows
 from kinefit.tracking._depth_view import DepthView
+from kinefit.tracking.evidence import SHOWN, Evidence
 
 _AGREES = 3.0  # standard deviations
 _AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
@@ -23,7 +24,7 @@ class Measurement(Protocol):
     """What one sensor saw at one time, ready to make rows."""
 
     sensor: str
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    def rows(self, state: BodyState, bound: float) -> Sequence[AnyRows]:
         """Rows at a state; `bound` [m] within which correspondences are sought."""
         ...
 
@@ -58,7 +59,7 @@ class KeypointMeasurement:
         self._camera = np.full(len(here), rig.index(frame.sensor))
         self._weight = np.ascontiguousarray(frame.confidence[here]) / sigma**2
 
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows]:
         """Two rows a keypoint."""
         camera, uv, weight = self._camera, self.uv, self._weight
         fill = _kernels.pixel_rows
@@ -67,7 +68,7 @@ class KeypointMeasurement:
     def square(self, state: BodyState) -> NDArray:
         """(K,) squared distances in the image, in variances."""
         rows = self.rows(state, 0.0)[0]
-        return np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))  # type: ignore[union-attr]
+        return np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))
 
     def evidence(self, state: BodyState) -> Evidence:
         """A keypoint speaks for its segment within three standard deviations, and against it beyond."""
@@ -97,7 +98,7 @@ class MarkerMeasurement:
         self.x_world = np.ascontiguousarray(frame.positions[here])
         self._weight = np.full(len(here), 1.0 / sigma**2)
 
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows]:
         """Three rows a marker."""
         return [targets.fill(_kernels.point_rows, 3, self._body, state, self.points, self.x_world, self._weight)]
 

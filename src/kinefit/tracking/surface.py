@@ -38,7 +38,8 @@ class Surface:
 
     def __init__(self, body: Body, count: int) -> None:
         if not body.surfaces:
-            raise BodyError(f"body '{body.name}' has no surfaces", remedy="Depth needs some; see the catalogue's bodies.")
+            remedy = "Depth needs some; see the catalogue's bodies."
+            raise BodyError(f"body '{body.name}' has no surfaces", remedy=remedy)
         self.body, self.mesh = body, body_mesh(body)
         points, normals, segment = sample(body, count)
         self.samples = SurfaceSamples(segment, points.T, normals.T)
