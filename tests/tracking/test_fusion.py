@@ -434,7 +434,7 @@ def test_no_garbage_makes_a_result_that_is_not_finite(data):
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-6)
 
 
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(st.data())
 def test_no_garbage_stops_a_search(data):
     tracker = a_tracker(start=None, settings=FusionSettings())

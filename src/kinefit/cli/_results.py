@@ -79,7 +79,7 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 def write_overlays(
     motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
 ) -> None:
-    """Write an overlay video of every camera and depth sensor, and a picture of all; enter what is there into `files`."""
+    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
     from kinefit.exporters.overlay import nearest_frame
     from kinefit.readers.video import Video

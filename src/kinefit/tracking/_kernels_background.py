@@ -64,7 +64,7 @@ def learn(
                 may = told and not own
                 waiting[i, j] = waiting[i, j] + 1.0 if may or known else 0.0
                 enough = waiting[i, j] >= wait
-                forget = known and (mean[i, j] < front or enough and not may)  # it has gone: this may be the body
+                forget = known and (mean[i, j] < front or (enough and not may))  # it has gone: this may be the body
                 if not enough and not forget:
                     continue
             if forget:

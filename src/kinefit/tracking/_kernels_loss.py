@@ -35,8 +35,8 @@ def judge(front, behind, owner, depth, across, down, focal, slack, constant, qua
     """Count every segment's foremost pixels by what was measured there.
 
     depth (H, W) [m], 0 for none, negative where it is known to be something else's, `across` and `down` times as wide
-    and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the pixel or at one of four that are `slack`
-    beside it at that depth; focal [px] of the full image.
+    and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the
+    pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image.
     """
     height, width = depth.shape
     for v in range(front.shape[0]):

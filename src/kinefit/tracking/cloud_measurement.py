@@ -17,6 +17,8 @@ from kinefit.tracking.fusion_search import camera_at
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.surface import Surface
 
+_PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
+
 
 class CloudMeasurement:
     """Points on some surface, on the body, or on one segment of it (P2 2.3), towards the body's surface.
@@ -44,7 +46,8 @@ class CloudMeasurement:
             x = x[((x > low) & (x < high)).all(axis=1)]
         every = max(len(x) // settings.points, 1)
         self._points = np.ascontiguousarray(x[::every])
-        patches = len(np.unique(np.floor(self._points / settings.patch).astype(np.int64), axis=0))
+        cells = np.floor(np.clip(self._points, -1e6, 1e6) / settings.patch).astype(np.int64)
+        patches = len(np.unique(cells @ _PRIMES))
         self._point_sigma = sigma * np.sqrt(max(len(self._points) / max(patches, 1), 1.0))
 
     def rows(self, state: BodyState, bound: float) -> list[Rows]:

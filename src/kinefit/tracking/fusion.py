@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
-from kinefit.errors import BodyError, ObservationError
+from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.solvers.equations import inverse
@@ -146,6 +147,14 @@ class FusionTracker:
             A camera, segment or keypoint set that is not known.
         """
         time = _time_of(frames, time)
+        before = self._time, self._sought, self._lost_since, self.dropped, copy(self._prediction)
+        try:
+            return self._updated(frames, time)
+        except KinefitError:  # as if they had never come
+            self._time, self._sought, self._lost_since, self.dropped, self._prediction = before
+            raise
+
+    def _updated(self, frames: Sequence[Frame], time: float) -> FusionResult | None:
         steps = self._steps(time)
         if steps is None:
             return self._last

@@ -52,7 +52,7 @@ class KeypointMeasurement:
 
     def __init__(self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float) -> None:
         self.sensor, self._body, self._packed = frame.sensor, body, rig.packed
-        seen = np.isfinite(frame.uv).all(axis=1) & (frame.confidence > 0)
+        seen = np.isfinite(frame.uv).all(axis=1) & (frame.confidence > 0) & (frame.confidence < np.inf)
         known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
         self.points, here = _known(known, frame.names, seen)
         self.uv = np.ascontiguousarray(frame.uv[here])
