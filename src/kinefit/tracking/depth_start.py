@@ -26,7 +26,7 @@ from kinefit.tracking.depth_shape import SurfaceFit, fit_surfaces
 
 _GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m; and half
 # of it, for those who stand by a table or a wall: people are then still closed, a pixel is some centimetres wide
-_SAME = 0.65  # overlap of two outlines of one person: an upper body that lacks both arms has 0.7 of its skin (rule of nines)
+_SAME = 0.65  # overlap of two outlines of one person: an upper body without both arms keeps 0.7 (rule of nines)
 _FLAT = 0.015  # [m] deviation from a plane, of a wall; a person who faces the sensor, arms down, has 0.02 or more
 _GOOD = 0.7  # score of a pose that needs no second attempt: right ones of rendered bodies have 0.73 to 0.9
 _MOST = 3  # largest things in view that are tried
