@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import ROT, TRANS
 
@@ -43,3 +45,15 @@ def soften(data, scale):
     for i in range(data.shape[1]):
         q = 1.0 + data[6, i] * data[6, i] * inverse
         data[7, i] /= q * q
+
+
+@jit
+def box(x, out):
+    """Least and largest coordinates (2, 3) of points (N, 3)."""
+    for k in range(3):
+        low, high = math.inf, -math.inf
+        for i in range(x.shape[0]):
+            v = x[i, k]
+            low = v if v < low else low
+            high = v if v > high else high
+        out[0, k], out[1, k] = low, high

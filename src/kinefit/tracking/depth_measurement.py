@@ -55,7 +55,9 @@ class DepthMeasurement:
             frame.sensor, camera, surface, sigma, settings,
         )  # fmt: skip
         self._raw, self._background = frame.depth, background
-        self._low, self._high = vertices.min(axis=0) - settings.reach, vertices.max(axis=0) + settings.reach
+        box = np.empty((2, 3))
+        kernels.box(vertices, box)
+        self._low, self._high = box[0] - settings.reach, box[1] + settings.reach
         first, last, self._back = self._window()
         self._depth = frame.depth if background is None else background.marked(frame.depth, first, last)
         self._shown = surface.depth(vertices, camera)
@@ -132,6 +134,7 @@ class DepthMeasurement:
     def evidence(self, state: BodyState) -> Evidence:
         """Pixels for and against each segment; see `judge_segments`."""
         layers, vertices = self.surface.layers(self.camera), self.surface.posed(state)
+        self.surface.judged = state
         return judge_segments(vertices, layers, self._depth, self.camera, noise=(self.sigma / 2.0, 0.0)).evidence
 
     def view(self) -> DepthView | None:
@@ -144,5 +147,8 @@ class DepthMeasurement:
     def learn(self, state: BodyState, sure: bool) -> None:
         """Let the background learn from the image, with the body where it was found."""
         if self._background is not None:
-            shown = self.surface.depth(self.surface.posed(state), self.camera)
+            if self.surface.judged is state:  # drawn already
+                shown = self.surface.layers(self.camera).front
+            else:
+                shown = self.surface.depth(self.surface.posed(state), self.camera)
             self._background.learn(self._raw, shown, (self._low, self._high), sure)

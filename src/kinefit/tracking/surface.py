@@ -29,6 +29,7 @@ class Surface:
     samples : SurfaceSamples
     mesh : BodyMesh
     areas : (S,) [m²] of each segment
+    judged : the state that was drawn segment by segment last, in all cameras
 
     Raises
     ------
@@ -46,6 +47,7 @@ class Surface:
         corners = self.mesh.vertices[self.mesh.faces]
         twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         self.areas = 0.5 * np.bincount(self.mesh.face_segment, twice, len(body.tree.segments))
+        self.judged: BodyState | None = None
         self._posed: tuple[BodyState, NDArray] | None = None
         self._canvases: dict[Camera, Canvas] = {}
         self._layers: dict[Camera, Layers] = {}
