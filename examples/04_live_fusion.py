@@ -37,7 +37,8 @@ def main(frames=30, seed=0):
         x = person.body.positions(result.state, points)
         errors.append(np.linalg.norm(x - truth.positions(points)[i], axis=1).mean())
         lost = [person.body.tree.segments[s] for s in np.flatnonzero(result.lost)]
-        print(f"{result.time:5.2f} s  quality {result.quality:.2f}  error {1e3 * errors[-1]:4.1f} mm  lost: {lost or '-'}")
+        error = 1e3 * errors[-1]
+        print(f"{result.time:5.2f} s  quality {result.quality:.2f}  error {error:4.1f} mm  lost: {lost or None}")
     return float(np.mean(errors)), tracker
 
 
