@@ -88,9 +88,9 @@ def run(
                     take, smooth=smooth, contacts=contacts,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
+                notes.extend(seen.notes)
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
-            notes.extend(seen.notes)
             motion = replace(motion, provenance=provenance(take, **motion.provenance))
             _results.write_results(motion, out, formats, step, files)
             if overlays:

@@ -63,16 +63,16 @@ def denoised(depth: NDArray, camera: Camera, sigma: NDArray | None = None) -> ND
 
     Returns
     -------
-    (H, W) float32 [m], 0 where there is nothing
+    (H, W) [m], 0 where there is nothing; not rounded to float32 where it stays as it is
     """
-    depth = _image(depth, camera)
-    depth = np.where((depth > 0.0) & (depth < np.inf), depth, np.float32(0.0))
+    given, depth = np.asarray(depth), _image(depth, camera)
+    seen = (depth > 0.0) & (depth < np.inf)
+    raw, depth = np.where(seen, given, 0.0), np.where(seen, depth, np.float32(0.0))
     sigma = noise_of(depth) if sigma is None else np.asarray(sigma, np.float32)
     noise = np.float32(_ALIKE) * sigma
-    seen = depth > 0.0
     if not seen.any() or float(np.median(sigma[seen])) < _FINE:
-        return depth
-    raw, depth = depth, clean(depth, camera, noise=max(float(np.median(noise[seen])), _NOISE))
+        return raw
+    depth = clean(depth, camera, noise=max(float(np.median(noise[seen])), _NOISE))
     if 2 * np.count_nonzero(depth) < np.count_nonzero(seen):
         return raw
     surface = np.maximum(noise, np.float32(slope_of(camera)) * depth)
