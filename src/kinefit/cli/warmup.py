@@ -21,15 +21,38 @@ def warmup(verbose: bool) -> None:
     """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
     begin = perf_counter()
     with _screen.bars() as step:
-        step("compiling", 0, 1)
+        step("compiling", 0, 2)
         from kinefit._jit import cache_directory
-        from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-        from kinefit.tracking.video import track
 
-        motion = cut(squat_and_wave(), 0, 4)
-        rig = studio_rig(motion)
-        track(rig, simulate_keypoints(motion, rig, "BODY_25B"), motion.body, up=motion.up)
-        step("compiling", 1, 1)
+        _video()
+        step("compiling", 1, 2)
+        _depth()
+        step("compiling", 2, 2)
     kept = cache_directory() / "kernels"
     where = f"the kernels lie in {kept}" if kept.is_dir() else f"none can be kept in {kept}: set KINEFIT_CACHE"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
+
+
+def _video() -> None:
+    from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+    from kinefit.tracking.video import track
+
+    motion = cut(squat_and_wave(), 0, 4)
+    rig = studio_rig(motion)
+    track(rig, simulate_keypoints(motion, rig, "BODY_25B"), motion.body, up=motion.up)
+
+
+def _depth() -> None:
+    """With no pose given, so that the search for the start is compiled too."""
+    from kinefit.geometry.camera import Rig
+    from kinefit.motion import UP_AXES
+    from kinefit.observations import DepthFrame
+    from kinefit.simulation import KINECT, cut, in_front, simulate_depth, squat_and_wave
+    from kinefit.tracking.fusion import FusionTracker
+
+    motion = cut(squat_and_wave(), 0, 3)
+    camera = in_front(motion, KINECT.camera(name="kinect"), near=KINECT.near, far=KINECT.far)
+    video = simulate_depth(motion, camera, KINECT)
+    tracker = FusionTracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
+    for i in range(len(motion)):
+        tracker.update([DepthFrame("kinect", motion.times[i], video.frame(i).depth)])
