@@ -11,6 +11,7 @@ from importlib import resources
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.cli.stopping import STOPPABLE
 
 import kinefit
 from kinefit.cli import main
@@ -256,7 +257,8 @@ def test_ctrl_c_keeps_the_frames_that_are_done(take, tmp_path):
         np.save(path, np.tile(np.load(path), (200, 1, 1)))
     out = tmp_path / "out"
     ours, theirs = pty.openpty()  # a terminal, on which progress is shown while it happens
-    args = [sys.executable, "-c", "from kinefit.cli import main; main()", "track", str(take), "--out", str(out)]
+    command = STOPPABLE + "from kinefit.cli import main; main()"
+    args = [sys.executable, "-c", command, "track", str(take), "--out", str(out)]
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "1"}
     process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=theirs, env=environment)
     os.close(theirs)

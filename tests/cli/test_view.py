@@ -11,6 +11,7 @@ import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from tests.cli.stopping import STOPPABLE
 from tests.viewers.recordings import write_take
 
 from kinefit.cli.view import gather, view
@@ -103,7 +104,7 @@ def test_two_takes_are_too_many(folder):
 
 
 def test_it_serves_until_it_is_stopped(folder):
-    command = "import sys; from kinefit.cli.view import view; view(sys.argv[1:])"
+    command = STOPPABLE + "import sys; from kinefit.cli.view import view; view(sys.argv[1:])"
     args = [sys.executable, "-c", command, str(folder / "take-kinefit"), "--no-browser", "--port", "0"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:

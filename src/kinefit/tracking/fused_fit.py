@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.solvers.equations import Covariance, inverse, joint_std
 from kinefit.solvers.least_squares import gauss_newton
@@ -20,6 +20,7 @@ from kinefit.tracking.cloud_measurement import CloudMeasurement
 from kinefit.tracking.depth_measurement import DepthMeasurement
 from kinefit.tracking.evidence import Evidence
 from kinefit.tracking.fusion_settings import FusionSettings
+from kinefit.tracking.in_sight import beside
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import belief
 from kinefit.tracking.surface import Surface
@@ -88,12 +89,13 @@ class FusedFit:
 
     def measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
         """What the sensors saw, ready to make rows about a state."""
-        return [self._measurement(frame, state) for frame in frames]
+        return [self._measurement(frame, frames, state) for frame in frames]
 
-    def _measurement(self, frame: Frame, state: BodyState) -> Measurement:
+    def _measurement(self, frame: Frame, frames: Sequence[Frame], state: BodyState) -> Measurement:
         s, name = self.settings, frame.sensor
         if isinstance(frame, KeypointFrame):
-            return KeypointMeasurement(frame, self.body, self.rig, self.accuracy.get(name, s.pixel))
+            accuracy = self.accuracy.get(name, s.pixel)
+            return KeypointMeasurement(frame, self.body, self.rig, accuracy, self._beside(frame, frames, state))
         if isinstance(frame, MarkerFrame):
             return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
@@ -102,6 +104,18 @@ class FusedFit:
             return CloudMeasurement(frame, surface, vertices, sigma, s)
         camera = self.rig[name]
         return DepthMeasurement(frame, camera, surface, vertices, sigma, s, self.background(camera))
+
+    def _beside(
+        self, frame: KeypointFrame, frames: Sequence[Frame], state: BodyState
+    ) -> tuple[DepthFrame, Camera, float] | None:
+        """A depth frame whose camera sees the body from about the same side, with its accuracy."""
+        depths = [f for f in frames if isinstance(f, DepthFrame)]
+        cameras = [self.rig[f.sensor] for f in depths]
+        near = beside(self.rig[frame.sensor], cameras, state.T_world_root[:3, 3])
+        if not near:
+            return None
+        chosen = depths[near[0]]
+        return chosen, cameras[near[0]], self.accuracy.get(chosen.sensor, self.settings.depth)
 
     def _rows(
         self, state: BodyState, held: Held | None, measurements: Sequence[Measurement], bound: float

@@ -256,7 +256,7 @@ def _against(state: BodyState, measurements: list[Measurement]) -> float:
     """How many keypoints and markers a state does not agree with; half for one that is ten deviations off."""
     points = [m for m in measurements if isinstance(m, KeypointMeasurement | MarkerMeasurement)]
     square = [m.square(state) for m in points]
-    return sum(float(np.sum(s / (s + 100.0))) for s in square)
+    return sum(float(np.sum(1.0 - 100.0 / (s + 100.0))) for s in square)
 
 
 def _better(new: FusionResult, old: FusionResult) -> bool:

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels, targets
-from kinefit.geometry.camera import Rig
-from kinefit.observations import KeypointFrame, MarkerFrame
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.tracking._depth_view import DepthView
 from kinefit.tracking.evidence import SHOWN, Evidence
+from kinefit.tracking.in_sight import SEEN, THICK, InSight
 
 _AGREES = 3.0  # standard deviations
 _AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
@@ -43,6 +44,7 @@ class KeypointMeasurement:
     Parameters
     ----------
     sigma : float [px] standard deviation of a keypoint with confidence 1.
+    depth : a depth frame of the same time, its camera beside this one, and its standard deviation [m], optional.
 
     Raises
     ------
@@ -50,7 +52,10 @@ class KeypointMeasurement:
         A keypoint set that the body does not have, a camera that the rig does not have.
     """
 
-    def __init__(self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float) -> None:
+    def __init__(
+        self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float,
+        depth: tuple[DepthFrame, Camera, float] | None = None,
+    ) -> None:  # fmt: skip
         self.sensor, self._body, self._packed = frame.sensor, body, rig.packed
         seen = np.isfinite(frame.uv).all(axis=1) & (frame.confidence > 0) & (frame.confidence < np.inf)
         known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
@@ -58,17 +63,27 @@ class KeypointMeasurement:
         self.uv = np.ascontiguousarray(frame.uv[here])
         self._camera = np.full(len(here), rig.index(frame.sensor))
         self._weight = np.ascontiguousarray(frame.confidence[here]) / sigma**2
+        self._shown = np.flatnonzero(frame.confidence[here] >= SEEN)
+        shown = self.points.select(tuple(self.points.names[k] for k in self._shown))
+        self._sight = None if depth is None or not len(shown) else InSight(body, shown, *depth)
 
     def rows(self, state: BodyState, bound: float) -> list[Rows]:
-        """Two rows a keypoint."""
+        """Two rows a keypoint; one more where it lies too deep behind what was measured before it."""
+        rows = [self._pixels(state)]
+        return rows if self._sight is None else [*rows, self._sight.rows(state)]
+
+    def _pixels(self, state: BodyState) -> Rows:
         camera, uv, weight = self._camera, self.uv, self._weight
         fill = _kernels.pixel_rows
-        return [targets.fill(fill, 2, self._body, state, self.points, self._packed, camera, uv, weight)]
+        return targets.fill(fill, 2, self._body, state, self.points, self._packed, camera, uv, weight)
 
     def square(self, state: BodyState) -> NDArray:
-        """(K,) squared distances in the image, in variances."""
-        rows = self.rows(state, 0.0)[0]
-        return np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))
+        """(K,) squared distances in the image, in variances; inf for those that could not be seen where they are."""
+        rows = self._pixels(state)
+        square = np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))
+        if self._sight is not None:
+            square[self._shown[self._sight.behind(state) > THICK]] = np.inf
+        return square
 
     def evidence(self, state: BodyState) -> Evidence:
         """A keypoint speaks for its segment within three standard deviations, and against it beyond."""
