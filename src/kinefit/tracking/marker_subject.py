@@ -1,0 +1,317 @@
+"""Who wears the markers: a body's size and where each marker sits on it, from one or several trials, all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.errors import ObservationError, TrackingError
+from kinefit.observations import Markers
+from kinefit.solvers.losses import Loss, geman_mcclure
+from kinefit.solvers.marker_shape import MarkerShape, fit_marker_shape, marker_parameters
+from kinefit.solvers.sequence import fit_sequence
+from kinefit.tracking.initialise import pose_from_points
+from kinefit.tracking.placement import Placement, find_placement
+
+Progress = Callable[[str, int, int], None]
+
+SOFT = 0.005
+"""[m] how far a marker moves on its segment along each axis, before a trial tells (skin: Leardini et al. 2005)."""
+
+LOSS = geman_mcclure(5.0)
+"""Of a marker: three residuals in one, which are 1.7 standard deviations long on average."""
+
+POSTURE = 0.01
+"""Share of the posture prior in a frame's fit: enough to decide what the markers leave open."""
+
+_LEAST = 0.005  # [m] no marker is held to be better fixed than this
+_INDEPENDENT = 2.0
+_POSTURES = 40  # random ones, in which the generic body's distances are looked up
+_ROUNDS = 3  # of calibration: poses of the whole trial, frames chosen anew, shape
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSubject:
+    """A body of the subject's size that wears its markers.
+
+    Parameters
+    ----------
+    body : Body, scaled; its marker set `marker_set` holds the K markers at the subject's own places.
+    marker_set : str
+    scales : (G,) of the generic body.
+    scale_std : (G,) standard deviation of each.
+    sigma : (K,) [m] how far each marker moved on its segment, along each axis.
+    moved : (K,) [m] how far each marker was found from where the set has it; far ones may be mislabelled.
+    rms : float [m] of all residuals (lengths) of the frames used, outliers left out.
+    frames : how many were used.
+    """
+
+    body: Body
+    marker_set: str
+    scales: NDArray
+    scale_std: NDArray
+    sigma: NDArray
+    moved: NDArray
+    rms: float
+    frames: int
+
+    @property
+    def points(self) -> PointSet:
+        """The K markers on the body."""
+        return self.body.markers(self.marker_set)
+
+
+def fit_marker_subject(
+    body: Body,
+    trials: Markers | Sequence[Markers],
+    marker_set: str | PathLike[str] | None = None,
+    *,
+    frames: int = 80,
+    height: float | None = None,
+    progress: Progress | None = None,
+) -> MarkerSubject:
+    """Size of a body and places of the markers on it, from static or moving trials of one subject, all together.
+
+    Where a trial moves a joint, its centre (and the knee's axis) comes from how the markers of both segments move;
+    where it does not, from the landmarks that markers sit on and from proportions. A static trial alone so gives what
+    scaling by landmarks would give.
+
+    Parameters
+    ----------
+    body : Body, generic.
+    trials : labelled; labels may carry a subject's prefix ("Anna:LASI").
+    marker_set : see `placement.find_placement`.
+    frames : how many are used at most, those of most different postures.
+    height : float [m] of the subject, barefoot.
+
+    Raises
+    ------
+    ObservationError
+        Too few labels are known; a height or number of frames that cannot be.
+    TrackingError
+        No frame shows enough markers to start from.
+    """
+    trials = [trials] if isinstance(trials, Markers) else list(trials)
+    if not trials or frames < 1 or (height is not None and not 0.3 < height < 3.0):
+        raise ObservationError(
+            f"{len(trials)} trials, {frames} frames, height {height}",
+            remedy="Give one trial at least, one frame at least, and a height in metres.",
+        )
+    progress = progress or (lambda what, done, total: None)
+    progress("marker offsets", 0, _ROUNDS)
+    labels = {bare(n) for t in trials for n in t.names}
+    placed = find_placement(body, labels, marker_set)
+    x = np.concatenate([columns(t, placed.points.names) for t in trials])
+    starts = np.cumsum([0, *(len(t) for t in trials)])
+    seen = np.isfinite(x).all(axis=2)
+    placed, x, seen = _worn(placed, x, seen)
+    whole = height / body.stature if height and body.stature else None
+    size = whole if whole is not None else _first_size(body, placed, x)
+    parameters = marker_parameters(body, placed.points, placed.spread, size, known=whole is not None)
+    sigma = np.full(len(placed.points), SOFT)
+    theta, shape = parameters.mean, None
+    for turn in range(_ROUNDS):
+        fitted, points = _dressed(body, placed, theta)
+        looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
+        roots, angles, good = _all_poses(fitted, points, x, starts, looseness)
+        chosen = _spread_frames(seen, angles, good, frames if turn else max(frames // 4, 8))
+        states = [BodyState(roots[f], angles[f]) for f in chosen]
+        if turn == 0:
+            theta = _moved(fitted, placed, theta, roots[good], angles[good], x[good])
+        share = min(_INDEPENDENT / len(chosen), 1.0)
+        weight = np.where(seen[chosen], share * sigma**-2.0, 0.0)
+        shape = fit_marker_shape(parameters, x[chosen], weight, states, start=theta, loss=geman_mcclure(5.0 * share**0.5))
+        theta = np.concatenate([shape.scales, shape.offsets.ravel()])
+        residuals = _residuals(body, placed, shape, x[chosen])
+        sigma = _noise(residuals, len(chosen), body.tree.n_dofs)
+        progress("marker offsets", turn + 1, _ROUNDS)
+    fitted, points = _dressed(body, placed, theta)
+    inlier = residuals < 5.0 * 1.7 * sigma
+    named = {**fitted.marker_sets, placed.name: points}
+    assert shape is not None  # noqa: S101 - for the type checker: there is at least one round
+    return MarkerSubject(
+        replace(fitted, marker_sets=named), placed.name, shape.scales, shape.scale_std, sigma,
+        np.linalg.norm(shape.offsets, axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))), len(chosen),
+    )  # fmt: skip
+
+
+def bare(label: str) -> str:
+    """A label without its subject's prefix: "Anna:LASI" -> "LASI"."""
+    return label.rpartition(":")[2].strip()
+
+
+def columns(markers: Markers, names: Sequence[str]) -> NDArray:
+    """(F, K, 3) [m] the named markers of a recording, NaN for those that it does not have."""
+    labels = [bare(n) for n in markers.names]
+    out = np.full((len(markers), len(names), 3), np.nan)
+    for k, name in enumerate(names):
+        if name in labels:
+            out[:, k] = markers.positions[:, labels.index(name)]
+    return out
+
+
+def _worn(placed: Placement, x: NDArray, seen: NDArray) -> tuple[Placement, NDArray, NDArray]:
+    """Without markers that are never seen."""
+    keep = seen.any(axis=0)
+    return placed.select(np.array(placed.points.names)[keep]), x[:, keep], seen[:, keep]
+
+
+def _first_size(body: Body, placed: Placement, x: NDArray) -> float:
+    """How many times the generic body's size the subject has: by distances that postures change little."""
+    rng, tree = np.random.default_rng(0), body.tree
+    angles = np.clip(tree.usual + 0.5 * tree.spread * rng.normal(size=(_POSTURES, len(tree.usual))), tree.lower, tree.upper)
+    angles = np.where(np.isfinite(angles), angles, 0.0)
+    own = body.trajectories(np.tile(np.eye(4), (_POSTURES, 1, 1)), angles, placed.points)
+    some = x[np.linspace(0, len(x) - 1, min(len(x), 100)).astype(int)]
+    i, j = np.triu_indices(len(placed.points), 1)
+    d_own = np.linalg.norm(own[:, i] - own[:, j], axis=2)
+    with np.errstate(invalid="ignore"):
+        d = np.linalg.norm(some[:, i] - some[:, j], axis=2)
+    known = np.isfinite(d).any(axis=0) & (np.median(d_own, axis=0) > 0.1)
+    if not known.any():
+        return 1.0
+    middle, middle_own = np.nanmedian(d[:, known], axis=0), np.median(d_own[:, known], axis=0)
+    variance = np.var(d_own[:, known], axis=0) + placed.spread[i[known]] ** 2 + placed.spread[j[known]] ** 2
+    weight = middle_own**2 / variance
+    order = np.argsort(ratio := middle / middle_own)
+    half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
+    return float(np.clip(ratio[order][half], 0.3, 3.0))
+
+
+def _moved(
+    body: Body, placed: Placement, theta: NDArray, roots: NDArray, angles: NDArray, x: NDArray
+) -> NDArray:
+    """The parameters with every marker where it was seen on its segment, by the median over some of the frames.
+
+    A set says which segment a marker sits on, but laboratories differ in where; to a robust fit that begins far away
+    such a marker would be an outlier in every frame.
+    """
+    some = np.unique(np.linspace(0, len(x) - 1, min(len(x), 200)).astype(int))
+    Ts = body.tree.segment_poses(roots[some], angles[some])[:, placed.points.segments]
+    local = np.einsum("fkji,fkj->fki", Ts[..., :3, :3], x[some] - Ts[..., :3, 3])
+    groups = len(body.scale_groups)
+    scales = theta[:groups][body.segment_scale[placed.points.segments]]
+    with np.errstate(all="ignore"):
+        offsets = np.nanmedian(local, axis=0) - placed.points.points * scales[:, None]
+    return np.concatenate([theta[:groups], np.nan_to_num(offsets).ravel()])
+
+
+def _dressed(body: Body, placed: Placement, theta: NDArray) -> tuple[Body, PointSet]:
+    """The body of a shape, and its markers on it."""
+    groups = len(body.scale_groups)
+    scales, offsets = theta[:groups], theta[groups:].reshape(-1, 3)
+    p = placed.points
+    return body.scaled(scales), PointSet(p.names, p.segments, p.points * scales[body.segment_scale[p.segments]][:, None] + offsets)
+
+
+def _all_poses(
+    body: Body, points: PointSet, x: NDArray, starts: NDArray, sigma: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Roots (F, 4, 4), angles (F, D) of every frame of every trial, and which are to be believed (F,)."""
+    parts, errors = [], []
+    for a, b in zip(starts[:-1], starts[1:], strict=True):
+        try:
+            parts.append(sequence_both_ways(body, points, x[a:b], sigma))
+        except TrackingError as error:
+            errors.append(error)
+            count = len(body.tree.coordinates)
+            parts.append((np.tile(np.eye(4), (b - a, 1, 1)), np.tile(body.tree.usual, (b - a, 1))))
+            x = x.copy()
+            x[a:b] = np.nan
+    if len(errors) == len(parts):
+        raise errors[0]
+    roots, angles = (np.concatenate(p) for p in zip(*parts, strict=True))
+    off = np.linalg.norm(x - body.trajectories(roots, angles, points), axis=2)
+    enough = np.isfinite(off).sum(axis=1) >= min(6, len(points))
+    with np.errstate(invalid="ignore"):
+        ratio = np.nanmedian(np.where(enough[:, None], off / sigma, np.inf), axis=1)
+    return roots, angles, enough & (ratio < 3.0 * max(float(np.nanmedian(ratio[enough])), 1.0))
+
+
+def sequence_both_ways(
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = LOSS, limits: bool = True
+) -> tuple[NDArray, NDArray]:
+    """Roots (F, 4, 4) and angles (F, D) of all frames, from the one that shows most, onwards and backwards.
+
+    Raises
+    ------
+    TrackingError
+        No frame shows enough markers to start from.
+    """
+    first, state = _start(body, points, x, sigma)
+    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": POSTURE}
+    after = fit_sequence(body, state, points, x[first:], **given)
+    state = BodyState(after.Ts_world_root[0], after.angles[0])
+    before = fit_sequence(body, state, points, x[: first + 1][::-1], **given)
+    roots = np.concatenate([before.Ts_world_root[:0:-1], after.Ts_world_root])
+    return roots, np.concatenate([before.angles[:0:-1], after.angles])
+
+
+def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:
+    """The frame to start from, and its state, found with no pose given: the best of a few that show most."""
+    seen = np.isfinite(x).all(axis=2)
+    count = seen.sum(axis=1)
+    most = np.flatnonzero(count >= count.max())
+    tries = most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]
+    fits = []
+    spread = np.maximum(sigma, 0.02)  # [m] wide enough for a start that is far off
+    for frame in tries:
+        try:
+            state, left = pose_from_points(body, points, x[frame], sigma=spread)
+        except TrackingError:
+            continue
+        fits.append((left, int(frame), state))
+        if left < 0.03:
+            break
+    if not fits:
+        raise TrackingError(
+            f"no frame shows enough markers to start from: {int(count.max(initial=0))} at most",
+            remedy="Six markers in one frame are the least.",
+        )
+    _, frame, state = min(fits, key=lambda f: f[0])
+    return frame, state
+
+
+def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) -> NDArray:
+    """Frames of most different postures (farthest points), of those that show most of the markers."""
+    usable = np.flatnonzero(good & (seen.sum(axis=1) >= 0.5 * seen.sum(axis=1).max(initial=0)))
+    if not len(usable):
+        usable = np.flatnonzero(seen.any(axis=1))
+    usable = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), 2000)).astype(int))]
+    if len(usable) <= count:
+        return usable
+    a = angles[usable]
+    chosen = [int(np.argmax(seen[usable].sum(axis=1)))]
+    distance = np.sum((a - a[chosen[0]]) ** 2, axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.sum((a - a[chosen[-1]]) ** 2, axis=1))
+    return np.sort(usable[chosen])
+
+
+def _residuals(body: Body, placed: Placement, shape: MarkerShape, x: NDArray) -> NDArray:
+    """(F, K) [m] lengths of residuals of the frames that a shape came from."""
+    fitted, points = _dressed(body, placed, np.concatenate([shape.scales, shape.offsets.ravel()]))
+    roots, angles = (np.stack([getattr(s, n) for s in shape.states]) for n in ("T_world_root", "angles"))
+    return np.linalg.norm(x - fitted.trajectories(roots, angles, points), axis=2)
+
+
+def _noise(residuals: NDArray, frames: int, dofs: int) -> NDArray:
+    """(K,) [m] standard deviation of every marker along each axis, drawn together where there are few frames.
+
+    Of three residuals in space the median length is 1.54 standard deviations; what a pose takes up is put back.
+    """
+    seen = np.isfinite(residuals)
+    with np.errstate(all="ignore"):
+        own = np.nanmedian(residuals, axis=0) / 1.538
+        typical = float(np.nanmedian(residuals)) / 1.538
+    count = seen.sum(axis=0)
+    shrunk = np.sqrt((count * np.nan_to_num(own) ** 2 + 10 * typical**2) / (count + 10))
+    free = 1.0 - min(dofs / max(3.0 * seen.sum() / max(frames, 1), 1.0), 0.75)
+    return np.maximum(shrunk / np.sqrt(free), _LEAST)
