@@ -1,23 +1,26 @@
-"""A marker model from one labelled frame and a marker set (P5 2: "one frame of pose data that includes full points")."""
+"""A marker model from one labelled frame and a marker set (P5 2: "one frame ... that includes full feature points")."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification.marker_sets import FEWEST, MarkerSet
+from kinefit.identification.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.identification.model import MarkerJoint, MarkerModel
 
-GIVE_FLOOR, GIVE_SLOPE = 0.004, 0.03
-"""Guess of a distance's standard deviation within a segment: [m], and a share of the distance. See docs/markers.md:
-the median over pairs of all catalogue sets in labelled takes of the whole body."""
+NOISE = 0.001
+"""[m] of a measured distance."""
 
 JOINT_SPREAD = 0.02
 """[m] guess of a virtual joint's spread: body proportions and skin."""
+
+MARKER_SPREAD = 0.01
+"""[m] the same where both segments share a marker."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +34,7 @@ class Skeleton:
     shared : for each segment, its markers that its parent has too
     places : (M, 3) [m] of the set, NaN where not known; joints : (S, 3) [m] of the set, NaN where not known
     unknown : labels that the set does not know, as indexes
+    give : [m] for each member of each segment; ranges : [rad] of each segment's joint; see SetSegment
     """
 
     names: tuple[str, ...]
@@ -39,6 +43,8 @@ class Skeleton:
     places: NDArray
     joints: NDArray
     unknown: tuple[int, ...]
+    give: tuple[tuple[float, ...], ...]
+    ranges: tuple[float, ...]
 
     def shared(self, s: int) -> tuple[int, ...]:
         """Markers of a segment that its parent has too."""
@@ -63,7 +69,7 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
         )
     members = [tuple(number[m] for m in s.markers if m in number) for s in marker_set.segments]
     elders: list[set[int]] = []
-    for s, segment in enumerate(marker_set.segments):
+    for segment in marker_set.segments:
         elders.append(set() if segment.parent < 0 else elders[segment.parent] | set(members[segment.parent]))
     keep = [s for s in range(len(members)) if set(members[s]) - elders[s]]
     keep = [s for i, s in enumerate(keep) if i or len(members[s]) >= 3] or keep
@@ -87,10 +93,13 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
         if marker_set.segments[s].joint is not None:
             joints[i] = marker_set.segments[s].joint
     unknown = tuple(sorted({i for i, name in enumerate(known) if name is None} | lost))
-    return Skeleton(
-        tuple(marker_set.segments[s].name for s in keep), tuple(parents), tuple(members[s] for s in keep), places,
-        joints, unknown,
-    )
+    give = []
+    for segment in (marker_set.segments[s] for s in keep):
+        each = segment.give or (GIVE,) * len(segment.markers)
+        give.append(tuple(g for m, g in zip(segment.markers, each) if m in number))
+    names = tuple(marker_set.segments[s].name for s in keep)
+    own, ranges = tuple(members[s] for s in keep), tuple(marker_set.segments[s].range for s in keep)
+    return Skeleton(names, tuple(parents), own, places, joints, unknown, tuple(give), ranges)
 
 
 def similarity(x: NDArray, y: NDArray, prior: NDArray, scaled: bool = True) -> tuple[float, NDArray, NDArray]:
@@ -104,7 +113,7 @@ def similarity(x: NDArray, y: NDArray, prior: NDArray, scaled: bool = True) -> t
     a, b = x - x.mean(0), y - y.mean(0)
     size = float((a * a).sum())
     cross = b.T @ a + (1e-4 * size + 1e-12) * prior
-    u, sigma, vt = np.linalg.svd(cross)
+    u, _, vt = np.linalg.svd(cross)
     d = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     R = (u * d) @ vt
     scale = float(np.sqrt((b * b).sum() / size)) if scaled and len(x) > 1 and size > 0 else 1.0
@@ -143,8 +152,10 @@ def place_joints(positions: NDArray, skeleton: Skeleton) -> NDArray:
     return joints
 
 
-def reach(reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence[MarkerJoint]) -> tuple[NDArray, NDArray]:
-    """(M, M), (M, M) [m] least and largest distance of two markers that the tree of segments allows, whatever its pose.
+def reach(
+    reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence[MarkerJoint]
+) -> tuple[NDArray, NDArray]:
+    """(M, M) [m] each: least and largest distance of two markers that the tree of segments allows, whatever its pose.
 
     Within a segment both are the distance itself. Across joints: the largest is the way through the joints; the least
     is what the longest piece of that way leaves when the others turn against it.
@@ -170,7 +181,7 @@ def reach(reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence
             common = next(s for s in up if s in down)
             chain = [(joint_of[s].in_child, joint_of[s].in_parent) for s in up[: up.index(common)]]
             chain += [(joint_of[s].in_parent, joint_of[s].in_child) for s in down[: down.index(common)]][::-1]
-            inner = [float(np.linalg.norm(k[1] - n[0])) for k, n in zip(chain, chain[1:])]
+            inner = [float(np.linalg.norm(k[1] - n[0])) for k, n in pairwise(chain)]
             first = np.linalg.norm(reference[list(members[a])] - chain[0][0], axis=-1)
             last = np.linalg.norm(reference[list(members[b])] - chain[-1][1], axis=-1)
             total = first[:, None] + last + sum(inner)
@@ -183,12 +194,14 @@ def reach(reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence
     return low, np.maximum(high, low)
 
 
-def guess_deviation(mean: NDArray, members: Sequence[Sequence[int]], low: NDArray, high: NDArray) -> NDArray:
-    """(M, M) [m] how much distances give where no training tells: little within segments, what the tree allows across."""
-    deviation = (high - low) / np.sqrt(12.0) + GIVE_FLOOR + GIVE_SLOPE * mean
-    for m in members:
-        i = np.ix_(list(m), list(m))
-        deviation[i] = GIVE_FLOOR + GIVE_SLOPE * mean[i]
+def guess_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArray) -> NDArray:
+    """(M, M) [m] how much distances give where no training tells: by skin within segments, else as the tree allows."""
+    deviation = (high - low) / np.sqrt(12.0)
+    within = np.full(mean.shape, np.inf)
+    for m, give in zip(skeleton.members, skeleton.give):
+        i, g = np.ix_(list(m), list(m)), np.asarray(give)
+        within[i] = np.minimum(within[i], np.sqrt(NOISE**2 + g[:, None] ** 2 + g**2))
+    deviation = np.where(np.isfinite(within), within, deviation + NOISE)
     np.fill_diagonal(deviation, 0.0)
     return deviation
 
@@ -223,10 +236,11 @@ def model_from_frame(
     for s in range(1, len(skeleton.names)):
         marker = pivot(skeleton, s, places[s], at)
         place = places[s] if marker is None else at[marker]
-        joints.append(MarkerJoint(skeleton.parents[s], s, place, place, JOINT_SPREAD, marker))
+        spread = JOINT_SPREAD if marker is None else MARKER_SPREAD
+        joints.append(MarkerJoint(skeleton.parents[s], s, place, place, spread, marker))
     mean = np.linalg.norm(at[:, None] - at, axis=-1)
     low, high = reach(at, skeleton.members, joints)
-    deviation = guess_deviation(mean, skeleton.members, low, high)
+    deviation = guess_deviation(mean, skeleton, low, high)
     return MarkerModel(
         name, tuple(labels), at, skeleton.members, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
     )
@@ -239,11 +253,11 @@ def pivot(skeleton: Skeleton, s: int, place: NDArray, at: NDArray) -> int | None
 
 
 def adopt(skeleton: Skeleton, cost: NDArray) -> Skeleton:
-    """Markers that the set does not know go to the segment with the least mean of `cost` (M, M) to two of its markers."""
-    members = [list(m) for m in skeleton.members]
+    """Markers that the set does not know go to the segment of least mean `cost` (M, M) to two of its markers."""
+    members, give = [list(m) for m in skeleton.members], [list(g) for g in skeleton.give]
     for i in skeleton.unknown:
-        known = [np.sort(cost[i, list(m)])[:2].mean() for m in skeleton.members]
-        members[int(np.argmin(known))].append(i)
-    return Skeleton(
-        skeleton.names, skeleton.parents, tuple(tuple(m) for m in members), skeleton.places, skeleton.joints, ()
-    )
+        known = [np.sort(np.nan_to_num(cost[i, list(m)], nan=np.inf))[:2].mean() for m in skeleton.members]
+        best = int(np.argmin(known))
+        members[best].append(i)
+        give[best].append(2 * GIVE)  # not known to be of this segment
+    return replace(skeleton, members=tuple(map(tuple, members)), unknown=(), give=tuple(map(tuple, give)))

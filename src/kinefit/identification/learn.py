@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.identification._rigid import meet, rigid_frames, turned
+from kinefit.identification.clusters import learn_segments
 from kinefit.identification.from_frame import (
-    JOINT_SPREAD, Skeleton, adopt, guess_deviation, pivot, place_joints, reach, skeleton_of,
+    JOINT_SPREAD,
+    MARKER_SPREAD,
+    NOISE,
+    Skeleton,
+    adopt,
+    guess_deviation,
+    pivot,
+    place_joints,
+    reach,
+    skeleton_of,
 )
 from kinefit.identification.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.identification.model import MarkerJoint, MarkerModel
@@ -15,6 +29,10 @@ from kinefit.observations import Markers
 
 MOST_FRAMES = 1000
 """Frames that are looked at, spread over the take: neighbours in time say the same."""
+
+SECOND_RANGE = 0.35
+"""Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
+and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
 
 SELDOM = 0.01
 """A label that fewer of the frames show is left out: mostly a rest of somebody's editing ("RBAC-1")."""
@@ -40,9 +58,10 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
         marker_set = find_marker_set(markers.names)
     positions, labels, gaps = usable(markers, marker_set or None)
     tables = distances(positions)
-    if not isinstance(marker_set, MarkerSet):
-        raise ObservationError("no marker set knows these labels", remedy="Give a template.")
-    skeleton = adopt(skeleton_of(labels, marker_set), tables[1])
+    if isinstance(marker_set, MarkerSet):
+        skeleton = adopt(skeleton_of(labels, marker_set), tables[1])
+    else:
+        skeleton = learn_segments(positions, labels, tables[1])
     return fit_model(positions, labels, skeleton, tables, name, gaps)
 
 
@@ -51,7 +70,8 @@ def usable(markers: Markers, marker_set: MarkerSet | None) -> tuple[NDArray, lis
     seen = np.isfinite(markers.positions[..., 0])
     keep = [
         i for i, label in enumerate(markers.names)
-        if seen[:, i].sum() >= max(3, SELDOM * len(seen)) and not label.startswith("*") and not (marker_set and marker_set.is_computed(label))
+        if seen[:, i].sum() >= max(3, SELDOM * len(seen)) and not label.startswith("*")
+        and not (marker_set and marker_set.is_computed(label))
     ]
     left_out = [n for i, n in enumerate(markers.names) if i not in keep and not n.startswith("*")]
     left_out = [n for n in left_out if not (marker_set and marker_set.is_computed(n))]
@@ -110,49 +130,72 @@ def fit_model(
             R, t = rigid_frames(np.vstack([x, b]), np.concatenate([y, known[:, None]], 1), Rs[p])
             spread = np.linalg.norm(known - (R @ b + t), axis=-1)
             spread = spread[np.isfinite(spread)]
-            joints.append(MarkerJoint(
-                p, s, a, b, float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD, marker,
-                turned(Rs[p], R),
-            ))
+            typical = float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD
+            ranges = turned(Rs[p], R, np.isfinite(y[..., 0]).sum(1) >= min(3, len(x)))
+            joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
+            told = exercised_share(joint, skeleton.ranges[s])
+            usual = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
+            joints.append(replace(joint, spread=float(np.sqrt(told * typical**2 + (1 - told) * usual**2))))
         Rs.append(R)
         ts.append(t)
     tree_low, tree_high = reach(reference, skeleton.members, joints)
     own = np.linalg.norm(reference[:, None] - reference, axis=-1)
     mean = np.where(np.isfinite(mean), mean, own)
-    guess_dev = guess_deviation(mean, skeleton.members, tree_low, tree_high)
-    deviation = np.where(np.isfinite(deviation), np.maximum(deviation, 0.002), guess_dev)
+    guess = guess_deviation(mean, skeleton, tree_low, tree_high)
+    known = np.where(np.isfinite(deviation), exercise(skeleton, joints, len(labels)), 0.0)
+    deviation = np.nan_to_num(np.hypot(deviation, NOISE))
+    deviation = np.sqrt(known * deviation**2 + (1 - known) * np.maximum(deviation, guess) ** 2)
     np.fill_diagonal(deviation, 0.0)
-    low, high = np.where(np.isfinite(low), low, tree_low), np.where(np.isfinite(high), high, tree_high)
+    low, high = np.fmin(low, mean), np.fmax(high, mean)
+    low, high = low + (1 - known) * np.minimum(tree_low - low, 0), high + (1 - known) * np.maximum(tree_high - high, 0)
+    segments = skeleton.members
     return MarkerModel(
-        name, tuple(labels), reference, skeleton.members, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
+        name, tuple(labels), reference, segments, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
     )
 
 
-def rigid_frames(x: NDArray, y: NDArray, prior: NDArray) -> tuple[NDArray, NDArray]:
-    """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
+def exercise(skeleton: Skeleton, joints: Sequence[MarkerJoint], count: int) -> NDArray:
+    """(M, M) in 0..1: how far the motion tells what a distance does.
 
-    What the points leave open (two of them, or one) follows `prior` (F, 3, 3). NaN where nothing is seen.
+    Across joints: the least of the joints between. Within a segment: the mean of its joints, as skin is moved by them.
     """
-    seen = np.isfinite(y[..., 0])
-    count = np.maximum(seen.sum(1), 1)[:, None]
-    x_all = np.where(seen[..., None], x, 0.0)
-    y_all = np.where(seen[..., None], y, 0.0)
-    x_mid, y_mid = x_all.sum(1) / count, y_all.sum(1) / count
-    a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
-    b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
-    size = (a * a).sum((1, 2))[:, None, None]
-    cross = np.einsum("fki,fkj->fij", b, a) + (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
-    u, _, vt = np.linalg.svd(cross)
-    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    R = u @ vt
-    t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
-    nothing = ~seen.any(1)
-    R[nothing], t[nothing] = np.nan, np.nan
-    return R, t
+    members = skeleton.members
+    share = {j.child: exercised_share(j, skeleton.ranges[j.child]) for j in joints}
+    parent = {j.child: j.parent for j in joints}
+    told = np.ones((count, count))
+    for a in range(len(members)):
+        for b in range(a, len(members)):
+            if a == b:
+                around = [v for c, v in share.items() if a in (c, parent[c])]
+                value = float(np.mean(around)) if around else 1.0
+            else:
+                value = min(share[s] for s in _between(a, b, parent))
+            i, j = np.ix_(list(members[a]), list(members[b])), np.ix_(list(members[b]), list(members[a]))
+            told[i] = np.minimum(told[i], value)
+            told[j] = np.minimum(told[j], value)
+    return told
+
+
+def exercised_share(joint: MarkerJoint, full: float) -> float:
+    """0..1: how much of its range a joint went through in training; half of it is for the second axis."""
+    first, second, _ = joint.ranges
+    return 0.5 * min(1.0, first / full) + 0.5 * min(1.0, second / (SECOND_RANGE * full))
+
+
+def _between(a: int, b: int, parent: dict[int, int]) -> list[int]:
+    """The segments whose joints with their parents lie between two segments."""
+    ways = []
+    for s in (a, b):
+        way = [s]
+        while way[-1] in parent:
+            way.append(parent[way[-1]])
+        ways.append(way)
+    common = next(s for s in ways[0] if s in ways[1])
+    return [s for way in ways for s in way[: way.index(common)]]
 
 
 def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: NDArray) -> NDArray:
-    """(M, 3) [m] each segment's mean shape, laid onto the frame that shows most and is nearest to the mean distances."""
+    """(M, 3) [m] each segment's mean shape, laid onto the frame that shows most, with the most usual distances."""
     seen = np.isfinite(positions[..., 0])
     best = np.flatnonzero(seen.sum(1) == seen.sum(1).max())
     best = best[:: max(1, len(best) // 200)]
@@ -188,61 +231,3 @@ def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: 
     if not placed.all():
         raise ObservationError("no frame shows all segments", remedy="Give a take in which every marker is seen.")
     return sums / weights[:, None]
-
-
-def meet(Rp: NDArray, tp: NDArray, Rc: NDArray, tc: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
-    """The point that is constant in both frames: a in the parent's, b in the child's, from the reference place `guess`.
-
-    Least squares of R_p a + t_p = R_c b + t_c over all frames; along directions that the motion does not tell (a
-    hinge's axis, or a joint held still) both stay at the guess, which counts as much as one centimetre in three.
-    """
-    if len(x) < 3:
-        return meet_few(Rp, tp, x, y, guess)
-    good = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
-    if not good.any():
-        return guess, guess
-    A = np.concatenate([Rp[good], -Rc[good]], axis=2)
-    r = tc[good] - tp[good] - (A @ np.concatenate([guess, guess]))
-    H = np.einsum("fij,fik->jk", A, A) / good.sum()
-    g = np.einsum("fij,fi->j", A, r) / good.sum()
-    step = np.linalg.solve(H + 0.02 * np.eye(6), g)
-    return guess + step[:3], guess + step[3:]
-
-
-def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
-    """The same for a child of one or two markers: the point of the parent that keeps its distance to each."""
-    good = np.isfinite(tp).all(1)
-    a = guess.copy()
-    local = np.einsum("fji,fkj->fki", Rp[good], y[good] - tp[good][:, None])
-    for _ in range(5):
-        away = local - a
-        length = np.linalg.norm(away, axis=-1)
-        typical = np.nanmedian(length, axis=0)
-        J = -away / length[..., None]
-        r = typical - length
-        ok = np.isfinite(r)
-        if not ok.any():
-            return guess, guess
-        J, r = J[ok], r[ok]
-        a = a + np.linalg.solve(J.T @ J / len(r) + 0.02 * np.eye(3), J.T @ r / len(r) + 0.02 * (guess - a))
-    # in the child: at those distances from its markers, nearest to where the parent's lies in the reference
-    b = a.copy()
-    typical = np.nanmedian(np.linalg.norm(local - a, axis=-1), axis=0)
-    for _ in range(10):
-        away = b - x
-        length = np.linalg.norm(away, axis=-1)
-        J, r = away / length[:, None], typical - length
-        b = b + np.linalg.lstsq(J, r, rcond=1e-3)[0]
-    return a, b
-
-
-def turned(Rp: NDArray, Rc: NDArray) -> float:
-    """[rad] range of a joint: twice the angle from the mean attitude that 5 % of the frames exceed."""
-    relative = np.einsum("fji,fjk->fik", Rp, Rc)
-    relative = relative[np.isfinite(relative).all((1, 2))]
-    if not len(relative):
-        return 0.0
-    u, _, vt = np.linalg.svd(relative.mean(0))
-    middle = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    cosine = (np.einsum("ij,fij->f", middle, relative) - 1) / 2
-    return float(2 * np.quantile(np.arccos(np.clip(cosine, -1, 1)), 0.95))

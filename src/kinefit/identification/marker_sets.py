@@ -19,6 +19,12 @@ from kinefit.errors import FileError, ObservationError, choices
 FEWEST = 4
 """Labels that a set and a take must have in common, and half of the take's or the set's: fewer agree by chance."""
 
+GIVE = 0.004
+"""[m] give of a marker where the set does not tell."""
+
+RANGE = 1.5
+"""[rad] range of a joint where the set does not tell."""
+
 _Vector = tuple[float, float, float]
 
 
@@ -32,12 +38,19 @@ class SetSegment:
     parent : int, index of its parent, -1 for the root
     markers : labels that move with it; a label may be in two segments that meet there
     joint : (3,) [m] where it meets its parent, in the frame of the set's places; None for the root
+    give : (k,) [m]
+        How far each of its markers strays from the segment along one axis in vigorous motion: skin, soft parts. The
+        catalogue's are medians over seven takes of six subjects; a distance gives by both of its ends.
+    range : float [rad]
+        How far its joint turns at most, about any one axis, in vigorous motion.
     """
 
     name: str
     parent: int
     markers: tuple[str, ...]
     joint: NDArray | None = None
+    give: tuple[float, ...] = ()
+    range: float = RANGE
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +145,9 @@ class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     markers: list[str]
     parent: str | None = None
     joint: _Vector | None = None
+    give: float = GIVE
+    loose: dict[str, float] = {}
+    range: float = np.degrees(RANGE)
 
 
 class _File(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -159,7 +175,8 @@ def _parse(text: str, source: str) -> MarkerSet:
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         remedy = "It has name, sides, [places] [m] and [[segment]] with name, parent, joint [m], markers."
-        raise FileError(f"not a marker set: {problem}", file=source, place=place.strip(".`") or None, remedy=remedy) from error
+        place = place.strip(".`")
+        raise FileError(f"not a marker set: {problem}", file=source, place=place or None, remedy=remedy) from error
     return _built(record, source)
 
 
@@ -173,33 +190,24 @@ def _built(record: _File, source: str) -> MarkerSet:
 
     segments: list[SetSegment] = []
     names: list[str] = []
-
-    def add(name: str, parent: str | None, markers: list[str], joint: NDArray | None) -> None:
-        place = f"segment '{name}'"
-        if name in names:
-            raise FileError("a segment is there twice", file=source, place=place, remedy="Give each its own name.")
-        if (parent is None) != (not segments):
-            problem = "the first segment is the root; every other has a parent"
-            raise FileError(problem, file=source, place=place, remedy="Put the root first, children after parents.")
-        if parent is not None and parent not in names:
-            raise FileError(choices("segment", parent, names), file=source, place=place, remedy="Parents come first.")
-        if not markers or len(set(markers)) < len(markers):
-            raise FileError("no markers, or one twice", file=source, place=place, remedy="List each label once.")
-        if joint is not None and not np.isfinite(joint).all():
-            raise FileError("the joint is not finite", file=source, place=place, remedy="Give three numbers [m].")
-        names.append(name)
-        segments.append(SetSegment(name, -1 if parent is None else names.index(parent), tuple(markers), joint))
-
     for s in record.segment:
-        joint = None if s.joint is None else np.array(s.joint, float)
-        if s.name.endswith("_r") and record.sides:
-            for side, own in (("_r", s.markers), ("_l", [m for label in s.markers if (m := mirror(label))])):
-                parent = s.parent.removesuffix("_r") + side if s.parent and s.parent.endswith("_r") else s.parent
-                if own:
-                    add(s.name.removesuffix("_r") + side, parent, own, joint if side == "_r" or joint is None else joint * [1, 1, -1])
-        else:
-            both = [n for label in s.markers for n in (label, mirror(label)) if n]
-            add(s.name, s.parent, list(dict.fromkeys(both)), joint)
+        right = s.name.endswith("_r") and bool(record.sides)
+        for side in ("_r", "_l") if right else ("",):
+            name = s.name.removesuffix("_r") + side if right else s.name
+            parent = s.parent.removesuffix("_r") + side if right and s.parent and s.parent.endswith("_r") else s.parent
+            give = {label: s.loose.get(label, s.give) for label in s.markers}
+            give |= {m: g for label, g in give.items() if (m := mirror(label)) and m not in give}
+            own = [n for label in s.markers for n in (label, mirror(label)) if n] if side == "" else s.markers
+            own = [m for label in s.markers if (m := mirror(label))] if side == "_l" else list(dict.fromkeys(own))
+            problem, remedy = _wrong(s, name, parent, own, names)
+            if problem:
+                raise FileError(problem, file=source, place=f"segment '{name}'", remedy=remedy)
+            joint = None if s.joint is None else np.array(s.joint) * ([1, 1, -1] if side == "_l" else 1)
+            if own:
+                turn = float(np.radians(s.range))
+                number = -1 if parent is None else names.index(parent)
+                segments.append(SetSegment(name, number, tuple(own), joint, tuple(give[m] for m in own), turn))
+                names.append(name)
     if not segments:
         raise FileError("no segment", file=source, remedy="Give at least one [[segment]].")
     labels = tuple(dict.fromkeys(label for s in segments for label in s.markers))
@@ -216,3 +224,21 @@ def _built(record: _File, source: str) -> MarkerSet:
     places = np.array([at.get(label, [np.nan] * 3) for label in labels])
     computed = [n for label in record.computed for n in (label, mirror(label)) if n]
     return MarkerSet(record.name, labels, places, tuple(segments), tuple(record.also), tuple(dict.fromkeys(computed)))
+
+
+def _wrong(s: _Segment, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
+    """What is wrong with a segment, and what to do; empty if nothing is."""
+    if name in names:
+        return "a segment is there twice", "Give each its own name."
+    if (parent is None) != (not names):
+        return "the first segment is the root; every other has a parent", "Put the root first, children after parents."
+    if parent is not None and parent not in names:
+        return choices("segment", parent, names), "Parents come first."
+    if not s.markers or len(set(own)) < len(own):
+        return "no markers, or one twice", "List each label once."
+    if strangers := sorted(set(s.loose) - set(s.markers)):
+        return f"`loose` names {', '.join(strangers)}, which it does not have", "Give labels of its markers."
+    numbers = [s.give, s.range, *s.loose.values(), *(s.joint or ())]
+    if not np.isfinite(numbers).all() or min(s.give, s.range, *s.loose.values()) <= 0:
+        return "joint, give or range is not finite, or not positive", "Give metres, and degrees for the range."
+    return "", ""

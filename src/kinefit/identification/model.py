@@ -25,6 +25,8 @@ class MarkerJoint:
         The marker that both segments share there, if one does (P5 2: "joint"); None for a virtual joint.
     exercised : float [rad]
         Range that the joint went through in training; 0 where the model comes from one frame.
+    ranges : 3 floats [rad]
+        The same about each of three axes at right angles, the most turned about first.
     """
 
     parent: int
@@ -34,6 +36,7 @@ class MarkerJoint:
     spread: float = 0.01
     marker: int | None = None
     exercised: float = 0.0
+    ranges: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,9 @@ class MarkerModel:
     joints : MarkerJoint, one for each segment but the root; parents come before children.
     mean, deviation : (M, M) [m]
         Distances of markers, and their standard deviations in training; a model of one frame has deviations guessed.
-    low, high : (M, M) [m] least and largest distance in training; equal to `mean` within segments of one frame.
+    low, high : (M, M) [m]
+        Least and largest distance in training; across joints that were not exercised (all, in a model of one frame)
+        widened towards what the tree of segments allows. Equal to `mean` within segments of one frame.
     gaps : labels of which training showed less than a tenth.
     """
 

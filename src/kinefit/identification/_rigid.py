@@ -1,0 +1,133 @@
+"""Motions of segments from their markers, and the points where two segments meet."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.se3 import log_so3
+
+
+def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
+
+    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where nothing is seen.
+    """
+    prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
+    seen = np.isfinite(y[..., 0])
+    count = np.maximum(seen.sum(1), 1)[:, None]
+    x_all = np.where(seen[..., None], x, 0.0)
+    y_all = np.where(seen[..., None], y, 0.0)
+    x_mid, y_mid = x_all.sum(1) / count, y_all.sum(1) / count
+    a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
+    b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
+    size = (a * a).sum((1, 2))[:, None, None]
+    cross = np.einsum("fki,fkj->fij", b, a) + (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
+    u, _, vt = np.linalg.svd(cross)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    R = u @ vt
+    t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
+    nothing = ~seen.any(1)
+    R[nothing], t[nothing] = np.nan, np.nan
+    return R, t
+
+
+def local(R: NDArray, t: NDArray, y: NDArray) -> NDArray:
+    """(F, k, 3) [m] points y of the world in the frames of a segment."""
+    return np.einsum("fji,fkj->fki", R, y - t[:, None])
+
+
+def meet(
+    Rp: NDArray, tp: NDArray, Rc: NDArray, tc: NDArray, x: NDArray, y: NDArray, guess: NDArray
+) -> tuple[NDArray, NDArray]:
+    """The point that is constant in both frames: a in the parent's, b in the child's, from the reference place `guess`.
+
+    Least squares of R_p a + t_p = R_c b + t_c over all frames; along directions that the motion does not tell (a
+    hinge's axis, or a joint held still) both stay at the guess, which counts as much as one centimetre in three.
+    """
+    if len(x) < 3:
+        return meet_few(Rp, tp, x, y, guess)
+    good = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
+    if not good.any():
+        return guess, guess
+    A = np.concatenate([Rp[good], -Rc[good]], axis=2)
+    r = tc[good] - tp[good] - (A @ np.concatenate([guess, guess]))
+    H = np.einsum("fij,fik->jk", A, A) / good.sum()
+    g = np.einsum("fij,fi->j", A, r) / good.sum()
+    step = np.linalg.solve(H + 0.02 * np.eye(6), g)
+    return guess + step[:3], guess + step[3:]
+
+
+def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
+    """The same for a child of one or two markers: the point of the parent that keeps its distance to each."""
+    good = np.isfinite(tp).all(1)
+    a = guess.copy()
+    local = np.einsum("fji,fkj->fki", Rp[good], y[good] - tp[good][:, None])
+    for _ in range(5):
+        away = local - a
+        length = np.linalg.norm(away, axis=-1)
+        typical = np.nanmedian(length, axis=0)
+        J = -away / length[..., None]
+        r = typical - length
+        ok = np.isfinite(r)
+        if not ok.any():
+            return guess, guess
+        J, r = J[ok], r[ok]
+        a = a + np.linalg.solve(J.T @ J / len(r) + 0.02 * np.eye(3), J.T @ r / len(r) + 0.02 * (guess - a))
+    # in the child: at those distances from its markers, nearest to where the parent's lies in the reference
+    b = a.copy()
+    typical = np.nanmedian(np.linalg.norm(local - a, axis=-1), axis=0)
+    for _ in range(10):
+        away = b - x
+        length = np.linalg.norm(away, axis=-1)
+        J, r = away / length[:, None], typical - length
+        b = b + np.linalg.lstsq(J, r, rcond=1e-3)[0]
+    return a, b
+
+
+def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | None, y: NDArray) -> float:
+    """[m] how far the best joint of two segments strays: root mean square, median over frames.
+
+    Parameters
+    ----------
+    parent, child : shape (k, 3), rotations (F, 3, 3), translations (F, 3); no child where it has fewer than 3 markers
+    y : (F, k, 3) [m] markers of the child
+    """
+    _, Rp, tp = parent
+    frame = int(np.argmax(np.isfinite(y[..., 0]).sum(1) + np.isfinite(tp[:, 0])))
+    if child is not None:
+        _, Rc, tc = child
+        good = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
+        if good.sum() < 3:
+            return np.inf
+        A = np.concatenate([Rp[good], -Rc[good]], axis=2)
+        r = tc[good] - tp[good]
+        middle = np.concatenate([local(Rp[good], tp[good], y[good]).mean((0, 1)), np.zeros(3)])
+        middle = np.nan_to_num(middle)
+        middle[3:] = np.nan_to_num(np.nanmean(local(Rc[good], tc[good], y[good]), axis=(0, 1)))
+        H = np.einsum("fij,fik->jk", A, A) / good.sum() + 1e-3 * np.eye(6)
+        g = np.einsum("fij,fi->j", A, r - A @ middle) / good.sum()
+        left = r - A @ (middle + np.linalg.solve(H, g))
+        return float(np.sqrt(np.median((left**2).sum(1))))
+    here = local(Rp, tp, y)
+    guess = here[frame].copy()
+    if not np.isfinite(guess).any():
+        return np.inf
+    a, _ = meet_few(Rp, tp, y[frame] if np.isfinite(y[frame]).all() else guess, y, np.nanmean(guess, axis=0))
+    length = np.linalg.norm(here - a, axis=-1)
+    return float(np.sqrt(np.nanmedian((length - np.nanmedian(length, axis=0)) ** 2))) if len(length) else np.inf
+
+
+def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
+    """[rad] range of a joint about three axes at right angles, largest first: what 90 % of the frames lie within."""
+    relative = np.einsum("fji,fjk->fik", Rp[good], Rc[good])
+    relative = relative[np.isfinite(relative).all((1, 2))]
+    if not len(relative):
+        return 0.0, 0.0, 0.0
+    u, _, vt = np.linalg.svd(relative.mean(0))
+    middle = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turns = log_so3(np.einsum("ji,fjk->fik", middle, relative))
+    _, axes = np.linalg.eigh(turns.T @ turns)
+    low, high = np.quantile(turns @ axes, [0.05, 0.95], axis=0)
+    first, second, third = np.sort(high - low)[::-1].tolist()
+    return first, second, third

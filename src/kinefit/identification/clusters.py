@@ -1,0 +1,186 @@
+"""Segments from motion alone: groups of near-constant distances, and the points that are constant in two of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.identification._rigid import joint_residual, local, rigid_frames
+from kinefit.identification.from_frame import Skeleton
+from kinefit.identification.marker_sets import GIVE, RANGE
+
+GIVE_WITHIN = 0.012
+"""[m] deviation of a distance up to which two markers may be of one segment: twice what the catalogue's markers give
+by (0.004 m each end, and their noise), so that a soft part holds together; joints that turn move theirs by centimetres."""
+
+SHARED_GIVE = 0.010
+"""[m] a marker that strays less than this from a second segment is that segment's too: it sits on their joint."""
+
+
+def learn_segments(positions: NDArray, labels: Sequence[str], deviation: NDArray) -> Skeleton:
+    """Segments and their tree, by what moves together.
+
+    Complete linkage over the deviations of distances gives groups; each marker then goes to the group from whose
+    rigid motion it strays least, and to a second one too if it hardly strays from that. Groups are joined into a tree
+    by the points that are most nearly constant in both frames; the root is the group with most markers and joints.
+
+    Parameters
+    ----------
+    positions : (F, M, 3) [m]
+    deviation : (M, M) [m] of distances, NaN for two that are never seen together
+    """
+    groups = linkage(np.where(np.isfinite(deviation), deviation, np.inf), GIVE_WITHIN)
+    groups = settle(positions, groups)
+    members = [tuple(sorted(g)) for g in groups]
+    shared = share(positions, members)
+    cost = joint_costs(positions, shared, deviation)
+    root = max(range(len(members)), key=lambda g: (len(members[g]), -float(np.sort(cost[g])[:3].sum())))
+    order, parents = spanning_tree(cost, root)
+    place = {g: i for i, g in enumerate(order)}
+    segments = []
+    for g in order:
+        p = parents[g]
+        keep = set(members[g]) | (shared[g] & set(members[p]) if p >= 0 else set())
+        keep |= {m for c in order if parents[c] == g for m in shared[g] & set(members[c])}
+        segments.append(tuple(sorted(keep)))
+    names = tuple(named([labels[m] for m in members[g]]) for g in order)
+    names = tuple(n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names))
+    unknown = np.full((len(labels), 3), np.nan)
+    return Skeleton(
+        names, tuple(-1 if parents[g] < 0 else place[parents[g]] for g in order), tuple(segments), unknown,
+        np.full((len(order), 3), np.nan), (), tuple((GIVE,) * len(s) for s in segments), (RANGE,) * len(order),
+    )
+
+
+def linkage(apart: NDArray, most: float) -> list[set[int]]:
+    """Groups by complete linkage: the two groups whose farthest members are nearest are merged, up to `most`."""
+    groups = [{i} for i in range(len(apart))]
+    d = np.array(apart, float)
+    np.fill_diagonal(d, np.inf)
+    while len(groups) > 1:
+        i, j = np.unravel_index(np.argmin(d), d.shape)
+        if d[i, j] > most:
+            break
+        i, j = min(i, j), max(i, j)
+        groups[i] |= groups.pop(j)
+        d[i] = d[:, i] = np.maximum(d[i], d[j])
+        d = np.delete(np.delete(d, j, 0), j, 1)
+        d[i, i] = np.inf
+    return groups
+
+
+def settle(positions: NDArray, groups: list[set[int]]) -> list[set[int]]:
+    """Each marker in the group from which it strays least; groups too small for a motion of their own stay."""
+    for _ in range(3):
+        whole = [g for g in groups if len(g) >= 3]
+        stray = np.stack([strays(positions, g) for g in whole]) if whole else np.empty((0, positions.shape[1]))
+        moved = False
+        for number, g in enumerate(whole):
+            for m in sorted(g):
+                best = int(np.argmin(stray[:, m]))
+                if best != number and len(g) > 3 and stray[best, m] < 0.7 * stray[number, m]:
+                    g.discard(m)
+                    whole[best].add(m)
+                    moved = True
+        for g in [g for g in groups if len(g) < 3]:
+            for m in sorted(g):
+                if len(whole) and stray[:, m].min() < GIVE_WITHIN / 2:
+                    g.discard(m)
+                    whole[int(np.argmin(stray[:, m]))].add(m)
+                    moved = True
+        groups = [g for g in groups if g]
+        if not moved:
+            break
+    return groups
+
+
+def strays(positions: NDArray, group: set[int]) -> NDArray:
+    """(M,) [m] how far each marker strays from its mean place in a group's frame, along one axis; its own fit left out."""
+    out = np.full(positions.shape[1], np.inf)
+    inside = sorted(group)
+    for leave in [None, *inside] if len(inside) > 3 else [None]:
+        used = [m for m in inside if m != leave]
+        R, t = rigid_frames(shape_of(positions[:, used]), positions[:, used])
+        who = [leave] if leave is not None else list(range(positions.shape[1]))
+        back = local(R, t, positions[:, who])
+        middle = np.nanmedian(back, axis=0)
+        away = np.nanmedian(((back - middle) ** 2).sum(-1), axis=0)
+        out[who] = np.where(np.isfinite(away), np.sqrt(away / 3), np.inf)
+    return out
+
+
+def shape_of(y: NDArray) -> NDArray:
+    """(k, 3) mean shape of markers that move together, y (F, k, 3)."""
+    shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
+    shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
+    for _ in range(3):
+        middle = np.nanmedian(local(*rigid_frames(shape, y), y), axis=0)
+        shape = np.where(np.isfinite(middle), middle, shape)
+    return shape
+
+
+def share(positions: NDArray, members: list[tuple[int, ...]]) -> list[set[int]]:
+    """Each group with the markers of others that hardly stray from it."""
+    out = []
+    for g in members:
+        stray = strays(positions, set(g)) if len(g) >= 3 else np.full(positions.shape[1], np.inf)
+        out.append(set(g) | set(np.flatnonzero(stray < SHARED_GIVE).tolist()))
+    return out
+
+
+def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) -> NDArray:
+    """(G, G) [m] how badly two groups meet in a point that is constant in both, with half of its way to their markers.
+
+    The way counts since a point far from both is nearly constant for any two that turn little.
+    """
+    count = len(groups)
+    cost = np.full((count, count), np.inf)
+    frames = []
+    for g in groups:
+        x = shape_of(positions[:, sorted(g)])
+        frames.append((x, *rigid_frames(x, positions[:, sorted(g)])) if len(g) >= 3 else None)
+    for a in range(count):
+        for b in range(a):
+            first, second = (a, b) if frames[a] is not None else (b, a)
+            if groups[a] & groups[b]:
+                cost[a, b] = 0.0
+            elif frames[first] is None:
+                between = deviation[np.ix_(sorted(groups[a]), sorted(groups[b]))]
+                cost[a, b] = np.nanmin(between, initial=np.inf) + 0.05
+            else:
+                cost[a, b] = joint_residual(frames[first], frames[second], positions[:, sorted(groups[second])])
+            near = np.linalg.norm(
+                positions[:, sorted(groups[a])][:, :, None] - positions[:, sorted(groups[b])][:, None], axis=-1
+            )
+            near = np.nanmin(np.nanmedian(near, axis=0)) if np.isfinite(near).any() else np.inf
+            cost[a, b] = cost[b, a] = cost[a, b] + 0.1 * near
+    return cost
+
+
+def spanning_tree(cost: NDArray, root: int) -> tuple[list[int], list[int]]:
+    """Order (parents first, depth first) and parents (-1 for the root) of the tree of least total cost."""
+    count = len(cost)
+    parents, best, inside = [-1] * count, cost[root].copy(), {root}
+    nearest = np.full(count, root)
+    while len(inside) < count:
+        outside = [g for g in range(count) if g not in inside]
+        g = min(outside, key=lambda k: best[k])
+        parents[g] = int(nearest[g])
+        inside.add(g)
+        closer = cost[g] < best
+        best, nearest = np.where(closer, cost[g], best), np.where(closer, g, nearest)
+    order: list[int] = []
+    stack = [root]
+    while stack:
+        g = stack.pop()
+        order.append(g)
+        stack += [c for c in range(count) if parents[c] == g][::-1]
+    return order, parents
+
+
+def named(labels: Sequence[str]) -> str:
+    """A group's name: its first two labels, without the subject."""
+    plain = [label.rpartition(":")[2] for label in labels]
+    return "+".join(plain[:2]) + ("+" if len(plain) > 2 else "")
