@@ -6,12 +6,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.se3 import log_so3
+from kinefit.identification.model import MarkerJoint
+
+SECOND_RANGE = 0.35
+"""Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
+and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
 
 
 def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
     """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
 
-    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where nothing is seen.
+    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where
+    nothing is seen.
     """
     prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
     seen = np.isfinite(y[..., 0])
@@ -131,3 +137,9 @@ def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float
     low, high = np.quantile(turns @ axes, [0.05, 0.95], axis=0)
     first, second, third = np.sort(high - low)[::-1].tolist()
     return first, second, third
+
+
+def told(joint: MarkerJoint, full: float) -> float:
+    """0..1: how much of its range `full` [rad] a joint went through; the axis it turns about second counts for half."""
+    first, second, _ = joint.ranges
+    return 0.5 * min(1.0, first / full) + 0.5 * min(1.0, second / (SECOND_RANGE * full))

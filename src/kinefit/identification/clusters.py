@@ -12,11 +12,20 @@ from kinefit.identification.from_frame import Skeleton
 from kinefit.identification.marker_sets import GIVE, RANGE
 
 GIVE_WITHIN = 0.012
-"""[m] deviation of a distance up to which two markers may be of one segment: twice what the catalogue's markers give
-by (0.004 m each end, and their noise), so that a soft part holds together; joints that turn move theirs by centimetres."""
+"""[m] deviation of a distance up to which two markers are of one segment: twice what the catalogue's markers give by
+(0.004 m at each end), so that a soft part holds together; joints that turn move theirs by centimetres."""
+
+LOOSE = 1.5
+"""By how much more a distance may give to a marker of a neighbour that helps a group of one or two to a shape."""
 
 SHARED_GIVE = 0.010
-"""[m] a marker that strays less than this from a second segment is that segment's too: it sits on their joint."""
+"""[m] a marker that strays less than this from a second segment may be that segment's too: it sits on their joint."""
+
+MOST_SHARED = 2
+"""Markers that two segments share at most: those on a hinge's axis."""
+
+MOST_FRAMES = 300
+"""Frames that are looked at here; every marker is fitted without itself."""
 
 
 def learn_segments(positions: NDArray, labels: Sequence[str], deviation: NDArray) -> Skeleton:
@@ -24,27 +33,30 @@ def learn_segments(positions: NDArray, labels: Sequence[str], deviation: NDArray
 
     Complete linkage over the deviations of distances gives groups; each marker then goes to the group from whose
     rigid motion it strays least, and to a second one too if it hardly strays from that. Groups are joined into a tree
-    by the points that are most nearly constant in both frames; the root is the group with most markers and joints.
+    by the points that are most nearly constant in both frames.
 
     Parameters
     ----------
     positions : (F, M, 3) [m]
     deviation : (M, M) [m] of distances, NaN for two that are never seen together
     """
-    groups = linkage(np.where(np.isfinite(deviation), deviation, np.inf), GIVE_WITHIN)
-    groups = settle(positions, groups)
+    positions = positions[:: -(-len(positions) // MOST_FRAMES)]
+    apart = np.where(np.isfinite(deviation), deviation, np.inf)
+    groups = settle(positions, linkage(apart, GIVE_WITHIN))
+    small = [g for g in groups if len(g) < 3]
+    index = sorted(set().union(*small))  # of these, two and two that are nearly of one segment
+    groups = [g for g in groups if len(g) >= 3]
+    groups += [{index[i] for i in g} for g in linkage(apart[np.ix_(index, index)], LOOSE * GIVE_WITHIN)]
     members = [tuple(sorted(g)) for g in groups]
-    shared = share(positions, members)
+    wide = [widened(g, apart) for g in groups]
+    shared = share(positions, members, wide)
     cost = joint_costs(positions, shared, deviation)
-    root = max(range(len(members)), key=lambda g: (len(members[g]), -float(np.sort(cost[g])[:3].sum())))
-    order, parents = spanning_tree(cost, root)
+    order, parents = rooted(cost, [len(m) for m in members])
     place = {g: i for i, g in enumerate(order)}
     segments = []
     for g in order:
-        p = parents[g]
-        keep = set(members[g]) | (shared[g] & set(members[p]) if p >= 0 else set())
-        keep |= {m for c in order if parents[c] == g for m in shared[g] & set(members[c])}
-        segments.append(tuple(sorted(keep)))
+        near = [c for c in order if parents[c] == g] + ([parents[g]] if parents[g] >= 0 else [])
+        segments.append(tuple(sorted(set(members[g]).union(*(shared[g] & set(members[c]) for c in near)))))
     names = tuple(named([labels[m] for m in members[g]]) for g in order)
     names = tuple(n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names))
     unknown = np.full((len(labels), 3), np.nan)
@@ -97,7 +109,7 @@ def settle(positions: NDArray, groups: list[set[int]]) -> list[set[int]]:
 
 
 def strays(positions: NDArray, group: set[int]) -> NDArray:
-    """(M,) [m] how far each marker strays from its mean place in a group's frame, along one axis; its own fit left out."""
+    """(M,) [m] how far each marker strays from its mean place in the frame of a group (without itself), on one axis."""
     out = np.full(positions.shape[1], np.inf)
     inside = sorted(group)
     for leave in [None, *inside] if len(inside) > 3 else [None]:
@@ -121,12 +133,30 @@ def shape_of(y: NDArray) -> NDArray:
     return shape
 
 
-def share(positions: NDArray, members: list[tuple[int, ...]]) -> list[set[int]]:
-    """Each group with the markers of others that hardly stray from it."""
+def widened(group: set[int], apart: NDArray) -> set[int]:
+    """A group of one or two with markers of others that hold their distances to it, the firmest first, up to four."""
+    out = set(group)
+    while len(group) < 3 and len(out) < 4:
+        firm = apart[sorted(out)].max(0)
+        firm[sorted(out)] = np.inf
+        if firm.min() > LOOSE * GIVE_WITHIN:
+            break
+        out.add(int(np.argmin(firm)))
+    return out
+
+
+def share(positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int]]) -> list[set[int]]:
+    """Each group with markers of others that hardly stray from it: of each other group the two that do least."""
     out = []
-    for g in members:
-        stray = strays(positions, set(g)) if len(g) >= 3 else np.full(positions.shape[1], np.inf)
-        out.append(set(g) | set(np.flatnonzero(stray < SHARED_GIVE).tolist()))
+    for g, more in zip(members, wide):
+        found = set(more)
+        if len(g) >= 3:
+            stray = strays(positions, set(g))
+            for other in members:
+                if other is not g:
+                    firm = sorted((m for m in other if stray[m] < SHARED_GIVE), key=lambda m: stray[m])
+                    found |= set(firm[:MOST_SHARED])
+        out.append(found)
     return out
 
 
@@ -159,24 +189,29 @@ def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) 
     return cost
 
 
-def spanning_tree(cost: NDArray, root: int) -> tuple[list[int], list[int]]:
-    """Order (parents first, depth first) and parents (-1 for the root) of the tree of least total cost."""
+def rooted(cost: NDArray, sizes: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Order (parents first, depth first) and parents (-1 for the root) of the tree of least total cost.
+
+    The root has most markers times neighbours (P5 3.2: more points, and more segments linked to it, than most).
+    """
     count = len(cost)
-    parents, best, inside = [-1] * count, cost[root].copy(), {root}
-    nearest = np.full(count, root)
-    while len(inside) < count:
-        outside = [g for g in range(count) if g not in inside]
+    links: list[set[int]] = [set() for _ in range(count)]
+    best, nearest, outside = cost[0].copy(), np.zeros(count, int), set(range(1, count))
+    while outside:
         g = min(outside, key=lambda k: best[k])
-        parents[g] = int(nearest[g])
-        inside.add(g)
+        links[g].add(int(nearest[g]))
+        links[int(nearest[g])].add(g)
+        outside.discard(g)
         closer = cost[g] < best
         best, nearest = np.where(closer, cost[g], best), np.where(closer, g, nearest)
-    order: list[int] = []
-    stack = [root]
+    root = max(range(count), key=lambda g: sizes[g] * max(len(links[g]), 1))
+    order, parents, stack = [], [-1] * count, [root]
     while stack:
         g = stack.pop()
         order.append(g)
-        stack += [c for c in range(count) if parents[c] == g][::-1]
+        for c in sorted(links[g] - {parents[g]}, reverse=True):
+            parents[c] = g
+            stack.append(c)
     return order, parents
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._rigid import meet, rigid_frames, turned
+from kinefit.identification._rigid import meet, rigid_frames, told, turned
 from kinefit.identification.clusters import learn_segments
 from kinefit.identification.from_frame import (
     JOINT_SPREAD,
@@ -29,10 +29,6 @@ from kinefit.observations import Markers
 
 MOST_FRAMES = 1000
 """Frames that are looked at, spread over the take: neighbours in time say the same."""
-
-SECOND_RANGE = 0.35
-"""Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
-and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
 
 SELDOM = 0.01
 """A label that fewer of the frames show is left out: mostly a rest of somebody's editing ("RBAC-1")."""
@@ -133,9 +129,9 @@ def fit_model(
             typical = float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD
             ranges = turned(Rs[p], R, np.isfinite(y[..., 0]).sum(1) >= min(3, len(x)))
             joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
-            told = exercised_share(joint, skeleton.ranges[s])
+            known_share = told(joint, skeleton.ranges[s])
             usual = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
-            joints.append(replace(joint, spread=float(np.sqrt(told * typical**2 + (1 - told) * usual**2))))
+            joints.append(replace(joint, spread=float(np.sqrt(known_share * typical**2 + (1 - known_share) * usual**2))))
         Rs.append(R)
         ts.append(t)
     tree_low, tree_high = reach(reference, skeleton.members, joints)
@@ -160,9 +156,9 @@ def exercise(skeleton: Skeleton, joints: Sequence[MarkerJoint], count: int) -> N
     Across joints: the least of the joints between. Within a segment: the mean of its joints, as skin is moved by them.
     """
     members = skeleton.members
-    share = {j.child: exercised_share(j, skeleton.ranges[j.child]) for j in joints}
+    share = {j.child: told(j, skeleton.ranges[j.child]) for j in joints}
     parent = {j.child: j.parent for j in joints}
-    told = np.ones((count, count))
+    known = np.ones((count, count))
     for a in range(len(members)):
         for b in range(a, len(members)):
             if a == b:
@@ -171,15 +167,9 @@ def exercise(skeleton: Skeleton, joints: Sequence[MarkerJoint], count: int) -> N
             else:
                 value = min(share[s] for s in _between(a, b, parent))
             i, j = np.ix_(list(members[a]), list(members[b])), np.ix_(list(members[b]), list(members[a]))
-            told[i] = np.minimum(told[i], value)
-            told[j] = np.minimum(told[j], value)
-    return told
-
-
-def exercised_share(joint: MarkerJoint, full: float) -> float:
-    """0..1: how much of its range a joint went through in training; half of it is for the second axis."""
-    first, second, _ = joint.ranges
-    return 0.5 * min(1.0, first / full) + 0.5 * min(1.0, second / (SECOND_RANGE * full))
+            known[i] = np.minimum(known[i], value)
+            known[j] = np.minimum(known[j], value)
+    return known
 
 
 def _between(a: int, b: int, parent: dict[int, int]) -> list[int]:
