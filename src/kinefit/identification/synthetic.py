@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.se3 import rotation_from_rotvec
+from kinefit.geometry.se3 import exp_so3
 from kinefit.identification.from_frame import model_from_frame
 from kinefit.identification.marker_sets import MarkerSet, SetSegment
 from kinefit.identification.model import MarkerModel
@@ -151,6 +151,6 @@ def _turn(rng: np.random.Generator, rotation: float | None) -> NDArray:
     if rotation is None:
         q = rng.standard_normal(4)
         angle = 2 * np.arctan2(np.linalg.norm(q[1:]), q[0])
-        return rotation_from_rotvec(angle * q[1:] / np.linalg.norm(q[1:]))
+        return exp_so3(angle * q[1:] / np.linalg.norm(q[1:]))
     axis = rng.standard_normal(3)
-    return rotation_from_rotvec(rng.uniform(0.0, rotation) * axis / np.linalg.norm(axis))
+    return exp_so3(rng.uniform(0.0, rotation) * axis / np.linalg.norm(axis))

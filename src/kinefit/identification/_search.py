@@ -1,0 +1,180 @@
+"""The search over the tree of segments: every segment's choices under each choice of its parent, best and likely ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.identification._kernels_identify import enumerate_segment, place_joint
+from kinefit.identification._tables import SegmentTable
+
+LOOSE = 0.15
+"""[m] a joint that the parent places worse than this tells its child nothing."""
+
+ROOM = 48
+"""Choices kept of a segment under one choice of its parent; the unlikeliest are dropped."""
+
+SLACK = 14.0
+"""Choices whose cost is this much above the best are dropped: one in a million of its likelihood."""
+
+
+@dataclass(eq=False)
+class Node:
+    """A segment's choices where its parent says one and the same of it.
+
+    Parameters
+    ----------
+    index : (C, k) int, points, -1 for none; cost : (C,) own; squares : (C,) weighted residual squares
+    new : (C, W) uint64, points that are chosen here (not given by the parent), as bits; all : given ones too
+    below : for each choice the nodes of the children
+    best : (C,) cost with the best below; total : (C,) -log of the sum over all below
+    """
+
+    table: SegmentTable
+    index: NDArray
+    cost: NDArray
+    squares: NDArray
+    new: NDArray
+    all: NDArray
+    below: list[list[Node]] = field(default_factory=list)
+    best: NDArray = field(default_factory=lambda: np.empty(0))
+    total: NDArray = field(default_factory=lambda: np.empty(0))
+
+
+class Search:
+    """One frame at one noise level.
+
+    Parameters
+    ----------
+    points : (N, 3) [m]
+    scale : factor on the model's deviations
+    gain : what a matched marker earns against a missing one, log(1/m³)
+    """
+
+    def __init__(self, tables: tuple[SegmentTable, ...], points: NDArray, gaps: NDArray, scale: float, gain: float, volume: float, gate: float):
+        self.tables = tables
+        self.by_index = {t.index: t for t in tables}
+        self.points, self.gaps, self.scale, self.gain, self.gate = points, gaps, scale, gain, gate
+        self.log_volume = float(np.log(volume))
+        self.sigma = {t.index: t.sigma * scale for t in tables}
+        self.memo: dict[tuple, Node] = {}
+        words = (len(points) + 63) // 64
+        self.bits = np.zeros((len(points) + 1, words), np.uint64)  # the last row: no point
+        for i in range(len(points)):
+            self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
+        self.nodes: list[Node] = []
+
+    def node(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
+        """The node of a segment under a choice of its parent's."""
+        given = np.full(len(table.markers), -2, np.int64)
+        pivot, sigma_pivot, key = np.zeros(3), -1.0, (table.index, None)
+        if parent is not None:
+            points = parent.index[choice]
+            common = table.shared >= 0
+            given[common] = points[table.shared[common]]
+            if (given >= 0).any():
+                key = (table.index, tuple(given[common].tolist()))
+            else:
+                pivot, sigma_pivot = self.joint(parent, choice, table)
+                key = (table.index, id(parent), choice) if sigma_pivot > 0 else (table.index, tuple(given.tolist()))
+        found = self.memo.get(key)
+        if found is None:
+            found = self.memo[key] = self.expand(table, given, pivot, sigma_pivot)
+        return found
+
+    def joint(self, parent: Node, choice: int, table: SegmentTable) -> tuple[NDArray, float]:
+        """Where a choice of the parent puts the joint, and its standard deviation [m]; that is < 0 where too loose."""
+        points = parent.index[choice]
+        here = points >= 0
+        if here.sum() < 2:
+            return np.zeros(3), -1.0
+        at = np.empty(3)
+        t = parent.table
+        variance = place_joint(int(here.sum()), t.x[here], self.points[points[here]], self.sigma[t.index][here], table.joint_there, at)
+        deviation = float(np.sqrt(variance + (table.spread * min(self.scale, 1.0)) ** 2))
+        return (at, deviation) if deviation < LOOSE else (at, -1.0)
+
+    def expand(self, table: SegmentTable, given: NDArray, pivot: NDArray, sigma_pivot: float) -> Node:
+        """Choices of a segment, then of all below it."""
+        k = len(table.markers)
+        index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
+        free = sigma_pivot <= 0 and not (given >= 0).any()
+        joint = table.joint_here if table.joint_here is not None else np.zeros(3)
+        count = enumerate_segment(
+            self.points, self.gaps, table.x, table.D, self.sigma[table.index], given, joint, pivot, sigma_pivot,
+            self.gate, self.gain, SLACK, 3 if free else 1, index, cost, squares,
+        )  # fmt: skip
+        index, cost, squares = index[:count], cost[:count], squares[:count]
+        if free:
+            cost[1:] += self.log_volume
+        keep = np.flatnonzero(cost <= cost.min() + SLACK)
+        keep = keep[np.argsort(cost[keep])]
+        if keep[-1] != 0 and 0 not in keep:
+            keep = np.append(keep, 0)
+        index, cost, squares = index[keep], cost[keep], squares[keep]
+        new = np.where(given == -2, index, -1)
+        node = Node(
+            table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1)
+        )
+        for c in range(len(cost)):
+            node.below.append([self.node(self.by_index[child], node, c) for child in table.children])
+        self.nodes.append(node)  # children come before their parents
+        self.weigh(node)
+        return node
+
+    def weigh(self, node: Node, extra: NDArray | None = None) -> None:
+        """Costs of each choice with all below it: `best` and `total`."""
+        own = node.cost if extra is None else node.cost + extra
+        node.best, node.total = own.copy(), own.copy()
+        for c, below in enumerate(node.below):
+            for child in below:
+                fits = ~(child.new & node.all[c]).any(1)
+                best = child.best[fits].min()
+                node.best[c] += best
+                low = child.total[fits].min()
+                node.total[c] += low - np.log(np.exp(low - child.total[fits]).sum())
+
+    def decode(self, node: Node, forbidden: NDArray | None = None) -> list[tuple[Node, int]]:
+        """The best choices of a node and all below it, top down."""
+        fits = np.ones(len(node.cost), bool) if forbidden is None else ~(node.new & forbidden).any(1)
+        c = int(np.argmin(np.where(fits, node.best, np.inf)))
+        found = [(node, c)]
+        for child in node.below[c]:
+            found += self.decode(child, node.all[c])
+        return found
+
+    def reweigh(self, extra: dict[int, NDArray]) -> None:
+        """Weigh anew with a cost for each point that a segment chooses: segment -> (N,)."""
+        for node in self.nodes:
+            price = extra.get(node.table.index)
+            if price is None:
+                self.weigh(node)
+            else:
+                self.weigh(node, self.price(node, price))
+
+    def price(self, node: Node, price: NDArray) -> NDArray:
+        """(C,) what the points that each choice takes cost."""
+        padded = np.append(price, 0.0)
+        new = np.where(node.table.shared >= 0, -1, node.index)
+        return padded[new].sum(1)
+
+    def marginals(self, root: Node, labels: int) -> NDArray:
+        """(M, N + 1) probability of each point to be each label, the last for none."""
+        share: dict[int, NDArray] = {id(n): np.zeros(len(n.cost)) for n in self.nodes}
+        weight = np.exp(root.total.min() - root.total)
+        share[id(root)] += weight / weight.sum()
+        table = np.zeros((labels, len(self.points) + 1))
+        for node in reversed(self.nodes):  # parents before children
+            p = share[id(node)]
+            if not p.any():
+                continue
+            fresh = node.table.shared < 0
+            for c in np.flatnonzero(p > 1e-6):
+                table[node.table.markers[fresh], node.index[c, fresh]] += p[c]
+                for child in node.below[c]:
+                    fits = ~(child.new & node.all[c]).any(1)
+                    weight = np.where(fits, np.exp(child.total[fits].min() - child.total), 0.0)
+                    share[id(child)] += p[c] * weight / weight.sum()
+        return table

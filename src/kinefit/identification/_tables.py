@@ -1,0 +1,81 @@
+"""A marker model as the search wants it: per segment places, distances, deviations, what is shared, joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.identification.model import MarkerModel
+
+FINEST = 1e-3
+"""[m] least standard deviation of a marker's coordinate in its segment: below it, training was too short to tell."""
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentTable:
+    """One segment, seen from the root that was chosen.
+
+    Parameters
+    ----------
+    index, parent : of the segment, parent -1 for the root
+    children : indexes
+    markers : (k,) int
+    x : (k, 3) [m] reference positions; D : (k, k) [m] their distances
+    sigma : (k,) [m] standard deviation of each coordinate
+    shared : for each marker its place in the parent's `markers`, or -1
+    joint_here, joint_there : (3,) [m] in this segment's and the parent's reference; None for the root
+    spread : [m] per coordinate
+    """
+
+    index: int
+    parent: int
+    children: tuple[int, ...]
+    markers: NDArray
+    x: NDArray
+    D: NDArray
+    sigma: NDArray
+    shared: NDArray
+    joint_here: NDArray | None
+    joint_there: NDArray | None
+    spread: float
+
+
+def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
+    """The model's segments, parents first, hung from any of them as the root."""
+    links: dict[int, list[tuple[int, NDArray, NDArray, float]]] = {s: [] for s in range(len(model.segments))}
+    for j in model.joints:
+        links[j.parent].append((j.child, np.asarray(j.in_child, float), np.asarray(j.in_parent, float), j.spread))
+        links[j.child].append((j.parent, np.asarray(j.in_parent, float), np.asarray(j.in_child, float), j.spread))
+    found: list[SegmentTable] = []
+    todo: list[tuple[int, int, NDArray | None, NDArray | None, float]] = [(root, -1, None, None, 0.0)]
+    while todo:
+        s, parent, here, there, spread = todo.pop(0)
+        below = [link for link in links[s] if link[0] != parent]
+        todo += [(child, s, a, b, width) for child, a, b, width in below]
+        markers = np.array(model.segments[s], np.int64)
+        x = np.ascontiguousarray(np.asarray(model.reference, float)[markers])
+        above = list(model.segments[parent]) if parent >= 0 else []
+        shared = np.array([above.index(m) if m in above else -1 for m in markers], np.int64)
+        D = np.linalg.norm(x[:, None] - x, axis=-1)
+        found.append(
+            SegmentTable(
+                s, parent, tuple(link[0] for link in below), markers, x, D,
+                deviations(model.deviation[np.ix_(markers, markers)]), shared, here, there, spread,
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def deviations(deviation: NDArray) -> NDArray:
+    """(k,) [m] standard deviations of each marker's coordinates from those of distances: d_ij² ≈ s_i² + s_j²."""
+    k = len(deviation)
+    if k < 2:
+        return np.full(k, 0.01)
+    square = np.where(np.isfinite(deviation), deviation, np.nanmedian(deviation)) ** 2
+    np.fill_diagonal(square, 0.0)
+    total = square.sum() / (2 * (k - 1))
+    mean = total / k
+    own = (square.sum(1) - total) / (k - 2) if k > 2 else np.full(k, mean)
+    return np.sqrt(np.maximum(own, max(0.25 * mean, FINEST**2)))

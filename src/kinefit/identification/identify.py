@@ -1,0 +1,192 @@
+"""Who is who in one frame of unlabelled markers: the model's labels, each with the point it is, or none."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from itertools import count as counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.identification._search import Node, Search
+from kinefit.identification._tables import SegmentTable, segment_tables
+from kinefit.identification.model import MarkerModel
+
+
+@dataclass(frozen=True)
+class IdentifySettings:
+    """How `identify` searches; nothing of it is about one body or one recording.
+
+    Parameters
+    ----------
+    scales : noise levels that are tried in turn, as factors on the model's deviations
+    certain : a label less probable than this is unknown
+    gate : deviations by which a distance may differ
+    miss : expected share of missing markers, before the frame's count is known
+    """
+
+    scales: tuple[float, ...] = (0.02, 0.3, 1.0, 2.0)
+    certain: float = 0.9
+    gate: float = 3.5
+    miss: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Names of one frame's points.
+
+    Parameters
+    ----------
+    assignment : (M,) int, the point of each of the model's labels; -1 where it is missing or not known
+    confidence : (M,)
+        Probability that the assignment is right; where it is -1, that of the best guess, which was too little.
+    cost : float, -log likelihood of the whole body's best explanation against that nothing is a marker
+    ambiguous : whether a label has a guess, but none that is probable enough
+    scale : noise found, as a factor on the model's deviations
+    guess : (M,) int, the most probable of all, however probable
+    """
+
+    assignment: NDArray
+    confidence: NDArray
+    cost: float
+    ambiguous: bool
+    scale: float = 1.0
+    guess: NDArray | None = None
+
+
+def identify(
+    model: MarkerModel, points: ArrayLike, *, previous: ArrayLike | None = None, settings: IdentifySettings | None = None
+) -> Identification:
+    """Which point of a frame is which of the model's labels; needs no pose, nor how many are missing or too many.
+
+    Parameters
+    ----------
+    points : (N, 3) [m], finite
+    previous : (M, 3) [m] or None
+        Where the labels were a moment ago, NaN where not known; not used for what the frame itself makes certain.
+
+    Raises
+    ------
+    ObservationError
+        Points of the wrong shape or not finite.
+    """
+    settings = settings or IdentifySettings()
+    at = np.ascontiguousarray(points, float)
+    if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
+        raise ObservationError(
+            f"points of shape {at.shape}, or not finite", remedy="Give the (N, 3) [m] points that were seen, without gaps."
+        )
+    count = len(model)
+    if len(at) < 3:
+        return Identification(np.full(count, -1), np.zeros(count), 0.0, False, guess=np.full(count, -1))
+    gaps = np.linalg.norm(at[:, None] - at, axis=-1)
+    box = float(np.prod(np.ptp(at, 0) + 0.3))
+    miss = min(max(1 - len(at) / count, settings.miss), 0.5)
+    clutter = max(len(at) - count * (1 - miss), 0.5) / box
+    gain = float(np.log((1 - miss) / (miss * clutter)))
+    tables = segment_tables(model, _root(model))
+    best: Solution | None = None
+    for scale in settings.scales:
+        found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
+        if best is None or found.cost < best.cost:
+            best = found
+        if best.matched >= 0.5 * min(count, len(at)) and best.noise < 0.7 * best.search.scale:
+            break
+    assert best is not None
+    return _decide(best, count, settings.certain)
+
+
+def _root(model: MarkerModel) -> int:
+    """The segment with most markers; of equals the one with most joints (P5 3.2)."""
+    links = [sum(s in (j.parent, j.child) for j in model.joints) for s in range(len(model.segments))]
+    return max(range(len(model.segments)), key=lambda s: (len(model.segments[s]), links[s], -s))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The best explanation at one noise level: the nodes and choices, top down."""
+
+    search: Search
+    root: Node
+    chosen: list[tuple[Node, int]]
+    cost: float
+    noise: float
+    matched: int
+
+
+def _solve(
+    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float
+) -> Solution:
+    search = Search(tables, at, gaps, scale, gain, box, gate)
+    root = search.node(tables[0], None, -1)
+    chosen, cost = _without_conflicts(search, root, len(at))
+    squares, freedom, matched = 0.0, 0, 0
+    for node, c in chosen:
+        n = int((node.index[c] >= 0).sum())
+        if n >= 2:
+            squares += float(node.squares[c])
+            freedom += 1 if n == 2 else 3 * n - 6
+        matched += int((node.index[c][node.table.shared < 0] >= 0).sum())
+    return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched)
+
+
+def _without_conflicts(search: Search, root: Node, count: int) -> tuple[list[tuple[Node, int]], float]:
+    """The best explanation in which no two labels share a point: best first over who must do without it."""
+    order = counter()
+    queue: list[tuple[float, int, dict[int, NDArray], list[tuple[Node, int]]]] = []
+
+    def push(extra: dict[int, NDArray]) -> None:
+        if extra:
+            search.reweigh(extra)
+        chosen = search.decode(root)
+        heapq.heappush(queue, (float(root.best[chosen[0][1]]), next(order), extra, chosen))
+
+    push({})
+    for _ in range(32):
+        cost, _, extra, chosen = heapq.heappop(queue)
+        clash = _clash(chosen)
+        if clash is None or len(queue) > 64:
+            break
+        point, segments = clash
+        for s in segments:
+            price = extra.get(s, np.zeros(count)).copy()
+            price[point] = 1e3
+            push({**extra, s: price})
+    return chosen, cost
+
+
+def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
+    taken: dict[int, tuple[int, int]] = {}
+    for node, c in chosen:
+        for marker, point, shared in zip(node.table.markers.tolist(), node.index[c].tolist(), node.table.shared.tolist()):
+            if point < 0 or shared >= 0:
+                continue
+            if point in taken and taken[point][0] != marker:
+                return point, (taken[point][1], node.table.index)
+            taken[point] = (marker, node.table.index)
+    return None
+
+
+def _decide(found: Solution, count: int, certain: float) -> Identification:
+    """Labels that are probable enough, by the share of all explanations that agree on them."""
+    search = found.search
+    near = {t.index: {t.index, t.parent, *t.children} for t in search.tables}
+    extra: dict[int, NDArray] = {}
+    guess = np.full(count, -1)
+    for node, c in found.chosen:
+        fresh = node.table.shared < 0
+        guess[node.table.markers[fresh]] = node.index[c, fresh]
+        for t in search.tables:
+            if node.table.index not in near[t.index]:
+                mine = node.index[c, fresh]
+                extra.setdefault(t.index, np.zeros(len(search.points)))[mine[mine >= 0]] = 5.0
+    search.reweigh(extra)
+    table = search.marginals(found.root, count)
+    confidence = table[np.arange(count), guess]
+    known = (confidence >= certain) & (guess >= 0)
+    assignment = np.where(known, guess, -1)
+    return Identification(
+        assignment, np.where(guess >= 0, confidence, 0.0), found.cost, bool(((guess >= 0) & ~known).any()), found.noise, guess
+    )
