@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
-from kinefit.bodies import Body, load_body
+import numpy as np
+
+from kinefit.bodies import Body, PointSet, load_body
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
 from kinefit.errors import ExportError
-from kinefit.motion import Motion
+from kinefit.motion import Motion, rotation_between_up
+from kinefit.tracking.marker_subject import MarkerSubject
 
-FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb")
+FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 """Formats that are written where none are named."""
+
+_MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
 
 
 def fit_file(
@@ -45,7 +51,7 @@ def fit_file(
     unit : str, optional, of files that tell none or a wrong one.
     up : str, optional, vertical axis of the world where the file does not tell it; default: found from the markers.
     limits : bool, whether joints stay within their ranges.
-    formats : names of `_results.NAMES`.
+    formats : names of `_results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, told of progress.
 
     Returns
@@ -57,6 +63,7 @@ def fit_file(
     KinefitError
         A file cannot be read or written, too few labels are known, or no frame shows enough: see `fit_markers`.
     """
+    from kinefit.exporters import write_markers, write_osim
     from kinefit.readers.markers import read_markers
     from kinefit.tracking.marker_people import split_people
     from kinefit.tracking.marker_subject import fit_marker_subject
@@ -65,9 +72,9 @@ def fit_file(
     step = step or (lambda what, done, total: None)
     source, formats = Path(path), tuple(formats)
     folder = Path(out) if out is not None else source.with_name(f"{source.stem}-kinefit")
-    unknown = [name for name in formats if name not in _results.NAMES]
+    unknown = [name for name in formats if name not in (*_results.NAMES, "markers")]
     if unknown:
-        raise ExportError(f"no format {unknown[0]!r}", remedy=f"There are: {', '.join(_results.NAMES)}.")
+        raise ExportError(f"no format {unknown[0]!r}", remedy=f"There are: {', '.join(_results.NAMES)}, markers.")
     _results.check_folder(folder)
     generic = body if isinstance(body, Body) else load_body(body)
     people = split_people(read_markers(source, unit=unit))
@@ -76,10 +83,31 @@ def fit_file(
     for person, markers in people.items():
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
         subject = fit_marker_subject(
-            generic, [markers] if trial is None else [trial, markers], marker_set, height=height, up=up, progress=step
+            generic, [markers] if trial is None else [trial, markers], marker_set, height=height, progress=step
         )
         motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=limits, up=up)
         files: dict[str, Path] = {}
-        _results.write_results(motion, folder / person if len(people) > 1 else folder, formats, step, files)
+        own = folder / person if len(people) > 1 else folder
+        plain = [name for name in formats if name not in ("markers", "osim")]
+        _results.write_results(motion, own, plain, step, files)
+        if "osim" in formats:
+            write_osim(wearing(subject), own / _results.NAMES["osim"])
+            files["osim"] = own / _results.NAMES["osim"]
+        if "markers" in formats:
+            R = rotation_between_up(motion.up, "y")
+            write_markers(replace(markers, positions=markers.positions @ R.T, up="y"), own / _MARKERS, unit="m")
+            files["markers"] = own / _MARKERS
         found[person] = motion, files
     return found
+
+
+def wearing(subject: MarkerSubject) -> Body:
+    """The subject's body with its markers among the landmarks, so that a model of it has them in its marker set."""
+    body, points = subject.body, subject.points
+    new = [k for k, name in enumerate(points.names) if name not in body.landmarks.names]
+    both = PointSet(
+        body.landmarks.names + tuple(points.names[k] for k in new),
+        np.concatenate([body.landmarks.segments, points.segments[new]]),
+        np.concatenate([body.landmarks.points, points.points[new]]),
+    )
+    return replace(body, landmarks=both)

@@ -38,6 +38,8 @@ class Node:
     squares: NDArray
     new: NDArray
     all: NDArray
+    pivot: NDArray
+    pivot_sigma: float
     below: list[list[Node]] = field(default_factory=list)
     best: NDArray = field(default_factory=lambda: np.empty(0))
     total: NDArray = field(default_factory=lambda: np.empty(0))
@@ -88,11 +90,14 @@ class Search:
         """Where a choice of the parent puts the joint, and its standard deviation [m]; that is < 0 where too loose."""
         points = parent.index[choice]
         here = points >= 0
-        if here.sum() < 2:
-            return np.zeros(3), -1.0
-        at = np.empty(3)
-        t = parent.table
-        variance = place_joint(int(here.sum()), t.x[here], self.points[points[here]], self.sigma[t.index][here], table.joint_there, at)
+        t, at = parent.table, np.empty(3)
+        x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
+        if parent.pivot_sigma > 0:
+            x, y = np.vstack([x, t.joint_here]), np.vstack([y, parent.pivot])
+            sigma = np.append(sigma, parent.pivot_sigma)
+        if len(x) < 2:
+            return at, -1.0
+        variance = place_joint(len(x), x, y, sigma, table.joint_there, at)
         deviation = float(np.sqrt(variance + (table.spread * min(self.scale, 1.0)) ** 2))
         return (at, deviation) if deviation < LOOSE else (at, -1.0)
 
@@ -111,12 +116,13 @@ class Search:
             cost[1:] += self.log_volume
         keep = np.flatnonzero(cost <= cost.min() + SLACK)
         keep = keep[np.argsort(cost[keep])]
-        if keep[-1] != 0 and 0 not in keep:
+        if 0 not in keep:  # no choice at all
             keep = np.append(keep, 0)
         index, cost, squares = index[keep], cost[keep], squares[keep]
         new = np.where(given == -2, index, -1)
         node = Node(
-            table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1)
+            table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
+            pivot, sigma_pivot,
         )
         for c in range(len(cost)):
             node.below.append([self.node(self.by_index[child], node, c) for child in table.children])

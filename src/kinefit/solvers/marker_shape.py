@@ -112,9 +112,11 @@ def fit_marker_shape(
         H, g = marker_equations(parameters, theta, state, x[f], weight[f], loss)
         H[range(6, n), range(6, n)] += posture
         g[6:n] -= posture * (state.angles - tree.usual)
-        if not tree.root_free:
-            H[:6], H[:, :6], g[:6] = 0.0, 0.0, 0.0
-            H[range(6), range(6)] = 1.0
+        held = np.zeros(len(g), bool)
+        held[:6] = not tree.root_free
+        held[6:n] = ((state.angles <= tree.lower) & (g[6:n] < 0)) | ((state.angles >= tree.upper) & (g[6:n] > 0))
+        H[held], H[:, held], g[held] = 0.0, 0.0, 0.0
+        H[held, held] = 1.0
         return H, g
 
     def eliminated(damping: float) -> tuple[NDArray, NDArray, NDArray]:

@@ -32,6 +32,7 @@ POSTURE = 0.01
 
 _LEAST = 0.005  # [m] no marker is held to be better fixed than this
 _INDEPENDENT = 2.0
+_SIZES = 0.3, 3.0  # of a person, as a share of the generic body's: beyond is a wrong unit
 _POSTURES = 40  # random ones, in which the generic body's distances are looked up
 _ROUNDS = 3  # of calibration: poses of the whole trial, frames chosen anew, shape
 
@@ -93,7 +94,8 @@ def fit_marker_subject(
     Raises
     ------
     ObservationError
-        Too few labels are known; a height or number of frames that cannot be.
+        Too few labels are known, or they are those of two subjects; a unit that makes a giant of a person; a height or
+        number of frames that cannot be.
     TrackingError
         No frame shows enough markers to start from.
     """
@@ -108,6 +110,8 @@ def fit_marker_subject(
     labels = {bare(n) for t in trials for n in t.names}
     placed = find_placement(body, labels, marker_set)
     x = np.concatenate([columns(t, placed.points.names) for t in trials])
+    if not np.isfinite(x).all(axis=2).any():
+        raise ObservationError("none of the markers is seen in any frame", remedy="Is this the right recording?")
     starts = np.cumsum([0, *(len(t) for t in trials)])
     seen = np.isfinite(x).all(axis=2)
     placed, x, seen = _worn(placed, x, seen)
@@ -149,6 +153,12 @@ def bare(label: str) -> str:
 def columns(markers: Markers, names: Sequence[str]) -> NDArray:
     """(F, K, 3) [m] the named markers of a recording, NaN for those that it does not have."""
     labels = [bare(n) for n in markers.names]
+    twice = sorted({n for n in names if labels.count(n) > 1})
+    if twice:
+        raise ObservationError(
+            f"{len(twice)} labels are there for more than one subject: {', '.join(twice[:6])}",
+            file=markers.source or None, remedy="Fit one subject at a time: see `split_people`.",
+        )
     out = np.full((len(markers), len(names), 3), np.nan)
     for k, name in enumerate(names):
         if name in labels:
@@ -181,7 +191,13 @@ def _first_size(body: Body, placed: Placement, x: NDArray) -> float:
     weight = middle_own**2 / variance
     order = np.argsort(ratio := middle / middle_own)
     half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-    return float(np.clip(ratio[order][half], 0.3, 3.0))
+    size = float(ratio[order][half])
+    if not _SIZES[0] < size < _SIZES[1]:
+        raise ObservationError(
+            f"the person would be {size:.3g} times the body's size: the unit of the file is wrong",
+            remedy='State the right one: unit = "mm" ...; or check that the labels are those of the marker set.',
+        )
+    return size
 
 
 def _moved(

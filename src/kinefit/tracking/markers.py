@@ -72,8 +72,9 @@ def fit_markers(
     roots, angles = sequence_both_ways(body, points, x, sigma, loss=loss, limits=limits)
     roots, angles = _tried_anew(body, points, x, sigma, roots, angles, loss, limits)
     sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
+    angles = unwrap(body.tree, angles)
     roots, angles = _bridged(body, points, x, sigma, roots, angles, sure, markers.rate, loss, limits)
-    return _motion(body, markers, points, x, roots, unwrap(body.tree, angles), sure, up)
+    return _motion(body, markers, points, x, roots, angles, sure, up)
 
 
 def _misfit(body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
@@ -113,7 +114,6 @@ def _bridged(
     some = told.any(axis=0)
     if lost.all() or (told[:, some].all() and not lost.any()):
         return roots, angles
-    angles = unwrap(tree, angles)
     frames = np.arange(len(x))
     meant = angles.copy()
     for d in np.flatnonzero(some):
@@ -128,6 +128,7 @@ def _bridged(
             posture=POSTURE, usual=meant[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
+    angles = unwrap(tree, angles) if again.any() else angles
     return roots, angles
 
 
