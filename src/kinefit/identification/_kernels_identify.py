@@ -305,3 +305,24 @@ def place_joint(n, x, y, sigma, joint, out):
     square = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
     inner = r[0] ** 2 * i00 + r[1] ** 2 * i11 + r[2] ** 2 * i22 + 2 * (r[0] * r[1] * i01 + r[0] * r[2] * i02 + r[1] * r[2] * i12)
     return 1 / total + (square * (i00 + i11 + i22) - inner) / (3 * det)
+
+
+@jit
+def weigh_child(new, best, total, taken):
+    """Least of `best`, and -log Σ exp(-total), over the choices (C, W bits) that take none of the points `taken`."""
+    low, low_total = math.inf, math.inf
+    for c in range(len(best)):
+        free = True
+        for i in range(len(taken)):
+            free = free and (new[c, i] & taken[i]) == 0
+        if free:
+            low = best[c] if best[c] < low else low
+            low_total = total[c] if total[c] < low_total else low_total
+    mass = 0.0
+    for c in range(len(best)):
+        free = True
+        for i in range(len(taken)):
+            free = free and (new[c, i] & taken[i]) == 0
+        if free:
+            mass += math.exp(low_total - total[c])
+    return low, low_total - math.log(mass)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._kernels_identify import enumerate_segment, place_joint
+from kinefit.identification._kernels_identify import enumerate_segment, place_joint, weigh_child
 from kinefit.identification._tables import SegmentTable
 
 LOOSE = 0.15
@@ -16,8 +16,8 @@ LOOSE = 0.15
 ROOM = 48
 """Choices kept of a segment under one choice of its parent; the unlikeliest are dropped."""
 
-SLACK = 14.0
-"""Choices whose cost is this much above the best are dropped: one in a million of its likelihood."""
+SLACK = 10.0
+"""Choices whose cost is this much above the best are dropped: e^-10 of its likelihood."""
 
 
 @dataclass(eq=False)
@@ -43,6 +43,12 @@ class Node:
     below: list[list[Node]] = field(default_factory=list)
     best: NDArray = field(default_factory=lambda: np.empty(0))
     total: NDArray = field(default_factory=lambda: np.empty(0))
+    empty: int = -1
+
+    def keep(self, kept: list[int]) -> None:
+        """Drop all other choices."""
+        for name in ("index", "cost", "squares", "new", "all", "best", "total"):
+            setattr(self, name, getattr(self, name)[kept])
 
 
 class Search:
@@ -67,6 +73,7 @@ class Search:
         for i in range(len(points)):
             self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
         self.nodes: list[Node] = []
+        self.promise = {t.index: 0.0 for t in tables}  # least cost of a segment and all below it, as found so far
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
         """The node of a segment under a choice of its parent's."""
@@ -122,25 +129,47 @@ class Search:
         new = np.where(given == -2, index, -1)
         node = Node(
             table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            pivot, sigma_pivot,
+            pivot, sigma_pivot, best=cost.copy(), total=cost.copy(), empty=int(np.flatnonzero(keep == 0)[0]),
         )
-        for c in range(len(cost)):
-            node.below.append([self.node(self.by_index[child], node, c) for child in table.children])
+        self.complete(node)
         self.nodes.append(node)  # children come before their parents
-        self.weigh(node)
         return node
+
+    def complete(self, node: Node) -> None:
+        """Nodes below each choice; choices whose cost cannot come near the best any more are dropped."""
+        children = [self.by_index[child] for child in node.table.children]
+        best, kept = np.inf, []
+        promise = sum(self.promise[t.index] for t in children)
+        for c in range(len(node.cost)):
+            below: list[Node] = []
+            bound = node.cost[c] + promise
+            for t in children:
+                if bound > best + SLACK and c > 0:
+                    break
+                child = self.node(t, node, c)
+                bound -= self.promise[t.index] 
+                low, total = weigh_child(child.new, child.best, child.total, node.all[c])
+                bound += low
+                node.best[c] += low
+                node.total[c] += total
+                self.promise[t.index] = min(self.promise[t.index], low)
+                promise = sum(self.promise[t.index] for t in children)
+                below.append(child)
+            if len(below) == len(children) and (bound <= best + SLACK or node.empty == c):
+                kept.append(c)
+                node.below.append(below)
+                best = min(best, node.best[c])
+        node.keep(kept)
 
     def weigh(self, node: Node, extra: NDArray | None = None) -> None:
         """Costs of each choice with all below it: `best` and `total`."""
-        own = node.cost if extra is None else node.cost + extra
-        node.best, node.total = own.copy(), own.copy()
+        node.best = node.cost.copy() if extra is None else node.cost + extra
+        node.total = node.best.copy()
         for c, below in enumerate(node.below):
             for child in below:
-                fits = ~(child.new & node.all[c]).any(1)
-                best = child.best[fits].min()
-                node.best[c] += best
-                low = child.total[fits].min()
-                node.total[c] += low - np.log(np.exp(low - child.total[fits]).sum())
+                low, total = weigh_child(child.new, child.best, child.total, node.all[c])
+                node.best[c] += low
+                node.total[c] += total
 
     def decode(self, node: Node, forbidden: NDArray | None = None) -> list[tuple[Node, int]]:
         """The best choices of a node and all below it, top down."""

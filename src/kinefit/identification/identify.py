@@ -21,13 +21,14 @@ class IdentifySettings:
 
     Parameters
     ----------
-    scales : noise levels that are tried in turn, as factors on the model's deviations
+    finest, coarsest : noise levels between which is searched, as factors on the model's deviations
     certain : a label less probable than this is unknown
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
     """
 
-    scales: tuple[float, ...] = (0.02, 0.3, 1.0, 2.0)
+    finest: float = 0.02
+    coarsest: float = 4.0
     certain: float = 0.9
     gate: float = 3.5
     miss: float = 0.05
@@ -88,12 +89,14 @@ def identify(
     gain = float(np.log((1 - miss) / (miss * clutter)))
     tables = segment_tables(model, _root(model))
     best: Solution | None = None
-    for scale in settings.scales:
+    scale = settings.finest
+    while scale <= settings.coarsest:
         found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
         if best is None or found.cost < best.cost:
             best = found
-        if best.matched >= 0.5 * min(count, len(at)) and best.noise < 0.7 * best.search.scale:
+        if found.matched >= 0.5 * min(count, len(at)) and found.noise < 0.95 * scale:
             break
+        scale = max(1.5 * scale, 1.2 * found.noise, 0.25)
     assert best is not None
     return _decide(best, count, settings.certain)
 
