@@ -63,12 +63,14 @@ def test_a_copy_keeps_force_plates(data_dir, tmp_path):
     np.testing.assert_array_equal(after.analog, before.analog.astype(np.float32))
     assert after.samples == before.samples == 9
     assert after.parameters["ANALOG:LABELS"] == before.parameters["ANALOG:LABELS"]
-    np.testing.assert_array_equal(after.parameters["FORCE_PLATFORM:CORNERS"], before.parameters["FORCE_PLATFORM:CORNERS"])
+    corners = [c3d.parameters["FORCE_PLATFORM:CORNERS"] for c3d in (before, after)]
+    np.testing.assert_array_equal(*corners)
     part = Markers(markers.names, markers.rate, markers.positions[50:80], first_frame=markers.first_frame + 50)
     write_markers(part, tmp_path / "b.c3d", like=source)
     np.testing.assert_array_equal(read_c3d(tmp_path / "b.c3d").analog, after.analog[50:80])
+    early = Markers(markers.names, 120.0, markers.positions[:30], first_frame=1)
     with pytest.raises(ExportError, match="frames 1 to 30 are not all in"):
-        write_markers(Markers(markers.names, 120.0, markers.positions[:30], first_frame=1), tmp_path / "c.c3d", like=source)
+        write_markers(early, tmp_path / "c.c3d", like=source)
 
 
 def test_another_program_reads_the_same(data_dir, tmp_path):

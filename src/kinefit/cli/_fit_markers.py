@@ -76,7 +76,7 @@ def fit_file(
     if unknown:
         raise ExportError(f"no format {unknown[0]!r}", remedy=f"There are: {', '.join(_results.NAMES)}, markers.")
     _results.check_folder(folder)
-    generic = body if isinstance(body, Body) else load_body(body)
+    generic = body if isinstance(body, Body) else load_body(Path(body) if isinstance(body, PathLike) else body)
     people = split_people(read_markers(source, unit=unit))
     trials = split_people(read_markers(static, unit=unit)) if static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}

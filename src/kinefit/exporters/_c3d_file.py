@@ -41,15 +41,15 @@ def c3d_bytes(
     frames, count = points.shape[:2]
     last = first + frames - 1
     channels = 0 if analog is None else analog.shape[1]
-    point = {
+    point: dict[str, Value] = {
         "USED": np.array(count, np.uint16), "SCALE": np.array(scale, np.float32), "RATE": np.array(rate, np.float32),
         "FRAMES": np.array(min(frames, MOST), np.uint16), "DATA_START": np.array(0, np.uint16),
     }  # fmt: skip
-    trial = {
+    trial: dict[str, Value] = {
         f"ACTUAL_{end}_FIELD": np.array([number % 65536, number // 65536], np.uint16)
         for end, number in (("START", first), ("END", last))
     }
-    whole = {name: dict(values) for name, values in groups.items()}
+    whole: dict[str, dict[str, Value]] = {name: dict(values) for name, values in groups.items()}
     whole["POINT"] = point | whole.get("POINT", {})
     whole["TRIAL"] = trial | {k: v for k, v in whole.get("TRIAL", {}).items() if k not in trial}
     blocks = -(-len(_parameters(whole, 0)) // _BLOCK)

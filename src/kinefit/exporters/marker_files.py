@@ -1,4 +1,4 @@
-"""Markers as C3D or TRC: labels, gaps, residuals, unit and events as they are; a C3D keeps what else its source held."""
+"""Markers as C3D or TRC: labels, gaps, residuals, unit and events as they are; a C3D keeps the rest of its source."""
 
 from __future__ import annotations
 
@@ -133,6 +133,6 @@ def _trc(markers: Markers, path: Path, unit: str, factor: float) -> str:
     ]  # fmt: skip
     seen = np.isfinite(markers.positions).all(axis=2)
     for f, (t, x) in enumerate(zip(markers.times.tolist(), (markers.positions * factor).tolist(), strict=True)):
-        cells = ["%.7g\t%.7g\t%.7g" % tuple(p) if ok else "\t\t" for p, ok in zip(x, seen[f], strict=True)]
+        cells = [f"{p[0]:.7g}\t{p[1]:.7g}\t{p[2]:.7g}" if ok else "\t\t" for p, ok in zip(x, seen[f], strict=True)]
         lines.append(f"{first + f}\t{t:.9f}\t" + "\t".join(cells))
     return "\n".join(lines) + "\n"

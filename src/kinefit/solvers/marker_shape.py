@@ -65,6 +65,7 @@ def fit_marker_shape(
     weight: NDArray,
     states: Sequence[BodyState],
     *,
+    share: NDArray | float = 1.0,
     start: NDArray | None = None,
     loss: Loss | None = None,
     max_iterations: int = 15,
@@ -78,6 +79,7 @@ def fit_marker_shape(
     x_world : (F, K, 3) [m], anything where the weight is 0.
     weight : (F, K) [1/m²], 0 where unseen.
     states : F, near the truth.
+    share : scalar or (F,), how much of a frame counts beyond its loss: below 1 for frames whose errors come together.
     start : (p,) parameters to begin with; default: the prior's mean.
     loss : default Geman-McClure.
     tolerance : stop when an iteration lowers the cost by less than this share.
@@ -96,6 +98,7 @@ def fit_marker_shape(
             remedy=f"Give (frames, {count}, 3) and (frames, {count}), one state a frame.",
         )
     x, weight = np.ascontiguousarray(np.nan_to_num(x_world), float), np.ascontiguousarray(weight, float)
+    counts = np.broadcast_to(np.asarray(share, float), len(states))
     posture, owner = _POSTURE * np.square(1.0 / tree.spread), parameters.points.segments
 
     def cost_of(theta: NDArray, states: Sequence[BodyState]) -> float:
@@ -104,14 +107,15 @@ def fit_marker_shape(
         total = float(bent @ parameters.prior @ bent)
         for f, state in enumerate(states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += float(posture @ np.square(state.angles - tree.usual))
-            total += _kernels_marker_shape.marker_cost(owner, rest, x[f], weight[f], placed, loss.kind, loss.scale)
+            own = _kernels_marker_shape.marker_cost(owner, rest, x[f], weight[f], placed, loss.kind, loss.scale)
+            total += float(counts[f]) * (own + float(posture @ np.square(state.angles - tree.usual)))
         return total
 
     def system(theta: NDArray, state: BodyState, f: int) -> tuple[NDArray, NDArray]:
         H, g = marker_equations(parameters, theta, state, x[f], weight[f], loss)
         H[range(6, n), range(6, n)] += posture
         g[6:n] -= posture * (state.angles - tree.usual)
+        H, g = counts[f] * H, counts[f] * g
         held = np.zeros(len(g), bool)
         held[:6] = not tree.root_free
         held[6:n] = ((state.angles <= tree.lower) & (g[6:n] < 0)) | ((state.angles >= tree.upper) & (g[6:n] > 0))

@@ -121,8 +121,13 @@ def fit_sequence(
 
 @dataclass(frozen=True, eq=False)
 class Certainty:
-    """How sure fitted frames are: one standard deviation of every degree of freedom dof_std (F, n) [m, rad] and joint
-    centre joint_std (F, S, 3) [m] along the world's axes, and the points' robust factors (F, K), 0 where unseen.
+    """How sure fitted frames are.
+
+    Parameters
+    ----------
+    dof_std : (F, n) [m, rad] one standard deviation of every degree of freedom.
+    joint_std : (F, S, 3) [m] one of every joint centre along the world's axes.
+    factors : (F, K) the points' robust factors in 0..1, 0 where unseen.
     """
 
     dof_std: NDArray

@@ -1,4 +1,4 @@
-"""Labelled markers on a body of the subject's size: joint angles of every frame (size and offsets: `marker_subject`)."""
+"""Labelled markers on a body of the subject's size: joint angles of every frame (its size: `marker_subject`)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from kinefit.observations import Markers
 from kinefit.solvers.losses import Loss
 from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
 from kinefit.tracking.bridging import bridged
-from kinefit.tracking.initialise import pose_from_points
-from kinefit.tracking.marker_subject import LOSS, POSTURE, bare, columns, sequence_both_ways
+from kinefit.tracking.marker_poses import LOSS, POSTURE, bare, columns, sequence_both_ways
 from kinefit.tracking.placement import find_placement
 from kinefit.tracking.unwrap import unwrap
 

@@ -146,7 +146,8 @@ def _parsed(text: str, source: str) -> _File:
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         remedy = "It has name, sides and [markers], each with a landmark, or a segment and `at` [m], and a spread."
-        raise FileError(f"not a marker set: {problem}", file=source, place=place.strip(".`") or None, remedy=remedy) from error
+        where = place.strip(".`") or None
+        raise FileError(f"not a marker set: {problem}", file=source, place=where, remedy=remedy) from error
     for label, entry in record.markers.items():
         numbers: list[Any] = [entry.spread, *entry.offset, *(entry.at or ())]
         if (entry.landmark is None) == (entry.segment is None or entry.at is None):
