@@ -8,6 +8,7 @@ from kinefit._jit import jit
 
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
 _TURNS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
+LEAST = 4.0  # what a choice must earn that nothing above holds: accidents are many
 _FLAT = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
 
 
@@ -131,14 +132,56 @@ def evidence(n, x, y, sigma, work):
 
 
 @jit
+def place_joint(n, x, y, sigma, joint, out):
+    """out: where a segment's fit puts a joint [m]; returns the variance of that per coordinate [m²], averaged."""
+    R, t, H, w = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(n)
+    total = 0.0
+    for i in range(n):
+        w[i] = 1 / (sigma[i] * sigma[i])
+        total += w[i]
+    rigid(n, x, y, w, R, t, H)
+    r = np.empty(3)
+    for k in range(3):
+        out[k] = t[k] + R[k, 0] * joint[0] + R[k, 1] * joint[1] + R[k, 2] * joint[2]
+        r[k] = joint[k]
+        for i in range(n):
+            r[k] -= w[i] * x[i, k] / total
+    a, b, c, d, e, f = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT, H[0, 1], H[0, 2], H[1, 2]
+    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    i00, i11, i22 = b * c - f * f, a * c - e * e, a * b - d * d
+    i01, i02, i12 = e * f - d * c, d * f - b * e, d * e - a * f
+    square = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
+    inner = r[0] ** 2 * i00 + r[1] ** 2 * i11 + r[2] ** 2 * i22 + 2 * (r[0] * r[1] * i01 + r[0] * r[2] * i02 + r[1] * r[2] * i12)
+    return 1 / total + (square * (i00 + i11 + i22) - inner) / (3 * det)
+
+
+@jit
+def reach_cost(joint, variance, anchors, reach, anchor_sigma):
+    """-log density [1/m³] of a joint that lies `reach` from one anchor (a sphere) or from two (a circle)."""
+    cost = 0.0
+    for a in range(len(anchors)):
+        d = math.sqrt((joint[0] - anchors[a, 0]) ** 2 + (joint[1] - anchors[a, 1]) ** 2 + (joint[2] - anchors[a, 2]) ** 2)
+        v = variance + anchor_sigma[a] ** 2
+        cost += 0.5 * (d - reach[a]) ** 2 / v + 0.5 * math.log(2 * math.pi * v)
+    if len(anchors) == 1:
+        return cost + math.log(4 * math.pi * reach[0] ** 2)
+    apart = math.sqrt(
+        (anchors[0, 0] - anchors[1, 0]) ** 2 + (anchors[0, 1] - anchors[1, 1]) ** 2 + (anchors[0, 2] - anchors[1, 2]) ** 2
+    )
+    return cost + math.log(2 * math.pi * reach[0] * reach[1] / apart)
+
+
+@jit
 def enumerate_segment(
-    points, gaps, x, D, sigma, given, x_pivot, pivot, pivot_sigma, gate, gain, slack, fewest, out_index, out_cost, out_rss
+    points, gaps, x, D, sigma, given, x_pivot, pivot, pivot_sigma, anchors, reach, anchor_sigma, log_volume,
+    gate, gain, slack, fewest, out_index, out_cost, out_rss,
 ):
     """All likely choices of points for a segment's k markers, and their costs (-log likelihood against no choice).
 
     points (N, 3), gaps (N, N) their distances; x (k, 3), D (k, k) of the model; sigma (k,) per coordinate;
     given (k,) the point of a marker that the parent has too, -1 where the parent misses it, -2 where it is to be found;
-    pivot (3,) where the parent says that x_pivot is, with pivot_sigma (none where <= 0); gain: what a match earns
+    pivot (3,) where the parent says that x_pivot is, with pivot_sigma (none where <= 0); without one, x_pivot may be
+    known to lie `reach` (A,) [m] from `anchors` (A, 3), A <= 2, else anywhere in the volume; gain: what a match earns
     against a miss; slack: costs this much above the best are kept. A choice differs from the model's distances by
     `gate` deviations at most. Fills out_*; returns how many there are (those beyond the room are dropped).
     """
@@ -180,12 +223,14 @@ def enumerate_segment(
     if has_pivot:
         xs[n], ys[n], ss[n] = x_pivot, pivot, pivot_sigma
         n += 1
+    loose = n == 0
+    J = np.empty(3)
     base, base_rss = evidence(n, xs, ys, ss, work)
     out_cost[0], out_rss[0] = 0.0, base_rss
     for i in range(k):
         out_index[0, i] = choice[i]
     count = 1
-    best, best_crude = 0.0, 0.0
+    best, best_crude = (-slack - LEAST if loose else 0.0), 0.0
     bound = np.zeros(last + 1)
     matched = np.zeros(last + 1, np.int64)
     depth = known
@@ -205,6 +250,12 @@ def enumerate_segment(
                     n += 1
                 cost, rss = evidence(n, xs, ys, ss, work)
                 cost -= base + matched[depth] * gain
+                if loose and (len(anchors) == 0 or n < 3):
+                    cost += log_volume
+                elif loose:
+                    variance = place_joint(n, xs, ys, ss, x_pivot, J)
+                    closer = reach_cost(J, variance, anchors, reach, anchor_sigma)
+                    cost += closer if variance < 0.01 else log_volume
                 if cost < best + slack and matched[depth] > 0:
                     best = cost if cost < best else best
                     crude = 0.5 * rss + bound[depth] * 0.0
@@ -246,6 +297,14 @@ def enumerate_segment(
                     e2 = (d - D0) ** 2
                     ok = e2 <= gate * gate * v
                     lb += e2 / (sigma[i] ** 2 * pivot_sigma**2)
+                for a in range(len(anchors)):
+                    d = math.sqrt(
+                        (points[q, 0] - anchors[a, 0]) ** 2
+                        + (points[q, 1] - anchors[a, 1]) ** 2
+                        + (points[q, 2] - anchors[a, 2]) ** 2
+                    )
+                    D0 = math.sqrt((x[i, 0] - x_pivot[0]) ** 2 + (x[i, 1] - x_pivot[1]) ** 2 + (x[i, 2] - x_pivot[2]) ** 2)
+                    ok = ok and abs(d - reach[a]) <= D0 + gate * (anchor_sigma[a] + sigma[i])
                 if ok:
                     for j in range(depth):
                         o = order[j]
@@ -281,30 +340,6 @@ def enumerate_segment(
         else:
             depth -= 1
     return count
-
-
-@jit
-def place_joint(n, x, y, sigma, joint, out):
-    """out: where a segment's fit puts a joint [m]; returns the variance of that per coordinate [m²], averaged."""
-    R, t, H, w = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(n)
-    total = 0.0
-    for i in range(n):
-        w[i] = 1 / (sigma[i] * sigma[i])
-        total += w[i]
-    rigid(n, x, y, w, R, t, H)
-    r = np.empty(3)
-    for k in range(3):
-        out[k] = t[k] + R[k, 0] * joint[0] + R[k, 1] * joint[1] + R[k, 2] * joint[2]
-        r[k] = joint[k]
-        for i in range(n):
-            r[k] -= w[i] * x[i, k] / total
-    a, b, c, d, e, f = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT, H[0, 1], H[0, 2], H[1, 2]
-    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-    i00, i11, i22 = b * c - f * f, a * c - e * e, a * b - d * d
-    i01, i02, i12 = e * f - d * c, d * f - b * e, d * e - a * f
-    square = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
-    inner = r[0] ** 2 * i00 + r[1] ** 2 * i11 + r[2] ** 2 * i22 + 2 * (r[0] * r[1] * i01 + r[0] * r[2] * i02 + r[1] * r[2] * i12)
-    return 1 / total + (square * (i00 + i11 + i22) - inner) / (3 * det)
 
 
 @jit

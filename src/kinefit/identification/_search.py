@@ -20,6 +20,27 @@ SLACK = 10.0
 """Choices whose cost is this much above the best are dropped: e^-10 of its likelihood."""
 
 
+BUDGET = 600
+"""Nodes; a search that needs more has a wrong noise level or too few points: from then on only first choices count."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """What is known of a segment's joint before its own markers.
+
+    Parameters
+    ----------
+    pivot, sigma : (3,) [m] its place, with a standard deviation; sigma < 0 where it is not known
+    anchors, reach, deviation : (A, 3), (A,), (A,) [m] points from which it is `reach` away
+    """
+
+    pivot: NDArray = field(default_factory=lambda: np.zeros(3))
+    sigma: float = -1.0
+    anchors: NDArray = field(default_factory=lambda: np.zeros((0, 3)))
+    reach: NDArray = field(default_factory=lambda: np.zeros(0))
+    deviation: NDArray = field(default_factory=lambda: np.zeros(0))
+
+
 @dataclass(eq=False)
 class Node:
     """A segment's choices where its parent says one and the same of it.
@@ -38,8 +59,7 @@ class Node:
     squares: NDArray
     new: NDArray
     all: NDArray
-    pivot: NDArray
-    pivot_sigma: float
+    hold: Hold
     below: list[list[Node]] = field(default_factory=list)
     best: NDArray = field(default_factory=lambda: np.empty(0))
     total: NDArray = field(default_factory=lambda: np.empty(0))
@@ -65,7 +85,7 @@ class Search:
         self.tables = tables
         self.by_index = {t.index: t for t in tables}
         self.points, self.gaps, self.scale, self.gain, self.gate = points, gaps, scale, gain, gate
-        self.log_volume = float(np.log(volume))
+        self.volume = volume
         self.sigma = {t.index: t.sigma * scale for t in tables}
         self.memo: dict[tuple, Node] = {}
         words = (len(points) + 63) // 64
@@ -78,7 +98,7 @@ class Search:
     def node(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
-        pivot, sigma_pivot, key = np.zeros(3), -1.0, (table.index, None)
+        hold, key = Hold(), (table.index, None)
         if parent is not None:
             points = parent.index[choice]
             common = table.shared >= 0
@@ -86,41 +106,53 @@ class Search:
             if (given >= 0).any():
                 key = (table.index, tuple(given[common].tolist()))
             else:
-                pivot, sigma_pivot = self.joint(parent, choice, table)
-                key = (table.index, id(parent), choice) if sigma_pivot > 0 else (table.index, tuple(given.tolist()))
+                hold = self.joint(parent, choice, table)
+                key = (table.index, id(parent), choice)
         found = self.memo.get(key)
         if found is None:
-            found = self.memo[key] = self.expand(table, given, pivot, sigma_pivot)
+            found = self.memo[key] = self.expand(table, given, hold)
         return found
 
-    def joint(self, parent: Node, choice: int, table: SegmentTable) -> tuple[NDArray, float]:
-        """Where a choice of the parent puts the joint, and its standard deviation [m]; that is < 0 where too loose."""
+    def joint(self, parent: Node, choice: int, table: SegmentTable) -> Hold:
+        """What a choice of the parent says of the joint: a place, or distances from one or two points, or nothing."""
         points = parent.index[choice]
         here = points >= 0
         t, at = parent.table, np.empty(3)
         x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
-        if parent.pivot_sigma > 0:
-            x, y = np.vstack([x, t.joint_here]), np.vstack([y, parent.pivot])
-            sigma = np.append(sigma, parent.pivot_sigma)
-        if len(x) < 2:
-            return at, -1.0
-        variance = place_joint(len(x), x, y, sigma, table.joint_there, at)
-        deviation = float(np.sqrt(variance + (table.spread * min(self.scale, 1.0)) ** 2))
-        return (at, deviation) if deviation < LOOSE else (at, -1.0)
+        if parent.hold.sigma > 0:
+            x, y = np.vstack([x, t.joint_here]), np.vstack([y, parent.hold.pivot])
+            sigma = np.append(sigma, parent.hold.sigma)
+        if not len(x):
+            return Hold()
+        spread = table.spread * min(self.scale, 1.0)
+        if len(x) > 1:
+            variance = place_joint(len(x), x, y, sigma, table.joint_there, at)
+            deviation = float(np.sqrt(variance + spread**2))
+            if deviation < LOOSE:
+                return Hold(at, deviation)
+        reach = np.linalg.norm(x - table.joint_there, axis=1)
+        return Hold(anchors=y[:2], reach=reach[:2], deviation=np.sqrt(sigma[:2] ** 2 + spread**2))
 
-    def expand(self, table: SegmentTable, given: NDArray, pivot: NDArray, sigma_pivot: float) -> Node:
-        """Choices of a segment, then of all below it."""
+    def choices(self, table: SegmentTable, given: NDArray, hold: Hold) -> tuple[NDArray, NDArray, NDArray]:
+        """(C, k) points, (C,) costs, (C,) weighted squares of a segment's likely choices; the first is to choose none."""
         k = len(table.markers)
         index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
-        free = sigma_pivot <= 0 and not (given >= 0).any()
+        free = hold.sigma <= 0 and not (given >= 0).any()
         joint = table.joint_here if table.joint_here is not None else np.zeros(3)
+        volume = self.volume
+        if len(hold.reach):
+            span = np.linalg.norm(table.x - joint, axis=1).max() + hold.reach.min()
+            volume = min(volume, 4 / 3 * np.pi * span**3)
         count = enumerate_segment(
-            self.points, self.gaps, table.x, table.D, self.sigma[table.index], given, joint, pivot, sigma_pivot,
-            self.gate, self.gain, SLACK, 3 if free else 1, index, cost, squares,
+            self.points, self.gaps, table.x, table.D, self.sigma[table.index], given, joint, hold.pivot, hold.sigma,
+            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, SLACK, 2 if free else 1,
+            index, cost, squares,
         )  # fmt: skip
-        index, cost, squares = index[:count], cost[:count], squares[:count]
-        if free:
-            cost[1:] += self.log_volume
+        return index[:count], cost[:count], squares[:count]
+
+    def expand(self, table: SegmentTable, given: NDArray, hold: Hold) -> Node:
+        """Choices of a segment, then of all below it."""
+        index, cost, squares = self.choices(table, given, hold)
         keep = np.flatnonzero(cost <= cost.min() + SLACK)
         keep = keep[np.argsort(cost[keep])]
         if 0 not in keep:  # no choice at all
@@ -129,11 +161,15 @@ class Search:
         new = np.where(given == -2, index, -1)
         node = Node(
             table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            pivot, sigma_pivot, best=cost.copy(), total=cost.copy(), empty=int(np.flatnonzero(keep == 0)[0]),
+            hold, best=cost.copy(), total=cost.copy(), empty=int(np.flatnonzero(keep == 0)[0]),
         )
         self.complete(node)
         self.nodes.append(node)  # children come before their parents
         return node
+
+    def alone(self, table: SegmentTable) -> float:
+        """Least cost of a segment on its own, with nothing known of any other."""
+        return float(self.choices(table, np.full(len(table.markers), -2, np.int64), Hold())[1].min())
 
     def complete(self, node: Node) -> None:
         """Nodes below each choice; choices whose cost cannot come near the best any more are dropped."""
@@ -141,10 +177,13 @@ class Search:
         best, kept = np.inf, []
         promise = sum(self.promise[t.index] for t in children)
         for c in range(len(node.cost)):
+            spent = len(self.memo) > BUDGET
+            if spent and kept and c != node.empty:
+                continue
             below: list[Node] = []
             bound = node.cost[c] + promise
             for t in children:
-                if bound > best + SLACK and c > 0:
+                if (bound > best + SLACK and c > 0) or (spent and c == node.empty):
                     break
                 child = self.node(t, node, c)
                 bound -= self.promise[t.index] 
@@ -155,11 +194,27 @@ class Search:
                 self.promise[t.index] = min(self.promise[t.index], low)
                 promise = sum(self.promise[t.index] for t in children)
                 below.append(child)
-            if len(below) == len(children) and (bound <= best + SLACK or node.empty == c):
+            near = len(below) == len(children) and bound <= best + SLACK
+            if not near and c == node.empty:  # kept for when every other clashes with what is chosen elsewhere
+                below, near = [self.absent(t) for t in children], True
+                node.best[c] = node.total[c] = node.cost[c]
+            if near:
                 kept.append(c)
                 node.below.append(below)
                 best = min(best, node.best[c])
         node.keep(kept)
+
+    def absent(self, table: SegmentTable) -> Node:
+        """A segment of which nothing is seen, nor of any below it."""
+        key = (table.index, "absent")
+        if key not in self.memo:
+            index, zero = np.full((1, len(table.markers)), -1, np.int64), np.zeros(1)
+            bits = self.bits[index[:, 0]]
+            node = Node(table, index, zero, zero, bits, bits, Hold(), best=zero.copy(), total=zero.copy(), empty=0)
+            node.below = [[self.absent(self.by_index[child]) for child in table.children]]
+            self.nodes.append(node)
+            self.memo[key] = node
+        return self.memo[key]
 
     def weigh(self, node: Node, extra: NDArray | None = None) -> None:
         """Costs of each choice with all below it: `best` and `total`."""

@@ -30,7 +30,7 @@ class IdentifySettings:
     finest: float = 0.02
     coarsest: float = 4.0
     certain: float = 0.9
-    gate: float = 3.5
+    gate: float = 4.5
     miss: float = 0.05
 
 
@@ -89,7 +89,7 @@ def identify(
     gain = float(np.log((1 - miss) / (miss * clutter)))
     tables = segment_tables(model, _root(model))
     best: Solution | None = None
-    scale = settings.finest
+    scale = _first_scale(tables, at, gaps, gain, box, settings)
     while scale <= settings.coarsest:
         found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
         if best is None or found.cost < best.cost:
@@ -98,7 +98,27 @@ def identify(
             break
         scale = max(1.5 * scale, 1.2 * found.noise, 0.25)
     assert best is not None
+    if best.matched > 3 and best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2:
+        found = _solve(tables, at, gaps, 1.05 * best.noise, gain, box, settings.gate)
+        best = found if found.matched >= 0.8 * best.matched else best
     return _decide(best, count, settings.certain)
+
+
+def _first_scale(
+    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, gain: float, box: float, settings: IdentifySettings
+) -> float:
+    """The noise level at which the two largest segments, each on its own, are explained best."""
+    largest = sorted(tables, key=lambda t: -len(t.markers))[:2]
+    best, scale, chosen = np.inf, settings.finest, settings.finest
+    while scale <= settings.coarsest:
+        search = Search(tables, at, gaps, scale, gain, box, settings.gate)
+        cost = sum(search.alone(t) for t in largest)
+        if cost < best:
+            best, chosen = cost, scale
+        elif best < -10 * len(largest):
+            break
+        scale = max(1.6 * scale, 0.25)
+    return chosen
 
 
 def _root(model: MarkerModel) -> int:
