@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows, prior_rows
@@ -141,7 +141,7 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
 
 
 def pose_from_points(
-    body: Body, points: PointSet, x_world: NDArray, *, sigma: ArrayLike = 0.03, near: BodyState | None = None
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 

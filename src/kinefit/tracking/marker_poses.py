@@ -10,16 +10,21 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError, TrackingError
+from kinefit.geometry import se3
 from kinefit.observations import Markers
-from kinefit.solvers.losses import Loss, geman_mcclure
+from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure
 from kinefit.solvers.sequence import fit_sequence
-from kinefit.tracking.initialise import pose_from_points
+from kinefit.tracking.initialise import aligned_root
 
 LOSS = geman_mcclure(5.0)
 """Of a marker: three residuals in one, which are 1.7 standard deviations long on average."""
 
-POSTURE = 0.01
+POSTURE = 0.1
 """Share of the posture prior in a frame's fit: enough to decide what the markers leave open."""
+
+_FEWEST = 6  # markers of a frame to start from
+_ROUGH = 0.03  # [m] how far a body that is not yet the subject's may be off
+_NEAR = 0.03  # [m] median distance of a start that needs no other
 
 
 def bare(label: str) -> str:
@@ -63,25 +68,35 @@ def sequence_both_ways(
 
 
 def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:
-    """The frame to start from, and its state, found with no pose given: the best of a few that show most."""
-    seen = np.isfinite(x).all(axis=2)
-    count = seen.sum(axis=1)
-    most = np.flatnonzero(count >= count.max())
-    tries = most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]
-    fits = []
-    spread = np.maximum(sigma, 0.02)  # [m] wide enough for a start that is far off
-    for frame in tries:
-        try:
-            state, left = pose_from_points(body, points, x[frame], sigma=spread)
-        except TrackingError:
-            continue
-        fits.append((left, int(frame), state))
-        if left < 0.03:
-            break
-    if not fits:
+    """The frame to start from, and its state, found with no pose given: the best of a few that show most.
+
+    The usual posture is laid on the markers, facing either way, and fitted without, then with a robust loss.
+    """
+    count = np.isfinite(x).all(axis=2).sum(axis=1)
+    if not count.max(initial=0) >= _FEWEST:
         raise TrackingError(
             f"no frame shows enough markers to start from: {int(count.max(initial=0))} at most",
-            remedy="Six markers in one frame are the least.",
+            remedy=f"{_FEWEST} markers in one frame are the least.",
         )
-    _, frame, state = min(fits, key=lambda f: f[0])
-    return frame, state
+    most = np.flatnonzero(count == count.max())
+    spread = np.maximum(sigma, _ROUGH)
+    best: tuple[float, int, BodyState] | None = None
+    for frame in most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]:
+        upright, one = aligned_root(body, points, x[frame]), x[frame : frame + 1]
+        fits = []
+        for turn in (np.eye(3), np.diag([-1.0, 1.0, -1.0])):
+            state = body.usual_state(upright @ se3.transform(turn, np.zeros(3)))
+            for loss in (SQUARED, geman_mcclure()):
+                fit = fit_sequence(
+                    body, state, points, one, sigma=spread, loss=loss, posture=1.0, max_iterations=60, tolerance=1e-4
+                )
+                state = BodyState(fit.Ts_world_root[0], fit.angles[0])
+            fits.append((float(fit.costs[0]), state))
+        state = min(fits, key=lambda f: f[0])[1]
+        left = float(np.nanmedian(np.linalg.norm(x[frame] - body.positions(state, points), axis=1)))
+        if best is None or left < best[0]:
+            best = left, int(frame), state
+        if left < _NEAR:
+            break
+    assert best is not None
+    return best[1], best[2]

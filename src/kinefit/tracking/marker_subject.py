@@ -19,7 +19,8 @@ from kinefit.tracking.placement import Placement, find_placement
 
 Progress = Callable[[str, int, int], None]
 
-_LEAST = 0.005  # [m] no marker is held to be better fixed than this
+_LEAST, _MOST = 0.005, 0.03  # [m] no marker is held to be better fixed or looser than this
+_FAR = 0.5  # share of its distance from the set's place that a marker's spread is at least
 _SLIDES = 0.1  # share of a marker's spread: one on soft parts, which may sit anywhere, slides more than one on a bone
 _INDEPENDENT = 1.0
 """How many frames with errors of their own all the frames of one trial count for.
@@ -116,10 +117,10 @@ def fit_marker_subject(
     placed, x, seen = _worn(placed, x, seen)
     whole = height / body.stature if height and body.stature else None
     size = whole if whole is not None else _first_size(body, placed, x)
-    parameters = marker_parameters(body, placed.points, placed.spread, size, known=whole is not None)
+    groups = len(body.scale_groups)
     floor = np.hypot(_LEAST, _SLIDES * placed.spread)
     sigma = floor
-    theta = parameters.mean
+    theta = np.concatenate([np.full(groups, size), np.zeros(3 * len(placed.points))])
     for turn in range(_ROUNDS):
         fitted, points = _dressed(body, placed, theta)
         looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
@@ -130,12 +131,15 @@ def fit_marker_subject(
         states = [BodyState(roots[f], angles[f]) for f in chosen]
         if turn == 0:
             theta = _moved(fitted, placed, theta, roots[good], angles[good], x[good])
+        away = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
+        spread = np.maximum(placed.spread, _FAR * away)  # one that sits elsewhere is believed, if it does so lastingly
+        parameters = marker_parameters(body, placed.points, spread, size, known=whole is not None)
         share = np.concatenate([np.full(len(p), min(_INDEPENDENT / max(len(p), 1), 1.0)) for p in parts])
         weight = np.where(seen[chosen], sigma**-2.0, 0.0)
         shape = fit_marker_shape(parameters, x[chosen], weight, states, share=share, start=theta, loss=LOSS)
         theta = np.concatenate([shape.scales, shape.offsets.ravel()])
         residuals = _residuals(body, placed, shape, x[chosen])
-        sigma = np.maximum(_noise(residuals, len(chosen), body.tree.n_dofs), floor)
+        sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
     fitted, points = _dressed(body, placed, theta)
     inlier = residuals < 5.0 * 1.7 * sigma

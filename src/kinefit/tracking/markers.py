@@ -23,6 +23,7 @@ _TOLD = 0.35  # [rad] an angle less sure than that is not told by its frame, but
 _HELD = 0.1  # [m] likewise for the root
 _PRIOR = 0.95  # share of the usual posture's spread from which an angle is known by that alone
 _MEMORY = 0.3  # [s] in which the velocity of a body that is not seen forgets itself
+_WORSE = 0.3  # standard deviations that a frame's markers may fit worse for following its neighbours
 _OFF = 4.0  # times the take's usual misfit from which a frame is tried anew, from nowhere
 _MOST_RUNS = 50  # of such frames
 
@@ -117,7 +118,8 @@ def _bridged(
     meant = angles.copy()
     for d in np.flatnonzero(some):
         meant[:, d] = np.interp(frames, frames[told[:, d]], angles[told[:, d], d])
-    roots, _ = bridged(roots, meant, lost, _MEMORY * rate)
+    held, (roots, _) = roots, bridged(roots, meant, lost, _MEMORY * rate)
+    before, measured = _misfit(body, points, x, sigma, roots, angles), angles
     roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
     again = ~lost & ~told[:, some].all(axis=1)
     for a, b in np.flatnonzero(np.diff(np.concatenate([[0], again.astype(int), [0]]))).reshape(-1, 2):
@@ -127,8 +129,9 @@ def _bridged(
             posture=POSTURE, usual=meant[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
-    angles = unwrap(tree, angles) if again.any() else angles
-    return roots, angles
+    worse = again & (_misfit(body, points, x, sigma, roots, angles) > before + _WORSE)
+    roots[worse], angles[worse] = held[worse], measured[worse]
+    return roots, unwrap(tree, angles) if again.any() else angles
 
 
 def _motion(
