@@ -173,12 +173,12 @@ def reach_cost(joint, variance, anchors, reach, anchor_sigma):
 
 @jit
 def enumerate_segment(
-    points, gaps, x, D, sigma, given, x_pivot, pivot, pivot_sigma, anchors, reach, anchor_sigma, log_volume,
+    points, gaps, blocked, x, D, sigma, given, x_pivot, pivot, pivot_sigma, anchors, reach, anchor_sigma, log_volume,
     gate, gain, slack, fewest, out_index, out_cost, out_rss,
 ):
     """All likely choices of points for a segment's k markers, and their costs (-log likelihood against no choice).
 
-    points (N, 3), gaps (N, N) their distances; x (k, 3), D (k, k) of the model; sigma (k,) per coordinate;
+    points (N, 3), gaps (N, N) their distances, blocked (N,) those taken already; x (k, 3), D (k, k) of the model; sigma (k,) per coordinate;
     given (k,) the point of a marker that the parent has too, -1 where the parent misses it, -2 where it is to be found;
     pivot (3,) where the parent says that x_pivot is, with pivot_sigma (none where <= 0); without one, x_pivot may be
     known to lie `reach` (A,) [m] from `anchors` (A, 3), A <= 2, else anywhere in the volume; gain: what a match earns
@@ -190,7 +190,7 @@ def enumerate_segment(
     work = np.empty((8 + k // 3 + 1, 3))
     choice = np.full(k, -1)
     nxt = np.zeros(k, np.int64)
-    used = np.zeros(N, np.bool_)
+    used = blocked.copy()
     order = np.empty(k, np.int64)
     known, m = 0, 0
     for i in range(k):

@@ -47,28 +47,28 @@ class Node:
 
     Parameters
     ----------
+    context : what the parent says, as a key
     index : (C, k) int, points, -1 for none; cost : (C,) own; squares : (C,) weighted residual squares
     new : (C, W) uint64, points that are chosen here (not given by the parent), as bits; all : given ones too
-    below : for each choice the nodes of the children
-    best : (C,) cost with the best below; total : (C,) -log of the sum over all below
+    empty : the choice of no point at all
+    below : for each choice the nodes of the children; None where it is not followed
+    best : (C,) cost with the best below; total : (C,) -log of the sum over all below; inf where not followed
+    allowed : choices dearer than this with all below were not followed
     """
 
     table: SegmentTable
+    context: tuple
     index: NDArray
     cost: NDArray
     squares: NDArray
     new: NDArray
     all: NDArray
     hold: Hold
-    below: list[list[Node]] = field(default_factory=list)
-    best: NDArray = field(default_factory=lambda: np.empty(0))
-    total: NDArray = field(default_factory=lambda: np.empty(0))
-    empty: int = -1
-
-    def keep(self, kept: list[int]) -> None:
-        """Drop all other choices."""
-        for name in ("index", "cost", "squares", "new", "all", "best", "total"):
-            setattr(self, name, getattr(self, name)[kept])
+    empty: int
+    below: list[list[Node] | None]
+    best: NDArray
+    total: NDArray
+    allowed: float = -np.inf
 
 
 class Search:
@@ -93,24 +93,39 @@ class Search:
         for i in range(len(points)):
             self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
         self.nodes: list[Node] = []
+        self.below = {t.index: {t.index} for t in tables}
+        for t in reversed(tables):
+            for child in t.children:
+                self.below[t.index] |= self.below[child]
+        self.blocked: frozenset[tuple[int, int]] = frozenset()  # (segment, point) that may not be
         self.promise = {t.index: 0.0 for t in tables}  # least cost of a segment and all below it, as found so far
 
-    def node(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
+    def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
-        hold, key = Hold(), (table.index, None)
+        hold, context, taken = Hold(), (), self.bits[-1]
+        blocked = frozenset(pair for pair in self.blocked if pair[0] in self.below[table.index])
         if parent is not None:
-            points = parent.index[choice]
+            points, taken = parent.index[choice], parent.all[choice]
             common = table.shared >= 0
             given[common] = points[table.shared[common]]
-            if (given >= 0).any():
-                key = (table.index, tuple(given[common].tolist()))
-            else:
+            context = tuple(given[common].tolist())
+            if not (given >= 0).any():
                 hold = self.joint(parent, choice, table)
-                key = (table.index, id(parent), choice)
+                context = (parent.table.index, parent.context, tuple(points.tolist()))
+        key = (table.index, blocked, context)
         found = self.memo.get(key)
         if found is None:
-            found = self.memo[key] = self.expand(table, given, hold)
+            found = self.memo[key] = self.expand(table, context, given, hold, self.bits[-1])
+        clash = np.bitwise_or.reduce(found.new, 0) & taken
+        if clash.any():  # others may come near the best without these points
+            context = (context, tuple(clash.tolist()))
+            key = (table.index, blocked, context)
+            found = self.memo.get(key)
+            if found is None:
+                found = self.memo[key] = self.expand(table, context, given, hold, taken)
+        if found.allowed < allowed:
+            self.complete(found, allowed)
         return found
 
     def joint(self, parent: Node, choice: int, table: SegmentTable) -> Hold:
@@ -133,76 +148,81 @@ class Search:
         reach = np.linalg.norm(x - table.joint_there, axis=1)
         return Hold(anchors=y[:2], reach=reach[:2], deviation=np.sqrt(sigma[:2] ** 2 + spread**2))
 
-    def choices(self, table: SegmentTable, given: NDArray, hold: Hold) -> tuple[NDArray, NDArray, NDArray]:
+    def choices(
+        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
         """(C, k) points, (C,) costs, (C,) weighted squares of a segment's likely choices; the first is to choose none."""
         k = len(table.markers)
         index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
         free = hold.sigma <= 0 and not (given >= 0).any()
         joint = table.joint_here if table.joint_here is not None else np.zeros(3)
+        blocked = (self.bits[:-1] & taken).any(1)
+        blocked[[point for s, point in self.blocked if s == table.index]] = True
+        blocked[given[given >= 0]] = False
         volume = self.volume
         if len(hold.reach):
             span = np.linalg.norm(table.x - joint, axis=1).max() + hold.reach.min()
             volume = min(volume, 4 / 3 * np.pi * span**3)
         count = enumerate_segment(
-            self.points, self.gaps, table.x, table.D, self.sigma[table.index], given, joint, hold.pivot, hold.sigma,
+            self.points, self.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint, hold.pivot, hold.sigma,
             hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, SLACK, 2 if free else 1,
             index, cost, squares,
         )  # fmt: skip
         return index[:count], cost[:count], squares[:count]
 
-    def expand(self, table: SegmentTable, given: NDArray, hold: Hold) -> Node:
-        """Choices of a segment, then of all below it."""
-        index, cost, squares = self.choices(table, given, hold)
+    def expand(self, table: SegmentTable, context: tuple, given: NDArray, hold: Hold, taken: NDArray) -> Node:
+        """Choices of a segment, none followed yet."""
+        index, cost, squares = self.choices(table, given, hold, taken)
         keep = np.flatnonzero(cost <= cost.min() + SLACK)
         keep = keep[np.argsort(cost[keep])]
         if 0 not in keep:  # no choice at all
             keep = np.append(keep, 0)
         index, cost, squares = index[keep], cost[keep], squares[keep]
         new = np.where(given == -2, index, -1)
-        node = Node(
-            table, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            hold, best=cost.copy(), total=cost.copy(), empty=int(np.flatnonzero(keep == 0)[0]),
-        )
-        self.complete(node)
-        self.nodes.append(node)  # children come before their parents
-        return node
+        return Node(
+            table, context, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
+            hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0), np.empty(0),
+        )  # fmt: skip
 
-    def alone(self, table: SegmentTable) -> float:
-        """Least cost of a segment on its own, with nothing known of any other."""
-        return float(self.choices(table, np.full(len(table.markers), -2, np.int64), Hold())[1].min())
+    def alone(self, table: SegmentTable) -> tuple[float, bool]:
+        """Least cost of a segment on its own, with nothing known of any other; whether that has all its markers."""
+        index, cost, _ = self.choices(table, np.full(len(table.markers), -2, np.int64), Hold(), self.bits[-1])
+        best = int(np.argmin(cost))
+        return float(cost[best]), bool((index[best] >= 0).all())
 
-    def complete(self, node: Node) -> None:
-        """Nodes below each choice; choices whose cost cannot come near the best any more are dropped."""
+    def complete(self, node: Node, allowed: float) -> None:
+        """Follow each choice downwards while its cost, with the best known of what is still to come, stays near.
+
+        Near is: below `allowed`, and SLACK above the best choice here at most.
+        """
+        node.allowed = allowed
+        node.best, node.total = np.full(len(node.cost), np.inf), np.full(len(node.cost), np.inf)
         children = [self.by_index[child] for child in node.table.children]
-        best, kept = np.inf, []
-        promise = sum(self.promise[t.index] for t in children)
+        best = np.inf
+        spent = len(self.memo) > BUDGET
         for c in range(len(node.cost)):
-            spent = len(self.memo) > BUDGET
-            if spent and kept and c != node.empty:
-                continue
             below: list[Node] = []
-            bound = node.cost[c] + promise
-            for t in children:
-                if (bound > best + SLACK and c > 0) or (spent and c == node.empty):
-                    break
-                child = self.node(t, node, c)
-                bound -= self.promise[t.index] 
-                low, total = weigh_child(child.new, child.best, child.total, node.all[c])
-                bound += low
-                node.best[c] += low
-                node.total[c] += total
+            bound = total = float(node.cost[c])
+            bound += sum(self.promise[t.index] for t in children)
+            limit = min(allowed, best + SLACK)
+            follow = not spent or (c == 0 and c != node.empty)
+            for t in children if follow and bound <= limit else ():
+                bound -= self.promise[t.index]
+                child = self.node(t, node, c, limit - bound)
+                low, sums = weigh_child(child.new, child.best, child.total, node.all[c])
+                bound, total = bound + low, total + sums
                 self.promise[t.index] = min(self.promise[t.index], low)
-                promise = sum(self.promise[t.index] for t in children)
                 below.append(child)
-            near = len(below) == len(children) and bound <= best + SLACK
-            if not near and c == node.empty:  # kept for when every other clashes with what is chosen elsewhere
-                below, near = [self.absent(t) for t in children], True
+                if bound > limit:
+                    break
+            if len(below) == len(children) and bound <= limit:
+                node.below[c], node.best[c], node.total[c] = below, bound, total
+            elif c == node.empty:  # for when every other clashes with what is chosen elsewhere
+                node.below[c] = [self.absent(t) for t in children]
                 node.best[c] = node.total[c] = node.cost[c]
-            if near:
-                kept.append(c)
-                node.below.append(below)
-                best = min(best, node.best[c])
-        node.keep(kept)
+            else:
+                node.below[c] = None
+            best = min(best, node.best[c])
 
     def absent(self, table: SegmentTable) -> Node:
         """A segment of which nothing is seen, nor of any below it."""
@@ -210,28 +230,41 @@ class Search:
         if key not in self.memo:
             index, zero = np.full((1, len(table.markers)), -1, np.int64), np.zeros(1)
             bits = self.bits[index[:, 0]]
-            node = Node(table, index, zero, zero, bits, bits, Hold(), best=zero.copy(), total=zero.copy(), empty=0)
-            node.below = [[self.absent(self.by_index[child]) for child in table.children]]
-            self.nodes.append(node)
-            self.memo[key] = node
+            below: list[list[Node] | None] = [[self.absent(self.by_index[child]) for child in table.children]]
+            self.memo[key] = Node(table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), zero.copy(), np.inf)
         return self.memo[key]
 
     def weigh(self, node: Node, extra: NDArray | None = None) -> None:
         """Costs of each choice with all below it: `best` and `total`."""
-        node.best = node.cost.copy() if extra is None else node.cost + extra
+        own = node.cost if extra is None else node.cost + extra
+        node.best = np.array([np.inf if below is None else cost for cost, below in zip(own, node.below)])
         node.total = node.best.copy()
         for c, below in enumerate(node.below):
-            for child in below:
+            for child in below or ():
                 low, total = weigh_child(child.new, child.best, child.total, node.all[c])
                 node.best[c] += low
                 node.total[c] += total
+
+    def gather(self, root: Node) -> None:
+        """`nodes`: all that count, children before their parents."""
+        self.nodes, seen = [], set()
+
+        def visit(node: Node) -> None:
+            seen.add(id(node))
+            for below in node.below:
+                for child in below or ():
+                    if id(child) not in seen:
+                        visit(child)
+            self.nodes.append(node)
+
+        visit(root)
 
     def decode(self, node: Node, forbidden: NDArray | None = None) -> list[tuple[Node, int]]:
         """The best choices of a node and all below it, top down."""
         fits = np.ones(len(node.cost), bool) if forbidden is None else ~(node.new & forbidden).any(1)
         c = int(np.argmin(np.where(fits, node.best, np.inf)))
         found = [(node, c)]
-        for child in node.below[c]:
+        for child in node.below[c] or ():
             found += self.decode(child, node.all[c])
         return found
 
@@ -263,7 +296,7 @@ class Search:
             fresh = node.table.shared < 0
             for c in np.flatnonzero(p > 1e-6):
                 table[node.table.markers[fresh], node.index[c, fresh]] += p[c]
-                for child in node.below[c]:
+                for child in node.below[c] or ():
                     fits = ~(child.new & node.all[c]).any(1)
                     weight = np.where(fits, np.exp(child.total[fits].min() - child.total), 0.0)
                     share[id(child)] += p[c] * weight / weight.sum()

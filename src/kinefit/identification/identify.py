@@ -15,6 +15,10 @@ from kinefit.identification._tables import SegmentTable, segment_tables
 from kinefit.identification.model import MarkerModel
 
 
+CLASHES = 24
+"""Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
+
+
 @dataclass(frozen=True)
 class IdentifySettings:
     """How `identify` searches; nothing of it is about one body or one recording.
@@ -87,9 +91,9 @@ def identify(
     miss = min(max(1 - len(at) / count, settings.miss), 0.5)
     clutter = max(len(at) - count * (1 - miss), 0.5) / box
     gain = float(np.log((1 - miss) / (miss * clutter)))
-    tables = segment_tables(model, _root(model))
     best: Solution | None = None
-    scale = _first_scale(tables, at, gaps, gain, box, settings)
+    root, scale = _start(model, at, gaps, gain, box, settings)
+    tables = segment_tables(model, root)
     while scale <= settings.coarsest:
         found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
         if best is None or found.cost < best.cost:
@@ -104,27 +108,25 @@ def identify(
     return _decide(best, count, settings.certain)
 
 
-def _first_scale(
-    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, gain: float, box: float, settings: IdentifySettings
-) -> float:
-    """The noise level at which the two largest segments, each on its own, are explained best."""
-    largest = sorted(tables, key=lambda t: -len(t.markers))[:2]
-    best, scale, chosen = np.inf, settings.finest, settings.finest
+def _start(
+    model: MarkerModel, at: NDArray, gaps: NDArray, gain: float, box: float, settings: IdentifySettings
+) -> tuple[int, float]:
+    """The segment to begin with and the noise level: what explains the largest segments best, each on its own."""
+    sizes = sorted((len(m) for m in model.segments), reverse=True)
+    large = [s for s, m in enumerate(model.segments) if len(m) >= max(3, sizes[min(2, len(sizes) - 1)])][:6]
+    large = large or [int(np.argmax([len(m) for m in model.segments]))]
+    tables = segment_tables(model, large[0])
+    best, scale, chosen = np.inf, settings.finest, (large[0], settings.finest)
     while scale <= settings.coarsest:
         search = Search(tables, at, gaps, scale, gain, box, settings.gate)
-        cost = sum(search.alone(t) for t in largest)
+        found = [search.alone(search.by_index[s]) for s in large]
+        cost = sum(c for c, _ in found)
         if cost < best:
-            best, chosen = cost, scale
-        elif best < -10 * len(largest):
+            best, chosen = cost, (large[int(np.argmin([c for c, _ in found]))], scale)
+        if all(whole for _, whole in found) and cost > best:
             break
         scale = max(1.6 * scale, 0.25)
     return chosen
-
-
-def _root(model: MarkerModel) -> int:
-    """The segment with most markers; of equals the one with most joints (P5 3.2)."""
-    links = [sum(s in (j.parent, j.child) for j in model.joints) for s in range(len(model.segments))]
-    return max(range(len(model.segments)), key=lambda s: (len(model.segments[s]), links[s], -s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +145,8 @@ def _solve(
     tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float
 ) -> Solution:
     search = Search(tables, at, gaps, scale, gain, box, gate)
-    root = search.node(tables[0], None, -1)
-    chosen, cost = _without_conflicts(search, root, len(at))
+    root, chosen, cost = _without_conflicts(search)
+    search.gather(root)
     squares, freedom, matched = 0.0, 0, 0
     for node, c in chosen:
         n = int((node.index[c] >= 0).sum())
@@ -155,29 +157,27 @@ def _solve(
     return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched)
 
 
-def _without_conflicts(search: Search, root: Node, count: int) -> tuple[list[tuple[Node, int]], float]:
+def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], float]:
     """The best explanation in which no two labels share a point: best first over who must do without it."""
     order = counter()
-    queue: list[tuple[float, int, dict[int, NDArray], list[tuple[Node, int]]]] = []
+    queue: list[tuple[float, int, frozenset[tuple[int, int]], Node, list[tuple[Node, int]]]] = []
 
-    def push(extra: dict[int, NDArray]) -> None:
-        if extra:
-            search.reweigh(extra)
+    def push(blocked: frozenset[tuple[int, int]]) -> None:
+        search.blocked = blocked
+        root = search.node(search.tables[0], None, -1)
         chosen = search.decode(root)
-        heapq.heappush(queue, (float(root.best[chosen[0][1]]), next(order), extra, chosen))
+        heapq.heappush(queue, (float(root.best[chosen[0][1]]), next(order), blocked, root, chosen))
 
-    push({})
-    for _ in range(32):
-        cost, _, extra, chosen = heapq.heappop(queue)
+    push(frozenset())
+    for _ in range(CLASHES):
+        cost, _, blocked, root, chosen = heapq.heappop(queue)
         clash = _clash(chosen)
-        if clash is None or len(queue) > 64:
+        if clash is None:
             break
         point, segments = clash
         for s in segments:
-            price = extra.get(s, np.zeros(count)).copy()
-            price[point] = 1e3
-            push({**extra, s: price})
-    return chosen, cost
+            push(blocked | {(s, point)})
+    return root, chosen, cost
 
 
 def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
