@@ -22,6 +22,7 @@ _HOMES = {
     "calibrate_people": "kinefit.calibration.people",
     "catalogue": "kinefit.bodies",
     "check_take": "kinefit.calibration.check",
+    "fit_marker_subject": "kinefit.tracking.marker_subject",
     "fit_markers": "kinefit.tracking.markers",
     "gauss_newton": "kinefit.solvers.least_squares",
     "levenberg_marquardt": "kinefit.solvers.least_squares",

@@ -139,13 +139,15 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
     try:
         rate, stated = float(header["datarate"]), int(float(header["numframes"]))
         count = int(float(header["nummarkers"]))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         problem = f"DataRate, NumFrames or NumMarkers is missing or no number ({error})"
         raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
         raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
     cells = lines[3].split("\t") if "\t" in lines[3] else lines[3].split()
     names = [cell.strip() for cell in cells if cell.strip()][2:]
+    if not 0 <= count <= len(text) or stated < 0:  # a cell takes a character at least
+        raise FileError(f"{count} markers in {stated} frames", file=path, place="line 3", remedy="Correct NumMarkers.")
     names += [""] * (count - len(names))
     metres = _metres(unit or header.get("units"), path)
     frames, times, positions = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
