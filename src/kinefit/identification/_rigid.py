@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,13 @@ from kinefit.identification.model import MarkerJoint
 SECOND_RANGE = 0.35
 """Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
 and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
+
+
+def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
+    """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
 
 
 def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
@@ -72,7 +81,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
     for _ in range(5):
         away = local - a
         length = np.linalg.norm(away, axis=-1)
-        typical = np.nanmedian(length, axis=0)
+        typical = middle(length, axis=0)
         J = -away / length[..., None]
         r = typical - length
         ok = np.isfinite(r)
@@ -82,7 +91,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
         a = a + np.linalg.solve(J.T @ J / len(r) + 0.02 * np.eye(3), J.T @ r / len(r) + 0.02 * (guess - a))
     # in the child: at those distances from its markers, nearest to where the parent's lies in the reference
     b = a.copy()
-    typical = np.nanmedian(np.linalg.norm(local - a, axis=-1), axis=0)
+    typical = middle(np.linalg.norm(local - a, axis=-1), axis=0)
     for _ in range(10):
         away = b - x
         length = np.linalg.norm(away, axis=-1)
@@ -108,12 +117,12 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
             return np.inf
         A = np.concatenate([Rp[good], -Rc[good]], axis=2)
         r = tc[good] - tp[good]
-        middle = np.concatenate([local(Rp[good], tp[good], y[good]).mean((0, 1)), np.zeros(3)])
-        middle = np.nan_to_num(middle)
-        middle[3:] = np.nan_to_num(np.nanmean(local(Rc[good], tc[good], y[good]), axis=(0, 1)))
+        start = np.concatenate([local(Rp[good], tp[good], y[good]).mean((0, 1)), np.zeros(3)])
+        start[3:] = middle(local(Rc[good], tc[good], y[good]), axis=(0, 1))
+        start = np.nan_to_num(start)
         H = np.einsum("fij,fik->jk", A, A) / good.sum() + 1e-3 * np.eye(6)
-        g = np.einsum("fij,fi->j", A, r - A @ middle) / good.sum()
-        left = r - A @ (middle + np.linalg.solve(H, g))
+        g = np.einsum("fij,fi->j", A, r - A @ start) / good.sum()
+        left = r - A @ (start + np.linalg.solve(H, g))
         return float(np.sqrt(np.median((left**2).sum(1))))
     here = local(Rp, tp, y)
     guess = here[frame].copy()
@@ -121,7 +130,7 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
         return np.inf
     a, _ = meet_few(Rp, tp, y[frame] if np.isfinite(y[frame]).all() else guess, y, np.nanmean(guess, axis=0))
     length = np.linalg.norm(here - a, axis=-1)
-    return float(np.sqrt(np.nanmedian((length - np.nanmedian(length, axis=0)) ** 2))) if len(length) else np.inf
+    return float(np.sqrt(np.nanmedian((length - middle(length, axis=0)) ** 2))) if len(length) else np.inf
 
 
 def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
@@ -131,8 +140,8 @@ def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float
     if not len(relative):
         return 0.0, 0.0, 0.0
     u, _, vt = np.linalg.svd(relative.mean(0))
-    middle = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    turns = log_so3(np.einsum("ji,fjk->fik", middle, relative))
+    mean = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turns = log_so3(np.einsum("ji,fjk->fik", mean, relative))
     _, axes = np.linalg.eigh(turns.T @ turns)
     low, high = np.quantile(turns @ axes, [0.05, 0.95], axis=0)
     first, second, third = np.sort(high - low)[::-1].tolist()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._rigid import joint_residual, local, rigid_frames
+from kinefit.identification._rigid import joint_residual, local, middle, rigid_frames
 from kinefit.identification.from_frame import Skeleton
 from kinefit.identification.marker_sets import GIVE, RANGE
 
@@ -117,8 +117,7 @@ def strays(positions: NDArray, group: set[int]) -> NDArray:
         R, t = rigid_frames(shape_of(positions[:, used]), positions[:, used])
         who = [leave] if leave is not None else list(range(positions.shape[1]))
         back = local(R, t, positions[:, who])
-        middle = np.nanmedian(back, axis=0)
-        away = np.nanmedian(((back - middle) ** 2).sum(-1), axis=0)
+        away = middle(((back - middle(back, axis=0)) ** 2).sum(-1), axis=0)
         out[who] = np.where(np.isfinite(away), np.sqrt(away / 3), np.inf)
     return out
 
@@ -128,8 +127,8 @@ def shape_of(y: NDArray) -> NDArray:
     shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
     shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
     for _ in range(3):
-        middle = np.nanmedian(local(*rigid_frames(shape, y), y), axis=0)
-        shape = np.where(np.isfinite(middle), middle, shape)
+        typical = middle(local(*rigid_frames(shape, y), y), axis=0)
+        shape = np.where(np.isfinite(typical), typical, shape)
     return shape
 
 
@@ -174,17 +173,18 @@ def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) 
     for a in range(count):
         for b in range(a):
             first, second = (a, b) if frames[a] is not None else (b, a)
+            parent = frames[first]
             if groups[a] & groups[b]:
                 cost[a, b] = 0.0
-            elif frames[first] is None:
+            elif parent is None:
                 between = deviation[np.ix_(sorted(groups[a]), sorted(groups[b]))]
                 cost[a, b] = np.nanmin(between, initial=np.inf) + 0.05
             else:
-                cost[a, b] = joint_residual(frames[first], frames[second], positions[:, sorted(groups[second])])
+                cost[a, b] = joint_residual(parent, frames[second], positions[:, sorted(groups[second])])
             near = np.linalg.norm(
                 positions[:, sorted(groups[a])][:, :, None] - positions[:, sorted(groups[b])][:, None], axis=-1
             )
-            near = np.nanmin(np.nanmedian(near, axis=0)) if np.isfinite(near).any() else np.inf
+            near = np.nanmin(middle(near, axis=0)) if np.isfinite(near).any() else np.inf
             cost[a, b] = cost[b, a] = cost[a, b] + 0.1 * near
     return cost
 

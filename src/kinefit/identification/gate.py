@@ -129,5 +129,6 @@ def _alike(model: MarkerModel) -> list[Finding]:
             d = model.mean[np.ix_(first, first)][i, j] - model.mean[np.ix_(second, second)][i, j]
             if np.abs(d).max() < ALIKE:
                 text = f"same shape as {model.names[b]} within {1e3 * np.abs(d).max():.0f} mm"
-                out.append(Finding("alike", model.names[a], text, "Move one marker by 3 cm, or wear one more on a side"))
+                remedy = "Move one marker by 3 cm, or wear one more on a side"
+                out.append(Finding("alike", model.names[a], text, remedy))
     return out

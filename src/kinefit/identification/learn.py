@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._rigid import meet, rigid_frames, told, turned
+from kinefit.identification._rigid import meet, middle, rigid_frames, told, turned
 from kinefit.identification.clusters import learn_segments
 from kinefit.identification.from_frame import (
     JOINT_SPREAD,
@@ -90,10 +90,10 @@ def distances(positions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     for i in range(count):
         d = np.linalg.norm(positions - positions[:, i, None], axis=-1)
         together = np.isfinite(d).any(0)
-        middle = np.nanmedian(d[:, together], axis=0)
-        away = np.abs(d[:, together] - middle)
+        usual = np.nanmedian(d[:, together], axis=0)
+        away = np.abs(d[:, together] - usual)
         most = 5 * 1.4826 * np.nanmedian(away, axis=0) + 1e-4
-        inside = np.clip(d[:, together], middle - most, middle + most)
+        inside = np.clip(d[:, together], usual - most, usual + most)
         mean[i, together], deviation[i, together] = np.nanmean(inside, axis=0), np.nanstd(inside, axis=0)
         low[i, together], high[i, together] = np.nanquantile(d[:, together], [0.005, 0.995], axis=0)
     return mean, deviation, low, high
@@ -129,9 +129,9 @@ def fit_model(
             typical = float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD
             ranges = turned(Rs[p], R, np.isfinite(y[..., 0]).sum(1) >= min(3, len(x)))
             joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
-            known_share = told(joint, skeleton.ranges[s])
+            share = told(joint, skeleton.ranges[s])
             usual = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
-            joints.append(replace(joint, spread=float(np.sqrt(known_share * typical**2 + (1 - known_share) * usual**2))))
+            joints.append(replace(joint, spread=float(np.sqrt(share * typical**2 + (1 - share) * usual**2))))
         Rs.append(R)
         ts.append(t)
     tree_low, tree_high = reach(reference, skeleton.members, joints)
@@ -211,8 +211,8 @@ def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: 
             R, t = rigid_frames(shape, y, prior)
             back = np.einsum("fji,fkj->fki", R, y - t[:, None])
             here = np.isfinite(back[..., 0])
-            middle = np.nanmedian(np.where(here[..., None], back, np.nan), axis=0)
-            shape = np.where(np.isfinite(middle), middle, shape)
+            typical = middle(np.where(here[..., None], back, np.nan), axis=0)
+            shape = np.where(np.isfinite(typical), typical, shape)
         R, t = rigid_frames(shape, frame[None, index], prior[:1])
         if np.isfinite(t).all():
             sums[index] += shape @ R[0].T + t[0]
