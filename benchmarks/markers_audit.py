@@ -17,9 +17,11 @@ from kinefit.identification.model import MarkerModel
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 
-# Takes of bodies or legs, one a marker set and more, without wrong labels that the eye can find in the raw tracks.
-# Not among them: nick_freeform_001 (two labels of the left hand are exchanged up to frame 192) and the running trial of
-# markers_bmc_run (RTOE and RMT5 change places every third frame): those the audit has to find.
+# Takes of bodies or legs, of nine marker sets, in which no exchanged labels are known (some have strays: RFHD in 01_01,
+# toes in 85_12). Thresholds were chosen on swaps injected, with other seeds, into the CMU, HDM05, ARIEL, Stanford.
+# Not among them are two with real errors, which the audit has to find: in the running trial of markers_bmc_run the raw
+# tracks of RTOE and RMT5 change places every third frame; in nick_freeform_001 the distances of LIWR and LOHAND up to
+# frame 192 are each other's of later on.
 CLEAN = (
     "markers/mocaprecovery/data__85_12.c3d", "markers/mocaprecovery/data__HDM_mm_01-02_03_120.c3d",
     "markers/c3d_to_xyz/01_01.c3d", "markers/momentum/momentum__examples__process_markers_app__02_01.c3d",
