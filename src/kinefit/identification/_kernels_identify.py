@@ -9,6 +9,7 @@ from kinefit._jit import jit
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
 _TURNS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
 LEAST = 4.0  # what a choice must earn that nothing above holds: accidents are many
+MOST_STEPS = 100_000  # of the search in one segment, about 10 ms: reached only where noise is as large as the segment
 _FLAT = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
 
 
@@ -236,7 +237,9 @@ def enumerate_segment(
     depth = known
     if depth < last:
         nxt[depth] = 0
-    while depth >= known and known < last:
+    steps = 0
+    while depth >= known and known < last and steps < MOST_STEPS:
+        steps += 1
         if depth == last:
             if matched[depth] >= fewest:
                 n = 0

@@ -100,6 +100,11 @@ class Search:
         self.blocked: frozenset[tuple[int, int]] = frozenset()  # (segment, point) that may not be
         self.promise = {t.index: 0.0 for t in tables}  # least cost of a segment and all below it, as found so far
 
+    @property
+    def spent(self) -> bool:
+        """Whether the search has had its nodes."""
+        return len(self.memo) > BUDGET
+
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
@@ -184,11 +189,11 @@ class Search:
             hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0), np.empty(0),
         )  # fmt: skip
 
-    def alone(self, table: SegmentTable) -> tuple[float, bool]:
-        """Least cost of a segment on its own, with nothing known of any other; whether that has all its markers."""
+    def alone(self, table: SegmentTable) -> tuple[float, int]:
+        """Least cost of a segment on its own, with nothing known of any other; how many markers that has."""
         index, cost, _ = self.choices(table, np.full(len(table.markers), -2, np.int64), Hold(), self.bits[-1])
         best = int(np.argmin(cost))
-        return float(cost[best]), bool((index[best] >= 0).all())
+        return float(cost[best]), int((index[best] >= 0).sum())
 
     def complete(self, node: Node, allowed: float) -> None:
         """Follow each choice downwards while its cost, with the best known of what is still to come, stays near.
@@ -199,13 +204,12 @@ class Search:
         node.best, node.total = np.full(len(node.cost), np.inf), np.full(len(node.cost), np.inf)
         children = [self.by_index[child] for child in node.table.children]
         best = np.inf
-        spent = len(self.memo) > BUDGET
         for c in range(len(node.cost)):
             below: list[Node] = []
             bound = total = float(node.cost[c])
             bound += sum(self.promise[t.index] for t in children)
             limit = min(allowed, best + SLACK)
-            follow = not spent or (c == 0 and c != node.empty)
+            follow = not self.spent or (c == 0 and c != node.empty)
             for t in children if follow and bound <= limit else ():
                 bound -= self.promise[t.index]
                 child = self.node(t, node, c, limit - bound)

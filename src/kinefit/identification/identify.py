@@ -19,6 +19,10 @@ CLASHES = 24
 """Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
 
 
+ENOUGH = 0.65
+"""Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
+
+
 @dataclass(frozen=True)
 class IdentifySettings:
     """How `identify` searches; nothing of it is about one body or one recording.
@@ -92,20 +96,26 @@ def identify(
     clutter = max(len(at) - count * (1 - miss), 0.5) / box
     gain = float(np.log((1 - miss) / (miss * clutter)))
     best: Solution | None = None
-    root, scale = _start(model, at, gaps, gain, box, settings)
+    root, start = _start(model, at, gaps, gain, box, settings)
     tables = segment_tables(model, root)
-    while scale <= settings.coarsest:
+    for scale in _around(start, settings):
         found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
-        if best is None or found.cost < best.cost:
+        if best is None or (found.clashes, found.cost) < (best.clashes, best.cost):
             best = found
-        if found.matched >= 0.5 * min(count, len(at)) and found.noise < 0.95 * scale:
+        if not found.clashes and found.matched >= ENOUGH * min(count, len(at)) and found.noise < 1.25 * scale:
             break
-        scale = max(1.5 * scale, 1.2 * found.noise, 0.25)
     assert best is not None
-    if best.matched > 3 and best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2:
+    if best.matched > 3 and not best.clashes and best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2:
         found = _solve(tables, at, gaps, 1.05 * best.noise, gain, box, settings.gate)
         best = found if found.matched >= 0.8 * best.matched else best
     return _decide(best, count, settings.certain)
+
+
+def _around(start: float, settings: IdentifySettings) -> list[float]:
+    """Noise levels, the nearest to the start first, coarser before finer."""
+    steps = [start * 1.6**k for k in range(-12, 13)]
+    inside = [s for s in steps if max(settings.finest, 0.2) <= s <= settings.coarsest or s == start]
+    return sorted(inside, key=lambda s: (round(abs(np.log(s / start)), 6), -s))
 
 
 def _start(
@@ -116,14 +126,15 @@ def _start(
     large = [s for s, m in enumerate(model.segments) if len(m) >= max(3, sizes[min(2, len(sizes) - 1)])][:6]
     large = large or [int(np.argmax([len(m) for m in model.segments]))]
     tables = segment_tables(model, large[0])
-    best, scale, chosen = np.inf, settings.finest, (large[0], settings.finest)
+    best, share, scale, chosen = np.inf, 0.0, settings.finest, (large[0], settings.finest)
     while scale <= settings.coarsest:
         search = Search(tables, at, gaps, scale, gain, box, settings.gate)
         found = [search.alone(search.by_index[s]) for s in large]
         cost = sum(c for c, _ in found)
         if cost < best:
             best, chosen = cost, (large[int(np.argmin([c for c, _ in found]))], scale)
-        if all(whole for _, whole in found) and cost > best:
+            share = sum(n for _, n in found) / sum(len(model.segments[s]) for s in large)
+        elif share > ENOUGH + 0.05:
             break
         scale = max(1.6 * scale, 0.25)
     return chosen
@@ -139,13 +150,14 @@ class Solution:
     cost: float
     noise: float
     matched: int
+    clashes: bool
 
 
 def _solve(
     tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float
 ) -> Solution:
     search = Search(tables, at, gaps, scale, gain, box, gate)
-    root, chosen, cost = _without_conflicts(search)
+    root, chosen, cost, clashes = _without_conflicts(search)
     search.gather(root)
     squares, freedom, matched = 0.0, 0, 0
     for node, c in chosen:
@@ -154,10 +166,10 @@ def _solve(
             squares += float(node.squares[c])
             freedom += 1 if n == 2 else 3 * n - 6
         matched += int((node.index[c][node.table.shared < 0] >= 0).sum())
-    return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched)
+    return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched, clashes)
 
 
-def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], float]:
+def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], float, bool]:
     """The best explanation in which no two labels share a point: best first over who must do without it."""
     order = counter()
     queue: list[tuple[float, int, frozenset[tuple[int, int]], Node, list[tuple[Node, int]]]] = []
@@ -172,12 +184,12 @@ def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], fl
     for _ in range(CLASHES):
         cost, _, blocked, root, chosen = heapq.heappop(queue)
         clash = _clash(chosen)
-        if clash is None:
+        if clash is None or search.spent:
             break
         point, segments = clash
         for s in segments:
             push(blocked | {(s, point)})
-    return root, chosen, cost
+    return root, chosen, cost, clash is not None
 
 
 def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
@@ -208,6 +220,8 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
     search.reweigh(extra)
     table = search.marginals(found.root, count)
     confidence = table[np.arange(count), guess]
+    users = np.bincount(guess[guess >= 0], minlength=len(search.points))
+    confidence[(guess >= 0) & (users[guess] > 1)] = 0.0  # the search ended before it was decided
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)
     return Identification(
