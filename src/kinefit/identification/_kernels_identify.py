@@ -8,6 +8,7 @@ from kinefit._jit import jit
 
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
 _TURNS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
+MOST_EXCESS = 4.0
 LEAST = 4.0  # what a choice must earn that nothing above holds: accidents are many
 MOST_STEPS = 100_000  # of the search in one segment, about 10 ms: reached only where noise is as large as the segment
 _FLAT = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
@@ -346,7 +347,32 @@ def enumerate_segment(
 
 
 @jit
-def weigh_child(new, best, total, taken):
+def range_cost(points, theirs, index, low, high, width, out):
+    """out (C,): how far a segment's choices leave the distances to the parent's points that training showed.
+
+    theirs (k',) the parent's points, index (C, k) the choices; low, high, width (k', k) [m]. Three times the mean over
+    pairs (a joint turns in three ways) of half the squared excess over `width`, each at most MOST_EXCESS.
+    """
+    for c in range(len(out)):
+        total, count = 0.0, 0
+        for i in range(len(theirs)):
+            p = theirs[i]
+            for j in range(index.shape[1]):
+                q = index[c, j]
+                if p < 0 or q < 0 or p == q or width[i, j] <= 0:
+                    continue
+                d = math.sqrt(
+                    (points[p, 0] - points[q, 0]) ** 2 + (points[p, 1] - points[q, 1]) ** 2 + (points[p, 2] - points[q, 2]) ** 2
+                )
+                e = low[i, j] - d if d < low[i, j] else (d - high[i, j] if d > high[i, j] else 0.0)
+                e = 0.5 * (e / width[i, j]) ** 2
+                total += e if e < MOST_EXCESS else MOST_EXCESS
+                count += 1
+        out[c] = 3 * total / count if count > 0 else 0.0
+
+
+@jit
+def weigh_child(new, best, total, extra, taken):
     """Least of `best`, and -log Σ exp(-total), over the choices (C, W bits) that take none of the points `taken`."""
     low, low_total = math.inf, math.inf
     for c in range(len(best)):
@@ -354,13 +380,13 @@ def weigh_child(new, best, total, taken):
         for i in range(len(taken)):
             free = free and (new[c, i] & taken[i]) == 0
         if free:
-            low = best[c] if best[c] < low else low
-            low_total = total[c] if total[c] < low_total else low_total
+            low = best[c] + extra[c] if best[c] + extra[c] < low else low
+            low_total = total[c] + extra[c] if total[c] + extra[c] < low_total else low_total
     mass = 0.0
     for c in range(len(best)):
         free = True
         for i in range(len(taken)):
             free = free and (new[c, i] & taken[i]) == 0
         if free:
-            mass += math.exp(low_total - total[c])
+            mass += math.exp(low_total - total[c] - extra[c])
     return low, low_total - math.log(mass)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._kernels_identify import enumerate_segment, place_joint, weigh_child
+from kinefit.identification._kernels_identify import enumerate_segment, place_joint, range_cost, weigh_child
 from kinefit.identification._tables import SegmentTable
 
 LOOSE = 0.15
@@ -87,6 +87,7 @@ class Search:
         self.points, self.gaps, self.scale, self.gain, self.gate = points, gaps, scale, gain, gate
         self.volume = volume
         self.sigma = {t.index: t.sigma * scale for t in tables}
+        self.tells = {t.index: bool((t.width > 0).any()) for t in tables}
         self.memo: dict[tuple, Node] = {}
         words = (len(points) + 63) // 64
         self.bits = np.zeros((len(points) + 1, words), np.uint64)  # the last row: no point
@@ -135,13 +136,8 @@ class Search:
 
     def joint(self, parent: Node, choice: int, table: SegmentTable) -> Hold:
         """What a choice of the parent says of the joint: a place, or distances from one or two points, or nothing."""
-        points = parent.index[choice]
-        here = points >= 0
         t, at = parent.table, np.empty(3)
-        x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
-        if parent.hold.sigma > 0:
-            x, y = np.vstack([x, t.joint_here]), np.vstack([y, parent.hold.pivot])
-            sigma = np.append(sigma, parent.hold.sigma)
+        x, y, sigma = self.fitted(parent, choice)
         if not len(x):
             return Hold()
         spread = table.spread * min(self.scale, 1.0)
@@ -152,6 +148,16 @@ class Search:
                 return Hold(at, deviation)
         reach = np.linalg.norm(x - table.joint_there, axis=1)
         return Hold(anchors=y[:2], reach=reach[:2], deviation=np.sqrt(sigma[:2] ** 2 + spread**2))
+
+    def fitted(self, node: Node, choice: int) -> tuple[NDArray, NDArray, NDArray]:
+        """(n, 3) places in the segment, (n, 3) where they are, (n,) deviations of a choice's points and its pivot [m]."""
+        points, t = node.index[choice], node.table
+        here = points >= 0
+        x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
+        if node.hold.sigma > 0:
+            x, y = np.vstack([x, t.joint_here]), np.vstack([y, node.hold.pivot])
+            sigma = np.append(sigma, node.hold.sigma)
+        return x, y, sigma
 
     def choices(
         self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
@@ -213,7 +219,7 @@ class Search:
             for t in children if follow and bound <= limit else ():
                 bound -= self.promise[t.index]
                 child = self.node(t, node, c, limit - bound)
-                low, sums = weigh_child(child.new, child.best, child.total, node.all[c])
+                low, sums = weigh_child(child.new, child.best, child.total, self.between(node, c, child), node.all[c])
                 bound, total = bound + low, total + sums
                 self.promise[t.index] = min(self.promise[t.index], low)
                 below.append(child)
@@ -245,9 +251,16 @@ class Search:
         node.total = node.best.copy()
         for c, below in enumerate(node.below):
             for child in below or ():
-                low, total = weigh_child(child.new, child.best, child.total, node.all[c])
+                low, total = weigh_child(child.new, child.best, child.total, self.between(node, c, child), node.all[c])
                 node.best[c] += low
                 node.total[c] += total
+
+    def between(self, node: Node, choice: int, child: Node) -> NDArray:
+        """(C,) what a child's choices cost beside one of its parent, by the distances of training."""
+        t, out = child.table, np.zeros(len(child.cost))
+        if self.tells[t.index]:
+            range_cost(self.points, node.index[choice], child.index, t.low, t.high, t.width, out)
+        return out
 
     def gather(self, root: Node) -> None:
         """`nodes`: all that count, children before their parents."""
@@ -263,13 +276,16 @@ class Search:
 
         visit(root)
 
-    def decode(self, node: Node, forbidden: NDArray | None = None) -> list[tuple[Node, int]]:
+    def decode(self, node: Node, above: tuple[Node, int] | None = None) -> list[tuple[Node, int]]:
         """The best choices of a node and all below it, top down."""
-        fits = np.ones(len(node.cost), bool) if forbidden is None else ~(node.new & forbidden).any(1)
-        c = int(np.argmin(np.where(fits, node.best, np.inf)))
+        cost = node.best
+        if above is not None:
+            fits = ~(node.new & above[0].all[above[1]]).any(1)
+            cost = np.where(fits, node.best + self.between(*above, node), np.inf)
+        c = int(np.argmin(cost))
         found = [(node, c)]
         for child in node.below[c] or ():
-            found += self.decode(child, node.all[c])
+            found += self.decode(child, (node, c))
         return found
 
     def reweigh(self, extra: dict[int, NDArray]) -> None:
@@ -302,6 +318,7 @@ class Search:
                 table[node.table.markers[fresh], node.index[c, fresh]] += p[c]
                 for child in node.below[c] or ():
                     fits = ~(child.new & node.all[c]).any(1)
-                    weight = np.where(fits, np.exp(child.total[fits].min() - child.total), 0.0)
+                    cost = np.where(fits, child.total + self.between(node, c, child), np.inf)
+                    weight = np.exp(cost.min() - cost)
                     share[id(child)] += p[c] * weight / weight.sum()
         return table

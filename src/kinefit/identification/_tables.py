@@ -13,6 +13,13 @@ FINEST = 1e-3
 """[m] least standard deviation of a marker's coordinate in its segment: below it, training was too short to tell."""
 
 
+OTHER_MOTIONS = 0.7
+"""Deviation that no training shows, as a share of the catalogue's usual one: skin moves otherwise in other motions."""
+
+BEYOND, BEYOND_SHARE = 0.03, 0.15
+"""Distances across a joint go beyond those of training by this [m], and this share of their range."""
+
+
 @dataclass(frozen=True, eq=False)
 class SegmentTable:
     """One segment, seen from the root that was chosen.
@@ -40,32 +47,46 @@ class SegmentTable:
     joint_here: NDArray | None
     joint_there: NDArray | None
     spread: float
+    low: NDArray
+    high: NDArray
+    width: NDArray
 
 
 def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
     """The model's segments, parents first, hung from any of them as the root."""
-    links: dict[int, list[tuple[int, NDArray, NDArray, float]]] = {s: [] for s in range(len(model.segments))}
+    links: dict[int, list[tuple[int, NDArray, NDArray, float, bool]]] = {s: [] for s in range(len(model.segments))}
     for j in model.joints:
-        links[j.parent].append((j.child, np.asarray(j.in_child, float), np.asarray(j.in_parent, float), j.spread))
-        links[j.child].append((j.parent, np.asarray(j.in_parent, float), np.asarray(j.in_child, float), j.spread))
+        links[j.parent].append((j.child, np.asarray(j.in_child, float), np.asarray(j.in_parent, float), j.spread, j.exercised > 0))
+        links[j.child].append((j.parent, np.asarray(j.in_parent, float), np.asarray(j.in_child, float), j.spread, j.exercised > 0))
     found: list[SegmentTable] = []
-    todo: list[tuple[int, int, NDArray | None, NDArray | None, float]] = [(root, -1, None, None, 0.0)]
+    trained = any(j.exercised > 0 for j in model.joints)  # else deviations are guesses, for any motion
+    todo: list[tuple[int, int, NDArray | None, NDArray | None, float, bool]] = [(root, -1, None, None, 0.0, False)]
     while todo:
-        s, parent, here, there, spread = todo.pop(0)
+        s, parent, here, there, spread, learnt = todo.pop(0)
         below = [link for link in links[s] if link[0] != parent]
-        todo += [(child, s, a, b, width) for child, a, b, width in below]
+        todo += [(child, s, *joint) for child, *joint in below]
         markers = np.array(model.segments[s], np.int64)
         x = np.ascontiguousarray(np.asarray(model.reference, float)[markers])
         above = list(model.segments[parent]) if parent >= 0 else []
         shared = np.array([above.index(m) if m in above else -1 for m in markers], np.int64)
+        pairs = np.ix_(above, markers)
+        low, high = model.low[pairs], model.high[pairs]
+        width = (BEYOND + BEYOND_SHARE * (high - low)) * (learnt and np.isfinite(high - low))
         D = np.linalg.norm(x[:, None] - x, axis=-1)
         found.append(
             SegmentTable(
                 s, parent, tuple(link[0] for link in below), markers, x, D,
-                deviations(model.deviation[np.ix_(markers, markers)]), shared, here, there, spread,
+                np.hypot(deviations(model.deviation[np.ix_(markers, markers)]), unseen(D) * trained), shared, here, there, spread,
+                np.nan_to_num(low), np.nan_to_num(high), np.nan_to_num(width),
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def unseen(D: NDArray) -> NDArray:
+    """(k,) [m] what motions other than those of training add to each coordinate's deviation: a share of the usual give."""
+    mean = D.sum(1) / max(len(D) - 1, 1)
+    return OTHER_MOTIONS * (0.004 + 0.03 * mean) / np.sqrt(2.0)
 
 
 def deviations(deviation: NDArray) -> NDArray:

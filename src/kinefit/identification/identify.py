@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.identification._kernels_identify import place_joint
 from kinefit.identification._search import Node, Search
 from kinefit.identification._tables import SegmentTable, segment_tables
 from kinefit.identification.model import MarkerModel
@@ -18,6 +19,9 @@ from kinefit.identification.model import MarkerModel
 CLASHES = 24
 """Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
 
+
+OUTLIERS, OUTLYING = 0.05, 4.0
+"""Share of markers beyond the noise, and how far: a usual contamination of a Gaussian."""
 
 ENOUGH = 0.65
 """Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
@@ -102,7 +106,8 @@ def identify(
         found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
         if best is None or (found.clashes, found.cost) < (best.clashes, best.cost):
             best = found
-        if not found.clashes and found.matched >= ENOUGH * min(count, len(at)) and found.noise < 1.25 * scale:
+        enough = 0.9 * len(at) if len(at) <= count else ENOUGH * count
+        if not found.clashes and found.matched >= enough and found.noise < 1.25 * scale:
             break
     assert best is not None
     if best.matched > 3 and not best.clashes and best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2:
@@ -222,8 +227,39 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
     confidence = table[np.arange(count), guess]
     users = np.bincount(guess[guess >= 0], minlength=len(search.points))
     confidence[(guess >= 0) & (users[guess] > 1)] = 0.0  # the search ended before it was decided
+    _complete(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)
     return Identification(
         assignment, np.where(guess >= 0, confidence, 0.0), found.cost, bool(((guess >= 0) & ~known).any()), found.noise, guess
     )
+
+
+def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
+    """Markers that left their place further than the noise allows, as skin does: the one free point near enough.
+
+    A share OUTLIERS of the markers has OUTLYING times the deviation; the odds are those against a missing marker and a
+    point that is none. Changes guess and confidence.
+    """
+    search = found.search
+    points = search.points
+    free = np.setdiff1d(np.arange(len(points)), guess[guess >= 0])
+    for node, c in found.chosen if len(free) else ():
+        t, here = node.table, node.index[c] >= 0
+        lost = [i for i in np.flatnonzero(~here) if t.shared[i] < 0 and guess[t.markers[i]] < 0]
+        x, y, sigma = search.fitted(node, c)
+        if len(x) < 3 or not lost:
+            continue
+        for i in lost:
+            at = np.empty(3)
+            variance = place_joint(len(x), x, y, sigma, t.x[i], at)
+            wide = OUTLYING**2 * search.sigma[t.index][i] ** 2 + variance
+            odds = search.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide) - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
+            best = int(np.argmax(odds))
+            share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))
+            sure = share * float(confidence[t.markers[here]].min(initial=1.0))
+            if sure > 0.5:
+                guess[t.markers[i]], confidence[t.markers[i]] = free[best], sure
+                free = np.delete(free, best)
+                if not len(free):
+                    return
