@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,7 @@ class SegmentTable:
     width: NDArray
 
 
+@lru_cache(maxsize=64)
 def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
     """The model's segments, parents first, hung from any of them as the root."""
     links: dict[int, list[tuple[int, NDArray, NDArray, float, bool]]] = {s: [] for s in range(len(model.segments))}

@@ -20,6 +20,12 @@ CLASHES = 24
 """Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
 
 
+CLEAR = 12.0
+"""Cost by which every choice leads the next, where nothing needs weighing."""
+
+ELSEWHERE = 5.0
+"""Cost of a point that the best explanation needs elsewhere."""
+
 OUTLIERS, OUTLYING = 0.05, 4.0
 """Share of markers beyond the noise, and how far: a usual contamination of a Gaussian."""
 
@@ -212,19 +218,14 @@ def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None
 def _decide(found: Solution, count: int, certain: float) -> Identification:
     """Labels that are probable enough, by the share of all explanations that agree on them."""
     search = found.search
-    near = {t.index: {t.index, t.parent, *t.children} for t in search.tables}
-    extra: dict[int, NDArray] = {}
     guess = np.full(count, -1)
     for node, c in found.chosen:
         fresh = node.table.shared < 0
         guess[node.table.markers[fresh]] = node.index[c, fresh]
-        for t in search.tables:
-            if node.table.index not in near[t.index]:
-                mine = node.index[c, fresh]
-                extra.setdefault(t.index, np.zeros(len(search.points)))[mine[mine >= 0]] = 5.0
-    search.reweigh(extra)
-    table = search.marginals(found.root, count)
-    confidence = table[np.arange(count), guess]
+    if all(np.delete(node.best, c).min(initial=np.inf) - node.best[c] > CLEAR for node, c in found.chosen):
+        confidence = np.full(count, 1 - float(np.exp(-CLEAR)))
+    else:
+        confidence = _shares(found, guess)
     users = np.bincount(guess[guess >= 0], minlength=len(search.points))
     confidence[(guess >= 0) & (users[guess] > 1)] = 0.0  # the search ended before it was decided
     _complete(found, guess, confidence)
@@ -233,6 +234,23 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
     return Identification(
         assignment, np.where(guess >= 0, confidence, 0.0), found.cost, bool(((guess >= 0) & ~known).any()), found.noise, guess
     )
+
+
+def _shares(found: Solution, guess: NDArray) -> NDArray:
+    """(M,) share of the likelihood of all explanations that agree with a guess about each label.
+
+    A point that the best explanation gives to a segment elsewhere costs others: it would have to be given up there.
+    """
+    search = found.search
+    near = {t.index: {t.index, t.parent, *t.children} for t in search.tables}
+    extra = {t.index: np.zeros(len(search.points)) for t in search.tables}
+    for node, c in found.chosen:
+        mine = node.index[c][(node.table.shared < 0) & (node.index[c] >= 0)]
+        for t in search.tables:
+            if node.table.index not in near[t.index]:
+                extra[t.index][mine] = ELSEWHERE
+    search.reweigh(extra)
+    return search.marginals(found.root, len(guess))[np.arange(len(guess)), guess]
 
 
 def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
