@@ -68,7 +68,8 @@ def table(model: MarkerModel) -> None:
     """Every distortion with every share missing and number extra."""
     print("distortion missing extra | identify: right wrong median ms slowest | SAPM: right wrong", flush=True)
     worst, medians = 0.0, []
-    goals = {(0.04, 0.0, 0): 99.95, (0.06, 0.0, 0): 99.7, (0.1, 0.0, 0): 98.3, (0.0, 0.1, 0): 99.6, (0.04, 0.1, 0): 99.6,
+    goals = {(0.04, 0.0, 0): 99.95, (0.06, 0.0, 0): 99.7, (0.1, 0.0, 0): 98.3, (0.0, 0.1, 0): 99.6,
+             (0.04, 0.1, 0): 99.6,
              (0.0, 0.2, 0): 99.0, (0.04, 0.2, 0): 97.5, (0.04, 0.0, 20): 99.9}  # fmt: skip
     results = {}
     for kind in [(d, m, e) for d in (0.0, 0.04, 0.06, 0.1) for m in (0.0, 0.1, 0.2) for e in (0, 5, 20)]:
@@ -76,13 +77,15 @@ def table(model: MarkerModel) -> None:
         a = score(ours, model, POSES, **named)
         b = score(sapm, model, max(POSES // 4, 5), **named)
         print(
-            f"{kind[0]:10.0%} {kind[1]:7.0%} {kind[2]:5d} | {a.right:8.2%} {a.wrong:7.3%} {a.median:7.1f} {a.slowest:7.0f} "
+            f"{kind[0]:10.0%} {kind[1]:7.0%} {kind[2]:5d} | {a.right:8.2%} {a.wrong:7.3%} "
+            f"{a.median:7.1f} {a.slowest:7.0f} "
             f"| {b.right:7.1%} {b.wrong:6.1%}", flush=True,
         )  # fmt: skip
         worst, results[kind] = max(worst, a.wrong), a.right
         medians.append(a.median)
     for kind, goal in goals.items():
-        figure(f"markers.synthetic.right.{kind[0]:.0%}.missing{kind[1]:.0%}.extra{kind[2]}", 100 * results[kind], "%", f">= {goal}")
+        name = f"markers.synthetic.right.{kind[0]:.0%}.missing{kind[1]:.0%}.extra{kind[2]}"
+        figure(name, 100 * results[kind], "%", f">= {goal}")
     figure("markers.synthetic.wrong.worst", 100 * worst, "%", "<= 0.1")
     figure("markers.synthetic.median.worst", max(medians), "ms", "<= 100")
 
@@ -92,7 +95,10 @@ def surface(model: MarkerModel, file: Path | None) -> None:
     distortions, rotations = np.arange(0, 11, 2) / 100, np.arange(0, 5)
     poses = max(POSES // 4, 5)
     found = {
-        name: [[score(method, model, poses, distortion=float(d), rotation=float(r)).right for d in distortions] for r in rotations]
+        name: [
+            [score(method, model, poses, distortion=float(d), rotation=float(r)).right for d in distortions]
+            for r in rotations
+        ]
         for name, method in (("identify", ours), ("SAPM", sapm))
     }
     for name, rows in found.items():
@@ -110,23 +116,26 @@ def drawing(found: dict[str, list[list[float]]], distortions: NDArray, rotations
              '<rect width="920" height="400" fill="white"/>']  # fmt: skip
     for n, (name, rows) in enumerate(found.items()):
         left, top, width, height = 60 + 440 * n, 50, 350, 270
-        floor = 0.0
         parts.append(f'<text x="{left}" y="30" font-size="16" font-weight="bold">{name}: labels right</text>')
         for k in range(6):
             y = top + height * (1 - k / 5)
-            parts.append(f'<path d="M{left} {y}h{width}" stroke="#ddd"/><text x="{left - 8}" y="{y + 4}" text-anchor="end">{20 * k} %</text>')
+            parts.append(f'<path d="M{left} {y}h{width}" stroke="#ddd"/>')
+            parts.append(f'<text x="{left - 8}" y="{y + 4}" text-anchor="end">{20 * k} %</text>')
         for d in distortions:
             x = left + width * d / distortions[-1]
             parts.append(f'<text x="{x}" y="{top + height + 20}" text-anchor="middle">{d:.0%}</text>')
-        parts.append(f'<text x="{left + width / 2}" y="{top + height + 42}" text-anchor="middle">distortion, share of a segment\'s mean distance</text>')
+        middle, under = left + width / 2, "distortion, share of a segment's mean distance"
+        parts.append(f'<text x="{middle}" y="{top + height + 42}" text-anchor="middle">{under}</text>')
         for r, row, colour in zip(rotations, rows, colours):
             line = " ".join(
-                f"{left + width * d / distortions[-1]:.1f},{top + height * (1 - (v - floor) / (1 - floor)):.1f}" for d, v in zip(distortions, row)
+                f"{left + width * d / distortions[-1]:.1f},{top + height * (1 - v):.1f}"
+                for d, v in zip(distortions, row)
             )
             parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
             if n == 0:
                 x = 60 + 130 * int(r)
-                parts.append(f'<path d="M{x} 388h24" stroke="{colour}" stroke-width="3"/><text x="{x + 30}" y="392">0–{r} rad</text>')
+                parts.append(f'<path d="M{x} 388h24" stroke="{colour}" stroke-width="3"/>')
+                parts.append(f'<text x="{x + 30}" y="392">0–{r} rad</text>')
     return "\n".join([*parts, "</svg>\n"])
 
 
@@ -137,7 +146,8 @@ def run(file: Path | None = None) -> None:
     clean = score(ours, model, CLEAN)
     figure("markers.synthetic.clean.identify", 100 * clean.whole, "% of frames", ">= 99.9")
     figure("markers.synthetic.clean.identify.median", clean.median, "ms", "<= 3")
-    figure("markers.synthetic.clean.identify.49", 100 * score(ours, synthetic_body(49), max(CLEAN // 10, 10)).whole, "% of frames", ">= 99.9")
+    large = score(ours, synthetic_body(49), max(CLEAN // 10, 10))
+    figure("markers.synthetic.clean.identify.49", 100 * large.whole, "% of frames", ">= 99.9")
     figure("markers.synthetic.clean.sapm", 100 * score(sapm, model, CLEAN).whole, "% of frames", ">= 95")
     table(model)
     surface(model, file)

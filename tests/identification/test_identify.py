@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import ObservationError
-from kinefit.identification._kernels_identify import evidence, largest_quaternion, rigid
+from kinefit.identification._kernels_evidence import evidence, largest_quaternion, rigid
 from kinefit.identification._tables import deviations, segment_tables
 from kinefit.identification.identify import identify
 from kinefit.identification.synthetic import mean_length, random_pose, synthetic_body

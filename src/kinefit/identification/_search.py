@@ -1,4 +1,4 @@
-"""The search over the tree of segments: every segment's choices under each choice of its parent, best and likely ones."""
+"""The search over the tree of segments: every segment's choices under each choice of its parent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._kernels_identify import enumerate_segment, place_joint, range_cost, weigh_child
+from kinefit.identification._kernels_evidence import place_joint
+from kinefit.identification._kernels_identify import enumerate_segment, range_cost, weigh_child
 from kinefit.identification._tables import SegmentTable
 
 LOOSE = 0.15
@@ -20,8 +21,12 @@ SLACK = 10.0
 """Choices whose cost is this much above the best are dropped: e^-10 of its likelihood."""
 
 
-BUDGET = 600
+BUDGET = 1200
 """Nodes; a search that needs more has a wrong noise level or too few points: from then on only first choices count."""
+
+
+QUOTA = 200
+"""Nodes for each choice of the root."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +86,16 @@ class Search:
     gain : what a matched marker earns against a missing one, log(1/m³)
     """
 
-    def __init__(self, tables: tuple[SegmentTable, ...], points: NDArray, gaps: NDArray, scale: float, gain: float, volume: float, gate: float):
+    def __init__(
+        self,
+        tables: tuple[SegmentTable, ...],
+        points: NDArray,
+        gaps: NDArray,
+        scale: float,
+        gain: float,
+        volume: float,
+        gate: float,
+    ):
         self.tables = tables
         self.by_index = {t.index: t for t in tables}
         self.points, self.gaps, self.scale, self.gain, self.gate = points, gaps, scale, gain, gate
@@ -93,6 +107,7 @@ class Search:
         self.bits = np.zeros((len(points) + 1, words), np.uint64)  # the last row: no point
         for i in range(len(points)):
             self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
+        self.quota, self.budget = QUOTA, BUDGET
         self.nodes: list[Node] = []
         self.below = {t.index: {t.index} for t in tables}
         for t in reversed(tables):
@@ -104,12 +119,13 @@ class Search:
     @property
     def spent(self) -> bool:
         """Whether the search has had its nodes."""
-        return len(self.memo) > BUDGET
+        return len(self.memo) > min(self.quota, self.budget)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
-        hold, context, taken = Hold(), (), self.bits[-1]
+        hold, taken = Hold(), self.bits[-1]
+        context: tuple = ()
         blocked = frozenset(pair for pair in self.blocked if pair[0] in self.below[table.index])
         if parent is not None:
             points, taken = parent.index[choice], parent.all[choice]
@@ -136,7 +152,7 @@ class Search:
 
     def joint(self, parent: Node, choice: int, table: SegmentTable) -> Hold:
         """What a choice of the parent says of the joint: a place, or distances from one or two points, or nothing."""
-        t, at = parent.table, np.empty(3)
+        at = np.empty(3)
         x, y, sigma = self.fitted(parent, choice)
         if not len(x):
             return Hold()
@@ -150,11 +166,11 @@ class Search:
         return Hold(anchors=y[:2], reach=reach[:2], deviation=np.sqrt(sigma[:2] ** 2 + spread**2))
 
     def fitted(self, node: Node, choice: int) -> tuple[NDArray, NDArray, NDArray]:
-        """(n, 3) places in the segment, (n, 3) where they are, (n,) deviations of a choice's points and its pivot [m]."""
+        """(n, 3) places in the segment, (n, 3) where they are, (n,) deviations: a choice's points and its pivot [m]."""
         points, t = node.index[choice], node.table
         here = points >= 0
         x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
-        if node.hold.sigma > 0:
+        if node.hold.sigma > 0 and t.joint_here is not None:
             x, y = np.vstack([x, t.joint_here]), np.vstack([y, node.hold.pivot])
             sigma = np.append(sigma, node.hold.sigma)
         return x, y, sigma
@@ -162,7 +178,7 @@ class Search:
     def choices(
         self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """(C, k) points, (C,) costs, (C,) weighted squares of a segment's likely choices; the first is to choose none."""
+        """(C, k) points, (C,) costs, (C,) weighted squares of likely choices; the first is to choose none."""
         k = len(table.markers)
         index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
         free = hold.sigma <= 0 and not (given >= 0).any()
@@ -175,9 +191,10 @@ class Search:
             span = np.linalg.norm(table.x - joint, axis=1).max() + hold.reach.min()
             volume = min(volume, 4 / 3 * np.pi * span**3)
         count = enumerate_segment(
-            self.points, self.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint, hold.pivot, hold.sigma,
-            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, SLACK, 2 if free else 1,
-            index, cost, squares,
+            self.points, self.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
+            hold.pivot, hold.sigma,
+            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, SLACK,
+            2 if free else 1, index, cost, squares,
         )  # fmt: skip
         return index[:count], cost[:count], squares[:count]
 
@@ -191,15 +208,20 @@ class Search:
         index, cost, squares = index[keep], cost[keep], squares[keep]
         new = np.where(given == -2, index, -1)
         return Node(
-            table, context, index, cost, squares, np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
+            table, context, index, cost, squares,
+            np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
             hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0), np.empty(0),
         )  # fmt: skip
 
-    def alone(self, table: SegmentTable) -> tuple[float, int]:
-        """Least cost of a segment on its own, with nothing known of any other; how many markers that has."""
+    def alone(self, table: SegmentTable) -> tuple[float, int, float]:
+        """Of a segment on its own: the least cost, how many markers that has, by how much any other choice is dearer.
+
+        Others are those that give a point to another marker; leaving markers out is no other choice.
+        """
         index, cost, _ = self.choices(table, np.full(len(table.markers), -2, np.int64), Hold(), self.bits[-1])
         best = int(np.argmin(cost))
-        return float(cost[best]), int((index[best] >= 0).sum())
+        other = ((index != index[best]) & (index >= 0)).any(1) | (index < 0).all(1)
+        return float(cost[best]), int((index[best] >= 0).sum()), float(cost[other].min(initial=0.0) - cost[best])
 
     def complete(self, node: Node, allowed: float) -> None:
         """Follow each choice downwards while its cost, with the best known of what is still to come, stays near.
@@ -211,6 +233,8 @@ class Search:
         children = [self.by_index[child] for child in node.table.children]
         best = np.inf
         for c in range(len(node.cost)):
+            if node.table.parent < 0:
+                self.quota = len(self.memo) + QUOTA
             below: list[Node] = []
             bound = total = float(node.cost[c])
             bound += sum(self.promise[t.index] for t in children)
@@ -241,7 +265,9 @@ class Search:
             index, zero = np.full((1, len(table.markers)), -1, np.int64), np.zeros(1)
             bits = self.bits[index[:, 0]]
             below: list[list[Node] | None] = [[self.absent(self.by_index[child]) for child in table.children]]
-            self.memo[key] = Node(table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), zero.copy(), np.inf)
+            self.memo[key] = Node(
+                table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), zero.copy(), np.inf
+            )
         return self.memo[key]
 
     def weigh(self, node: Node, extra: NDArray | None = None) -> None:
@@ -314,7 +340,7 @@ class Search:
             if not p.any():
                 continue
             fresh = node.table.shared < 0
-            for c in np.flatnonzero(p > 1e-6):
+            for c in np.flatnonzero(p > 1e-6).tolist():
                 table[node.table.markers[fresh], node.index[c, fresh]] += p[c]
                 for child in node.below[c] or ():
                     fits = ~(child.new & node.all[c]).any(1)

@@ -58,27 +58,29 @@ def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
     """The model's segments, parents first, hung from any of them as the root."""
     links: dict[int, list[tuple[int, NDArray, NDArray, float, bool]]] = {s: [] for s in range(len(model.segments))}
     for j in model.joints:
-        links[j.parent].append((j.child, np.asarray(j.in_child, float), np.asarray(j.in_parent, float), j.spread, j.exercised > 0))
-        links[j.child].append((j.parent, np.asarray(j.in_parent, float), np.asarray(j.in_child, float), j.spread, j.exercised > 0))
+        above, below, learnt = np.asarray(j.in_parent, float), np.asarray(j.in_child, float), j.exercised > 0
+        links[j.parent].append((j.child, below, above, j.spread, learnt))
+        links[j.child].append((j.parent, above, below, j.spread, learnt))
     found: list[SegmentTable] = []
     trained = any(j.exercised > 0 for j in model.joints)  # else deviations are guesses, for any motion
     todo: list[tuple[int, int, NDArray | None, NDArray | None, float, bool]] = [(root, -1, None, None, 0.0, False)]
     while todo:
         s, parent, here, there, spread, learnt = todo.pop(0)
-        below = [link for link in links[s] if link[0] != parent]
-        todo += [(child, s, *joint) for child, *joint in below]
+        children = [link for link in links[s] if link[0] != parent]
+        todo += [(link[0], s, link[1], link[2], link[3], link[4]) for link in children]
         markers = np.array(model.segments[s], np.int64)
         x = np.ascontiguousarray(np.asarray(model.reference, float)[markers])
-        above = list(model.segments[parent]) if parent >= 0 else []
-        shared = np.array([above.index(m) if m in above else -1 for m in markers], np.int64)
-        pairs = np.ix_(above, markers)
+        theirs = list(model.segments[parent]) if parent >= 0 else []
+        shared = np.array([theirs.index(m) if m in theirs else -1 for m in markers], np.int64)
+        pairs = np.ix_(np.array(theirs, np.int64), markers)
         low, high = model.low[pairs], model.high[pairs]
         width = (BEYOND + BEYOND_SHARE * (high - low)) * (learnt and np.isfinite(high - low))
+        own = deviations(model.deviation[np.ix_(markers, markers)])
         D = np.linalg.norm(x[:, None] - x, axis=-1)
         found.append(
             SegmentTable(
-                s, parent, tuple(link[0] for link in below), markers, x, D,
-                np.hypot(deviations(model.deviation[np.ix_(markers, markers)]), unseen(D) * trained), shared, here, there, spread,
+                s, parent, tuple(link[0] for link in children), markers, x, D,
+                np.hypot(own, unseen(D) * trained), shared, here, there, spread,
                 np.nan_to_num(low), np.nan_to_num(high), np.nan_to_num(width),
             )
         )  # fmt: skip
@@ -86,7 +88,7 @@ def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
 
 
 def unseen(D: NDArray) -> NDArray:
-    """(k,) [m] what motions other than those of training add to each coordinate's deviation: a share of the usual give."""
+    """(k,) [m] what motions other than those of training add to each coordinate's deviation."""
     mean = D.sum(1) / max(len(D) - 1, 1)
     return OTHER_MOTIONS * (0.004 + 0.03 * mean) / np.sqrt(2.0)
 

@@ -10,11 +10,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._kernels_identify import place_joint
-from kinefit.identification._search import Node, Search
+from kinefit.identification._kernels_evidence import place_joint
+from kinefit.identification._search import BUDGET, Node, Search
 from kinefit.identification._tables import SegmentTable, segment_tables
 from kinefit.identification.model import MarkerModel
 
+ATTEMPTS = 8
+"""Searches of a frame that is not explained well; each takes about 0.1 s."""
+
+AGAIN, MOST_AGAIN = 100, 400
+"""Nodes for a search anew without a point, and for all such."""
+
+MOST_NODES = 4500
+"""Nodes of all attempts at a frame, a second or so; one that needs more is left as it is."""
+
+SURE = 15.0
+"""A lead that needs to be no longer."""
 
 CLASHES = 24
 """Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
@@ -76,7 +87,11 @@ class Identification:
 
 
 def identify(
-    model: MarkerModel, points: ArrayLike, *, previous: ArrayLike | None = None, settings: IdentifySettings | None = None
+    model: MarkerModel,
+    points: ArrayLike,
+    *,
+    previous: ArrayLike | None = None,
+    settings: IdentifySettings | None = None,
 ) -> Identification:
     """Which point of a frame is which of the model's labels; needs no pose, nor how many are missing or too many.
 
@@ -95,7 +110,8 @@ def identify(
     at = np.ascontiguousarray(points, float)
     if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
         raise ObservationError(
-            f"points of shape {at.shape}, or not finite", remedy="Give the (N, 3) [m] points that were seen, without gaps."
+            f"points of shape {at.shape}, or not finite",
+            remedy="Give the (N, 3) [m] points that were seen, without gaps.",
         )
     count = len(model)
     if len(at) < 3:
@@ -106,49 +122,54 @@ def identify(
     clutter = max(len(at) - count * (1 - miss), 0.5) / box
     gain = float(np.log((1 - miss) / (miss * clutter)))
     best: Solution | None = None
-    root, start = _start(model, at, gaps, gain, box, settings)
-    tables = segment_tables(model, root)
-    for scale in _around(start, settings):
-        found = _solve(tables, at, gaps, scale, gain, box, settings.gate)
+    spent = 0
+    for root, scale in _attempts(model, at, gaps, gain, box, settings):
+        found = _solve(segment_tables(model, root), at, gaps, scale, gain, box, settings.gate)
+        spent += len(found.search.memo)
         if best is None or (found.clashes, found.cost) < (best.clashes, best.cost):
             best = found
         enough = 0.9 * len(at) if len(at) <= count else ENOUGH * count
-        if not found.clashes and found.matched >= enough and found.noise < 1.25 * scale:
+        if (not found.clashes and found.matched >= enough and found.noise < 1.25 * scale) or spent > MOST_NODES:
             break
     assert best is not None
-    if best.matched > 3 and not best.clashes and best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2:
-        found = _solve(tables, at, gaps, 1.05 * best.noise, gain, box, settings.gate)
+    off = best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2
+    if best.matched > 3 and not best.clashes and off:
+        found = _solve(best.search.tables, at, gaps, 1.05 * best.noise, gain, box, settings.gate)
         best = found if found.matched >= 0.8 * best.matched else best
     return _decide(best, count, settings.certain)
 
 
-def _around(start: float, settings: IdentifySettings) -> list[float]:
-    """Noise levels, the nearest to the start first, coarser before finer."""
-    steps = [start * 1.6**k for k in range(-12, 13)]
-    inside = [s for s in steps if max(settings.finest, 0.2) <= s <= settings.coarsest or s == start]
-    return sorted(inside, key=lambda s: (round(abs(np.log(s / start)), 6), -s))
-
-
-def _start(
+def _attempts(
     model: MarkerModel, at: NDArray, gaps: NDArray, gain: float, box: float, settings: IdentifySettings
-) -> tuple[int, float]:
-    """The segment to begin with and the noise level: what explains the largest segments best, each on its own."""
+) -> list[tuple[int, float]]:
+    """Segments to begin with and noise levels, the likeliest first.
+
+    The level is that at which the largest segments, each on its own, are explained best; the segment is that of which
+    the next choice is furthest behind the best. After that other levels and other segments, the nearest first.
+    """
     sizes = sorted((len(m) for m in model.segments), reverse=True)
     large = [s for s, m in enumerate(model.segments) if len(m) >= max(3, sizes[min(2, len(sizes) - 1)])][:6]
     large = large or [int(np.argmax([len(m) for m in model.segments]))]
     tables = segment_tables(model, large[0])
-    best, share, scale, chosen = np.inf, 0.0, settings.finest, (large[0], settings.finest)
+    best, share, scale, chosen = np.inf, 0.0, settings.finest, 0
+    levels: list[tuple[float, list[int]]] = []
     while scale <= settings.coarsest:
         search = Search(tables, at, gaps, scale, gain, box, settings.gate)
         found = [search.alone(search.by_index[s]) for s in large]
-        cost = sum(c for c, _ in found)
+        cost = sum(f[0] for f in found)
+        order = sorted(range(len(large)), key=lambda k: (-min(found[k][2], SURE), found[k][0]))
+        levels.append((scale, [large[k] for k in order]))
         if cost < best:
-            best, chosen = cost, (large[int(np.argmin([c for c, _ in found]))], scale)
-            share = sum(n for _, n in found) / sum(len(model.segments[s]) for s in large)
+            best, chosen = cost, len(levels) - 1
+            share = sum(f[1] for f in found) / sum(len(model.segments[s]) for s in large)
         elif share > ENOUGH + 0.05:
             break
         scale = max(1.6 * scale, 0.25)
-    return chosen
+    ranked = [
+        (abs(n - chosen) + rank, -n, root, scale)
+        for n, (scale, roots) in enumerate(levels) if n or not chosen for rank, root in enumerate(roots[:2])
+    ]  # fmt: skip
+    return [(root, scale) for *_, root, scale in sorted(ranked)[:ATTEMPTS]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,15 +208,17 @@ def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], fl
 
     def push(blocked: frozenset[tuple[int, int]]) -> None:
         search.blocked = blocked
+        search.budget = len(search.memo) + (AGAIN if blocked else BUDGET)
         root = search.node(search.tables[0], None, -1)
         chosen = search.decode(root)
         heapq.heappush(queue, (float(root.best[chosen[0][1]]), next(order), blocked, root, chosen))
 
     push(frozenset())
+    start = len(search.memo)
     for _ in range(CLASHES):
         cost, _, blocked, root, chosen = heapq.heappop(queue)
         clash = _clash(chosen)
-        if clash is None or search.spent:
+        if clash is None or len(search.memo) > start + MOST_AGAIN:
             break
         point, segments = clash
         for s in segments:
@@ -206,7 +229,8 @@ def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], fl
 def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
     taken: dict[int, tuple[int, int]] = {}
     for node, c in chosen:
-        for marker, point, shared in zip(node.table.markers.tolist(), node.index[c].tolist(), node.table.shared.tolist()):
+        t = node.table
+        for marker, point, shared in zip(t.markers.tolist(), node.index[c].tolist(), t.shared.tolist()):
             if point < 0 or shared >= 0:
                 continue
             if point in taken and taken[point][0] != marker:
@@ -227,12 +251,23 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
     else:
         confidence = _shares(found, guess)
     users = np.bincount(guess[guess >= 0], minlength=len(search.points))
-    confidence[(guess >= 0) & (users[guess] > 1)] = 0.0  # the search ended before it was decided
+    twice = (guess >= 0) & (users[guess] > 1)  # the search ended before it was decided
+    if twice.sum() > 4:
+        confidence[:] = 0.0
+    for node, _ in found.chosen:
+        if twice[node.table.markers].any():
+            for s in search.below[node.table.index]:
+                confidence[search.by_index[s].markers] = 0.0
     _complete(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)
     return Identification(
-        assignment, np.where(guess >= 0, confidence, 0.0), found.cost, bool(((guess >= 0) & ~known).any()), found.noise, guess
+        assignment,
+        np.where(guess >= 0, confidence, 0.0),
+        found.cost,
+        bool(((guess >= 0) & ~known).any()),
+        found.noise,
+        guess,
     )
 
 
@@ -272,7 +307,8 @@ def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
             at = np.empty(3)
             variance = place_joint(len(x), x, y, sigma, t.x[i], at)
             wide = OUTLYING**2 * search.sigma[t.index][i] ** 2 + variance
-            odds = search.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide) - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
+            odds = search.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
+            odds = odds - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
             best = int(np.argmax(odds))
             share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))
             sure = share * float(confidence[t.markers[here]].min(initial=1.0))

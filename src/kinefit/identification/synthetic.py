@@ -19,7 +19,8 @@ from kinefit.identification.model import MarkerModel
 PLACES = {  # [m] right side and middle; x forward, y up, z right, from the middle of the hips
     "neck": (0.00, 0.54, 0.00), "chest": (0.11, 0.40, 0.03), "back": (-0.10, 0.33, -0.04), "waist": (0.00, 0.12, 0.00),
     "r_shoulder": (0.00, 0.48, 0.19), "r_temple": (0.06, 0.70, 0.08), "crown": (0.00, 0.79, 0.01),
-    "occiput": (-0.09, 0.69, 0.02), "r_hip": (0.00, 0.00, 0.10), "r_asis": (0.10, 0.07, 0.12), "sacrum": (-0.11, 0.05, -0.01),
+    "occiput": (-0.09, 0.69, 0.02), "r_hip": (0.00, 0.00, 0.10), "r_asis": (0.10, 0.07, 0.12),
+    "sacrum": (-0.11, 0.05, -0.01),
     "r_biceps": (0.06, 0.36, 0.21), "r_triceps": (-0.05, 0.30, 0.23), "r_elbow": (0.00, 0.19, 0.22),
     "r_radius": (0.05, 0.09, 0.25), "r_ulna": (-0.03, 0.03, 0.19), "r_wrist": (0.00, -0.07, 0.23),
     "r_thigh": (0.10, -0.18, 0.14), "r_hamstring": (-0.08, -0.28, 0.10), "r_knee": (0.00, -0.43, 0.11),
@@ -64,12 +65,13 @@ def synthetic_body(points: int = 44, *, placing: float = PLACING, seed: int = 0)
     placing : [m] standard deviation by which markers between joints miss their mirror image
     """
     tree = [row for row in TREE if points > 44 or not row[0].startswith("hand")]
-    full = []
+    full: list[tuple[str, str, str, list[str]]] = []  # name, parent, joint (empty for the root), markers
     for name, parent, joint, markers in tree:
         for side in ("r", "l") if name.endswith("_r") else ("r",):
-            full.append(tuple(_sided(x, side) for x in (name, parent, joint)) + (tuple(_sided(m, side) for m in markers),))
+            own = [_sided(m, side) for m in markers]
+            full.append((_sided(name, side), _sided(parent or "", side), _sided(joint or "", side), own))
     if points > 44:
-        full[2] = full[2][:3] + (full[2][3] + ("l_asis",),)
+        full[2][3].append("l_asis")
     labels = tuple(dict.fromkeys(m for *_, markers in full for m in markers))
     joints = {joint for _, _, joint, _ in full}
     rng = np.random.default_rng(seed)
@@ -77,14 +79,16 @@ def synthetic_body(points: int = 44, *, placing: float = PLACING, seed: int = 0)
     at += placing * rng.standard_normal(at.shape) * np.array([m not in joints for m in labels])[:, None]
     names = [name for name, *_ in full]
     segments = tuple(
-        SetSegment(name, -1 if parent is None else names.index(parent), markers, None if joint is None else at[labels.index(joint)])
+        SetSegment(name, names.index(parent), tuple(markers), at[labels.index(joint)])
+        if parent
+        else SetSegment(name, -1, tuple(markers))
         for name, parent, joint, markers in full
     )
     return model_from_frame(at, labels, MarkerSet(f"synthetic_{len(labels)}", labels, at, segments))
 
 
-def _sided(name: str | None, side: str) -> str | None:
-    if name is None or side == "r":
+def _sided(name: str, side: str) -> str:
+    if side == "r":
         return name
     return "l" + name[1:] if name.startswith("r_") else name[:-1] + "l" if name.endswith("_r") else name
 
