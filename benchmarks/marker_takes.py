@@ -17,6 +17,22 @@ from kinefit.readers.markers import read_markers
 STANFORD = "nimblephysics/data__grf__Subject4__MarkerData__%s1.trc"
 
 
+MISNAMED = {
+    "nimblephysics/data__c3d__nick_freeform_001.c3d": (
+        ("Nick01:RTOE", "Nick01:RIWR", 975, 1100, "nearer than 5 mm to where 47 mm from ROWR is; 1.4 m from the ankle"),
+        ("Nick01:LIWR", "Nick01:LOHAND", 0, 197, "both fit each other's places, as in the frames after"),
+        ("Nick01:LOHAND", "Nick01:LIWR", 0, 197, "the same"),
+    ),
+    STANFORD % "DJ": (("r_5meta", "r_toe", 222, 222, "goes on 78 mm away, within 15 mm of r_toe, for one frame"),),
+    STANFORD % "walking": (
+        ("r_thigh5", "r_thigh3", 7, 7, "84 mm from r_thigh5 before, 16 mm from r_thigh3"),
+        ("r_thigh3", "r_thigh5", 10, 10, "goes on 68 mm away, within 11 mm of r_thigh5"),
+    ),
+}
+"""Labels of the files that are wrong: what is called the first is the second, in frames counted from 0; and how that
+shows without any model. Each is put right before it teaches or is asked."""
+
+
 @dataclass(frozen=True)
 class Case:
     """What teaches, and what is asked.
@@ -79,7 +95,6 @@ CASES = (
         "still to walk", (_whole("opensim/Pipelines__Rajagopal__ExpData__static_walk_1.trc"),),
         _whole("opensim/Pipelines__Rajagopal__ExpData__motion_capture_walk.trc"), exercised=False,
     ),
-    _halves("golf", "btkdata/Input__C3DSamples__c3d.org__sample13__golfswing.c3d", full=False),
     _halves("clusters of a walk", "btkdata/Input__C3DSamples__c3d.org__sample01__Eb015pr.c3d", full=False),
     Case(
         "plug-in-gait, still to walk", (_whole("../markers_pycgm/Test_Files/Static_trial.c3d"),),
@@ -89,20 +104,42 @@ CASES = (
 
 
 def load(part: tuple[str, float, float]) -> Markers | None:
-    """Labelled markers of a share of a file, without computed points and those without a label; None where absent."""
+    """Labelled markers of a share of a file; None where absent.
+
+    Without computed points, those without a label, and copies of others.
+    """
     folder = data("markers")
     path = None if folder is None else (folder / Path(part[0]))
     if path is None or not path.exists():
         return None
     markers = read_markers(path)
+    markers = replace(markers, positions=_put_right(markers, part[0]))
     known = find_marker_set(markers.names)
-    keep = [
-        i for i, n in enumerate(markers.names) if not n.startswith("*") and not (known is not None and known.is_computed(n))
-    ]
+    keep: list[int] = []
+    for i, n in enumerate(markers.names):
+        if n.startswith("*") or (known is not None and known.is_computed(n)):
+            continue
+        apart = np.linalg.norm(markers.positions[:, keep] - markers.positions[:, i, None], axis=-1)
+        if not keep or not (np.nanmedian(apart, axis=0) < 0.002).any():  # one marker under two names
+            keep.append(i)
     rows = slice(round(part[1] * len(markers)), round(part[2] * len(markers)))
     return replace(
         markers, names=tuple(markers.names[i] for i in keep), positions=markers.positions[rows][:, keep], residual=None
     )
+
+
+def _put_right(markers: Markers, file: str) -> NDArray:
+    positions = np.array(markers.positions)
+    for called, label, first, last, _ in MISNAMED.get(file, ()):
+        a, b, rows = markers.names.index(called), markers.names.index(label), slice(first, last + 1)
+        exchange = any((label, called) == other[:2] for other in MISNAMED[file])
+        if exchange:
+            positions[rows, b] = markers.positions[rows, a]
+        else:
+            seen = np.isfinite(markers.positions[rows, a, :1]) & ~np.isfinite(markers.positions[rows, b, :1])
+            positions[rows, b] = np.where(seen, markers.positions[rows, a], positions[rows, b])
+            positions[rows, a] = np.where(seen, np.nan, positions[rows, a])
+    return positions
 
 
 def training(case: Case) -> Markers | None:
@@ -202,7 +239,8 @@ def broken(
         f, m = int(rng.integers(frames)), int(rng.integers(count))
         rows = np.arange(f, min(f + 1 + round(take.rate * rng.exponential(0.2)), frames))
         way = rng.standard_normal(3)
-        at = P[rows, m] + way / np.linalg.norm(way) * rng.uniform(0.03, 0.3) + 0.002 * rng.standard_normal((len(rows), 3))
+        at = P[rows, m] + way / np.linalg.norm(way) * rng.uniform(0.03, 0.3)
+        at += 0.002 * rng.standard_normal((len(rows), 3))
         if np.isfinite(at).all():
             pieces.append((rows, at, np.full(len(rows), -1)))
     positions = np.full((frames, len(pieces), 3), np.nan)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,9 @@ FLOOR = 0.004
 
 FIRM = 0.03
 """[m] deviation beyond which a distance says nothing of who is who."""
+
+LEVER = 0.03
+"""[m] size across of markers that tell a rotation."""
 
 
 class Consistency:
@@ -31,6 +36,8 @@ class Consistency:
         sigma = np.hypot(model.deviation, FLOOR)
         rank = np.where(within, sigma, sigma + FLOOR)  # of a segment first, if as firm
         np.fill_diagonal(rank, np.inf)
+        self.spread = np.hypot(FLOOR, 0.5 * sigma)
+        self.homes = [tuple(s for s in model.segments if m in s) for m in range(labels)]
         self.who = np.argsort(rank, axis=1)[:, : min(count, labels - 1)]
         self.mean = np.take_along_axis(np.asarray(model.mean), self.who, 1)
         self.sigma = np.take_along_axis(sigma, self.who, 1)
@@ -46,6 +53,45 @@ class Consistency:
         """(F, M) the same for points (F, 3) as any label."""
         d = np.linalg.norm(positions - points[:, None], axis=-1)
         return _lower_middle(np.abs(d[:, self.who] - self.mean) / self.sigma)
+
+    def lately(self, points: NDArray, frames: NDArray, positions: NDArray, label: int, reach: int) -> float:
+        """Deviations by which points (n, 3) of frames (n,) are off as a label, by where it was just before and after.
+
+        Each end is compared with the nearest frame within `reach` that shows the label, carried along by those around
+        it; where fewer than three are seen at both times, by distances. NaN where there is none.
+        """
+        seen = np.isfinite(positions[:, label, 0])
+        before = np.flatnonzero(seen[max(frames[0] - reach, 0) : frames[0]])
+        after = np.flatnonzero(seen[frames[-1] + 1 : frames[-1] + 1 + reach])
+        pairs = []
+        if len(before):
+            pairs.append((int(before[-1]) + max(int(frames[0]) - reach, 0), 0))
+        if len(after):
+            pairs.append((int(after[0]) + int(frames[-1]) + 1, -1))
+        who, sigma = self.who[label], np.hypot(FLOOR, 0.5 * self.sigma[label])
+        off = []
+        for then, end in pairs:
+            rigid = [self._carried(positions, then, int(frames[end]), points[end], label, home) for home in self.homes[label]]
+            told = min((o for o in rigid if o is not None), default=None)
+            if told is None:
+                usual = np.linalg.norm(positions[then, who] - positions[then, label], axis=-1)
+                now = np.linalg.norm(positions[frames[end], who] - points[end], axis=-1)
+                told = float(_lower_middle(np.abs(now - usual) / sigma))
+            off.append(told)
+        off = [o for o in off if np.isfinite(o)]
+        return float(np.mean(off)) if off else np.nan
+
+    def _carried(
+        self, positions: NDArray, then: int, now: int, point: NDArray, label: int, home: tuple[int, ...]
+    ) -> float | None:
+        """Deviations by which a point is off where a segment carried the label; None where it has too few markers."""
+        peers = [k for k in home if k != label and np.isfinite(positions[[then, now], k]).all()]
+        x, y = positions[then, peers], positions[now, peers]
+        if len(peers) < 3 or np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < LEVER:
+            return None
+        R, t = rigid_frames(x, y[None])
+        away = np.linalg.norm(R[0] @ positions[then, label] + t[0] - point)
+        return float(away / np.median(self.spread[label, peers]) / np.sqrt(3.0))
 
     def own(self, positions: NDArray) -> NDArray:
         """(F, M) misfit of every label where it is."""
@@ -100,7 +146,7 @@ def gaps_of(seen: NDArray) -> list[tuple[int, int]]:
     """First and last of each gap (F,) that has both ends."""
     edges = np.flatnonzero(np.diff(seen.astype(int)))
     out = []
-    for a, b in zip(edges, edges[1:]):
+    for a, b in pairwise(edges):
         if seen[a] and not seen[a + 1]:
             out.append((int(a) + 1, int(b)))
     return out

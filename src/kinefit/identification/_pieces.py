@@ -58,7 +58,7 @@ class Pieces:
 
 
 def find_pieces(positions: NDArray, rate: float) -> Pieces:
-    """Pieces of a take's columns (F, N, 3) [m]: ended by gaps and jumps, joined where a trajectory goes on elsewhere."""
+    """Pieces of a take's columns (F, N, 3) [m]: ended by gaps and jumps, joined where one goes on in another column."""
     frame, column = np.nonzero(np.isfinite(positions).all(-1))
     points = np.ascontiguousarray(positions[frame, column])
     starts = np.searchsorted(frame, np.arange(len(positions) + 1))

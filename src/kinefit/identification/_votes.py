@@ -56,10 +56,22 @@ class Votes:
         self.asked.add(frame)
 
     def table(self, pieces: Pieces) -> NDArray:
-        """(P, M + 1) sums over each piece."""
+        """(P, M + 1) sums over each piece; no vote counts for more than votes of this take are right."""
+        wrong = self.wrong(pieces)
+        most = float(np.clip(np.log((1 - wrong) / wrong), 0.2, MOST))
         out = np.zeros((pieces.count, self.labels + 1))
-        np.add.at(out, (pieces.piece[self.point], self.label), self.weight)
+        np.add.at(out, (pieces.piece[self.point], np.asarray(self.label)), np.minimum(self.weight, most))
         return out
+
+    def wrong(self, pieces: Pieces) -> float:
+        """Share of votes that contradict most others of their piece, of pieces with three and more."""
+        piece, label = pieces.piece[self.point], np.asarray(self.label)
+        names = label < self.labels
+        many = names & (np.bincount(piece[names], minlength=pieces.count)[piece] >= 3)
+        out = np.zeros((pieces.count, self.labels))
+        np.add.at(out, (piece[many], label[many]), np.asarray(self.weight)[many])
+        against = label[many] != np.argmax(out[piece[many]], axis=1)
+        return float((against.sum() + 0.5) / (many.sum() + 1)) if many.sum() > 20 else 0.01
 
     def changes(self, pieces: Pieces) -> list[tuple[int, int, int]]:
         """(piece, last point before, first point after) of each change of name within a piece, as votes tell it."""
@@ -81,13 +93,15 @@ class Votes:
         return out
 
 
-def assign_pieces(table: NDArray, pieces: Pieces, rows: list[NDArray], share: float = 0.6) -> NDArray:
+def assign_pieces(
+    table: NDArray, pieces: Pieces, rows: list[NDArray], share: float = 0.6, least: float = 1.0
+) -> NDArray:
     """(P,) label of each piece, -1 for none: the surest first, no label in two places at once.
 
     Parameters
     ----------
     table : (P, M + 1) votes
-    share : of a piece's votes that a label must have
+    share : of a piece's votes that a label must have; least : weight of them
     """
     labels = table.shape[1] - 1
     total = np.maximum(table.sum(1), 1e-9)
@@ -96,7 +110,7 @@ def assign_pieces(table: NDArray, pieces: Pieces, rows: list[NDArray], share: fl
     best = np.argmax(table[:, :labels], axis=1)
     weight = table[np.arange(pieces.count), best]
     for p in np.argsort(-weight, kind="stable"):
-        if weight[p] <= 0 or weight[p] < share * total[p]:
+        if weight[p] < max(least, share * total[p]):
             continue
         frames = pieces.frame[rows[p]]
         if not taken[frames, best[p]].any():

@@ -9,21 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._consistency import Consistency, fill_gaps
-from kinefit.identification._pieces import Pieces, find_pieces
-from kinefit.identification._votes import Votes, assign_pieces
+from kinefit.identification._consistency import fill_gaps
+from kinefit.identification._naming import FINE, STRAY, Naming, Step
+from kinefit.identification._pieces import find_pieces
 from kinefit.identification.identify import Identification, identify
 from kinefit.identification.model import MarkerModel
 from kinefit.observations import Markers
 
-Step = Callable[[str, int, int], None]
-
-STRAY, FINE = 5.0, 2.5
-"""Deviations by which half of a label's distances are off: where it is in doubt, and up to where it fits."""
-
-APART = 2.0
-"""Deviations by which another label must fit worse, where only distances speak."""
-
+FIRST, FITS = 12, 0.4
+"""Frames that are asked first, and the share of labels that must be found in half of them: a model of another subject
+and marker set finds a third at most, and takes long; the right one finds nine in ten."""
 
 @dataclass(frozen=True)
 class TakeSettings:
@@ -119,7 +114,7 @@ def identify_take(
     Raises
     ------
     ObservationError
-        No frame shows three points, or no name was found at all.
+        No frame shows three points, or the model is of another subject.
     """
     settings = settings or TakeSettings()
     step = progress or (lambda what, done, total: None)
@@ -127,8 +122,18 @@ def identify_take(
     counts = np.diff(pieces.starts)
     if counts.max(initial=0) < 3:
         raise ObservationError("no frame shows three markers", file=markers.source or None, remedy="Check the take.")
-    work = _Work(model, pieces, identify_frame, step)
-    work.ask(_anchors(counts, max(1, round(settings.every * markers.rate))))
+    work = Naming(model, pieces, markers.rate, step, identify_frame)
+    anchors = _anchors(counts, max(1, round(settings.every * markers.rate)))
+    first = anchors[:: max(1, len(anchors) // FIRST)]
+    work.ask(first)
+    share = float(np.median(work.named))
+    if share < FITS:
+        raise ObservationError(
+            f"the take does not fit the model of {model.name}: it finds {100 * share:.0f} % of the labels",
+            file=markers.source or None,
+            remedy="Is it the same subject, with the same markers, and the right unit?",
+        )
+    work.ask(sorted(set(anchors) - set(first)))
     budget = max(20, int(settings.most * len(markers)))
     for _ in range(settings.rounds):
         work.cut_changes()
@@ -139,189 +144,37 @@ def identify_take(
         work.ask(more)
     work.cut_changes()
     work.settle()
-    if (work.label < 0).all():
-        raise ObservationError(
-            f"none of {len(work.votes.asked)} frames fits the model of {model.name}", file=markers.source or None,
-            remedy="Is it the same subject, with the same markers, and the right unit?",
-        )
-    return work.result(markers.rate, settings)
+    return _result(work, markers.rate, settings)
 
 
 def _anchors(counts: NDArray, every: int) -> list[int]:
     """The frame that shows most points in each stretch."""
-    return [a + int(np.argmax(counts[a : a + every])) for a in range(0, len(counts), every) if counts[a : a + every].max() > 2]
+    best = [a + int(np.argmax(counts[a : a + every])) for a in range(0, len(counts), every)]
+    return [f for f in best if counts[f] > 2]
 
 
-class _Work:
-    """A take while its names are found."""
-
-    def __init__(
-        self, model: MarkerModel, pieces: Pieces, identify_frame: Callable[[MarkerModel, NDArray], Identification], step: Step
-    ):
-        self.model, self.pieces, self.step, self.identify_frame = model, pieces, step, identify_frame
-        self.votes = Votes(len(model))
-        self.agree = Consistency(model)
-        self.rows = pieces.rows()
-        self.label = np.full(pieces.count, -1)
-        self.sure = np.zeros(pieces.count)
-
-    def ask(self, frames: list[int]) -> None:
-        """Identify frames, one by one."""
-        done, total = len(self.votes.asked), len(self.votes.asked) + len(frames)
-        for f in frames:
-            points = self.pieces.points[self.pieces.starts[f] : self.pieces.starts[f + 1]]
-            self.votes.add(self.pieces, f, self.identify_frame(self.model, points))
-            done += 1
-            self.step("identifying", done, total)
-
-    def cut_changes(self) -> None:
-        """Cut pieces whose name changes, asking frames between until it is known when, and where it jumps there."""
-        for _ in range(20):
-            changes = self.votes.changes(self.pieces)
-            if not changes:
-                return
-            frame = self.pieces.frame
-            between = {(frame[a] + frame[b]) // 2 for _, a, b in changes if frame[b] - frame[a] > 4}
-            between -= self.votes.asked
-            if between:
-                self.ask(sorted(int(f) for f in between))
-                changes = self.votes.changes(self.pieces)
-            piece = self.pieces.piece.copy()
-            fresh = self.pieces.count
-            for p, a, b in changes:
-                if frame[b] - frame[a] > 4 and (frame[a] + frame[b]) // 2 not in self.votes.asked:
-                    continue
-                own = self.rows[p]
-                i, j = np.searchsorted(own, [a, b])
-                x = self.pieces.points[own[max(i - 1, 0) : j + 2]]
-                jump = np.linalg.norm(x[2:] - 2 * x[1:-1] + x[:-2], axis=1)
-                where = min(max(max(i - 1, 0) + 1 + int(np.argmax(jump)), i + 1), j) if len(jump) else j
-                if frame[b] - frame[a] > 4 and {(frame[a] + frame[b]) // 2} - self.votes.asked:
-                    continue
-                piece[own[where:]] = fresh
-                fresh += 1
-            if fresh == self.pieces.count:
-                continue
-            self.pieces = self.pieces.cut(piece)
-            self.rows = self.pieces.rows()
-
-    def settle(self) -> None:
-        """Names by votes; then what distances say for and against them."""
-        table = self.votes.table(self.pieces)
-        self.label = assign_pieces(table, self.pieces, self.rows)
-        named = self.label >= 0
-        best = np.where(named, table[np.arange(len(table)), self.label], 0.0)
-        rest = table.sum(1) - best
-        self.sure = np.where(named, 1 / (1 + np.exp(-np.clip(best - rest, -30, 30))), 0.0)
-        for _ in range(6):
-            changed = self.drop_strays(best) + self.name_rest(table)
-            if not changed:
-                break
-
-    def positions(self) -> tuple[NDArray, NDArray]:
-        """(F, M, 3) [m] of the labels, and the point (F, M) each is, -1 where none."""
-        labels = self.label[self.pieces.piece]
-        known = np.flatnonzero(labels >= 0)
-        point = np.full((self.pieces.frames, len(self.model)), -1)
-        point[self.pieces.frame[known], labels[known]] = known
-        at = np.where((point >= 0)[..., None], self.pieces.points[point], np.nan)
-        return at, point
-
-    def sample(self, p: int, most: int = 40) -> NDArray:
-        """Points of a piece, spread over it."""
-        own = self.rows[p]
-        return own[np.unique(np.linspace(0, len(own) - 1, min(most, len(own))).astype(int))]
-
-    def drop_strays(self, best: NDArray) -> int:
-        """Take away names that the distances speak against: of those that blame each other, the least voted for."""
-        at, _ = self.positions()
-        named = np.flatnonzero(self.label >= 0)
-        off = np.full(self.pieces.count, 0.0)
-        for p in named:
-            own = self.sample(p)
-            z = self.agree.misfit(self.pieces.points[own], at[self.pieces.frame[own]], self.label[p])
-            off[p] = np.nanmedian(z) if np.isfinite(z).any() else 0.0
-        bad = [p for p in named if off[p] > STRAY]
-        dropped: list[int] = []
-        for p in sorted(bad, key=lambda p: best[p] / off[p]):
-            near = set(self.agree.who[self.label[p]].tolist())
-            frames = self.pieces.frame[self.rows[p]]
-            blamed = any(
-                self.label[q] in near and self.pieces.frame[self.rows[q][0]] <= frames[-1]
-                and self.pieces.frame[self.rows[q][-1]] >= frames[0] for q in dropped
-            )
-            if not blamed:
-                dropped.append(p)
-        for p in dropped:
-            self.label[p], self.sure[p] = -1, 0.0
-        return len(dropped)
-
-    def name_rest(self, table: NDArray) -> int:
-        """Name pieces by distances alone, where one label fits that is free, and no other does; longest first."""
-        at, point = self.positions()
-        taken = point >= 0
-        count = 0
-        for p in sorted(np.flatnonzero(self.label < 0), key=lambda p: -len(self.rows[p])):
-            own = self.rows[p]
-            free = np.flatnonzero(~taken[self.pieces.frame[own]].any(0))
-            if not len(free):
-                continue
-            own = self.sample(p)
-            z = self.agree.misfits(self.pieces.points[own], at[self.pieces.frame[own]])
-            z = np.where(np.isfinite(z).sum(0) * 2 >= len(own), np.nanmedian(z, axis=0), np.inf)
-            z[np.setdiff1d(np.arange(len(z)), free)] = np.inf
-            order = np.argsort(z)
-            m = int(order[0])
-            second = z[order[1]] if len(order) > 1 else np.inf
-            favoured = table[p, m] > 0.5 * table[p, : len(self.model)].sum() > 0
-            if z[m] < FINE and (second > z[m] + APART or (favoured and second > z[m])):
-                self.label[p] = m
-                self.sure[p] = 1 / (1 + np.exp(-np.clip(second - z[m], 0, 6)))
-                frames = self.pieces.frame[self.rows[p]]
-                at[frames, m] = self.pieces.points[self.rows[p]]
-                taken[frames, m] = True
-                count += 1
-        return count
-
-    def unknown_frames(self, most: int) -> list[int]:
-        """Frames in which most unnamed points are that no frame was asked for, while labels are missing there."""
-        asked = np.zeros(self.pieces.count, bool)
-        asked[self.pieces.piece[self.votes.point]] = True
-        _, point = self.positions()
-        lacking = (point < 0).any(1)
-        out: list[int] = []
-        waiting = (self.label < 0) & ~asked
-        while len(out) < most and waiting.any():
-            here = waiting[self.pieces.piece]
-            count = np.bincount(self.pieces.frame[here], minlength=self.pieces.frames) * lacking
-            count[list(self.votes.asked) + out] = 0
-            f = int(np.argmax(count))
-            if count[f] == 0:
-                break
-            out.append(f)
-            waiting[self.pieces.piece[self.pieces.starts[f] : self.pieces.starts[f + 1]]] = False
-        return sorted(out)
-
-    def result(self, rate: float, settings: TakeSettings) -> TakeIdentification:
-        """All of it, with gaps filled and doubts told."""
-        at, point = self.positions()
-        seen = point >= 0
-        off = self.agree.own(at)
-        known = self.sure[self.pieces.piece][point]
-        fits = np.exp(-0.5 * np.clip(np.nan_to_num(off) - FINE, 0.0, None) ** 2 / FINE**2)
-        confidence = np.where(seen, known * fits, 0.0)
-        doubts = list_doubts(self.model.labels, confidence, off, seen, settings.certain)
-        filled = np.zeros(seen.shape, bool)
-        if settings.fill > 0:
-            at, filled = fill_gaps(self.model, at, rate, settings.fill, settings.fill_alone)
-        column = np.where(seen, self.pieces.column[point], -1)
-        return TakeIdentification(
-            self.model.labels, at, confidence, filled, column, tuple(doubts), tuple(sorted(self.votes.asked)),
-            int(len(self.pieces.points) - seen.sum()),
-        )
+def _result(work: Naming, rate: float, settings: TakeSettings) -> TakeIdentification:
+    """All of it, with gaps filled and doubts told."""
+    at, point = work.positions()
+    seen = point >= 0
+    off = work.agree.own(at)
+    known = work.sure[work.pieces.piece][point]
+    fits = np.exp(-0.5 * np.clip(np.nan_to_num(off) - FINE, 0.0, None) ** 2 / FINE**2)
+    confidence = np.where(seen, known * fits, 0.0)
+    doubts = list_doubts(work.model.labels, confidence, off, seen, settings.certain)
+    filled = np.zeros(seen.shape, bool)
+    if settings.fill > 0:
+        at, filled = fill_gaps(work.model, at, rate, settings.fill, settings.fill_alone)
+    column = np.where(seen, work.pieces.column[point], -1)
+    return TakeIdentification(
+        work.model.labels, at, confidence, filled, column, tuple(doubts), tuple(sorted(work.votes.asked)),
+        int(len(work.pieces.points) - seen.sum()),
+    )
 
 
-def list_doubts(labels: tuple[str, ...], confidence: NDArray, off: NDArray, seen: NDArray, certain: float) -> list[Doubt]:
+def list_doubts(
+    labels: tuple[str, ...], confidence: NDArray, off: NDArray, seen: NDArray, certain: float
+) -> list[Doubt]:
     """Spans of frames in which a name is not sure, worst first."""
     out = []
     for m, label in enumerate(labels):
