@@ -19,7 +19,7 @@ from kinefit.tracking.placement import placement
 
 @pytest.fixture(scope="module")
 def labelled():
-    """Two seconds of a person with 41 markers, at 60 Hz."""
+    """Two seconds of a person with 42 markers, at 60 Hz."""
     motion = squat_and_wave(rate=60)
     points = placement(motion.body, "CMU_41").points
     return Markers(points.names, 60.0, motion.positions(points), up="z")
@@ -94,7 +94,7 @@ def test_columns_shuffled_in_every_frame(labelled, model):
 
 def test_another_subjects_model_is_told(labelled, model):
     def nothing(_, points):
-        return Identification(np.full(41, -1), np.zeros(41), 0.0, False, guess=np.full(41, -1))
+        return Identification(np.full(len(model), -1), np.zeros(len(model)), 0.0, False, guess=np.full(len(model), -1))
 
     with pytest.raises(ObservationError, match="does not fit the model of Anna"):
         identify_take(model, labelled, identify_frame=nothing)
@@ -102,7 +102,7 @@ def test_another_subjects_model_is_told(labelled, model):
 
 @pytest.mark.parametrize("seen", [0, 2])
 def test_a_take_with_nothing_in_it(labelled, model, seen):
-    positions = np.full((5, 41, 3), np.nan)
+    positions = np.full((5, len(labelled.names), 3), np.nan)
     positions[:, :seen] = 1.0
     with pytest.raises(ObservationError, match="no frame shows three"):
         identify_take(model, Markers(labelled.names, 60.0, positions))
@@ -124,10 +124,11 @@ def test_doubts_name_the_frames_in_which_a_marker_leaves_its_segment(labelled, m
 def test_two_people_in_one_take(labelled, model):
     away = Markers(labelled.names, 60.0, labelled.positions + (0.0, 2.0, 0.0))
     both = np.concatenate([labelled.positions, away.positions], axis=1)
-    names = tuple(f"*{i}" for i in range(82))
+    count = len(labelled.names)
+    names = tuple(f"*{i}" for i in range(2 * count))
     other = learn_model(away, name="Bob")
     first, second = identify_people([model, other], Markers(names, 60.0, both), settings=TakeSettings(every=0.6))
-    mine = np.where(first.column >= 0, first.column // 41, second.column // 41)
+    mine = np.where(first.column >= 0, first.column // count, second.column // count)
     assert (mine == mine[0, 0]).mean() > 0.95  # one body each, whichever: they are twins
     assert not (first.column[..., None] == second.column[:, None])[first.column >= 0].any()
     with pytest.raises(ObservationError, match="Anna, Anna"):

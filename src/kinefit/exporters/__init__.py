@@ -14,6 +14,6 @@ from kinefit.exporters.usd import write_usd
 
 __all__ = [
     "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_csv", "write_depth_overlay",
-    "write_glb", "write_markers", "write_montage", "write_mot", "write_motion", "write_osim", "write_overlay", "write_parquet",
-    "write_report", "write_trc", "write_usd",
+    "write_glb", "write_markers", "write_montage", "write_mot", "write_motion", "write_osim", "write_overlay",
+    "write_parquet", "write_report", "write_trc", "write_usd",
 ]  # fmt: skip

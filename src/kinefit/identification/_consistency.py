@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._rigid import rigid_frames
 from kinefit.identification.model import MarkerModel
+from kinefit.solvers.rigid_clusters import rigid_frames
 
 FLOOR = 0.004
 """[m] least deviation of a distance: skin and measurement, whatever a short training showed."""
@@ -71,12 +71,13 @@ class Consistency:
         who, sigma = self.who[label], np.hypot(FLOOR, 0.5 * self.sigma[label])
         off = []
         for then, end in pairs:
-            rigid = [self._carried(positions, then, int(frames[end]), points[end], label, home) for home in self.homes[label]]
+            now = int(frames[end])
+            rigid = [self._carried(positions, then, now, points[end], label, home) for home in self.homes[label]]
             told = min((o for o in rigid if o is not None), default=None)
             if told is None:
                 usual = np.linalg.norm(positions[then, who] - positions[then, label], axis=-1)
-                now = np.linalg.norm(positions[frames[end], who] - points[end], axis=-1)
-                told = float(_lower_middle(np.abs(now - usual) / sigma))
+                away = np.linalg.norm(positions[now, who] - points[end], axis=-1)
+                told = float(_lower_middle(np.abs(away - usual) / sigma))
             off.append(told)
         off = [o for o in off if np.isfinite(o)]
         return float(np.mean(off)) if off else np.nan

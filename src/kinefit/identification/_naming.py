@@ -166,7 +166,9 @@ class Naming:
                 continue
             own = self.sample(p)
             z = self.agree.misfits(self.pieces.points[own], at[self.pieces.frame[own]])[:, free]
-            z = np.where(np.isfinite(z).sum(0) * 2 >= len(own), np.nanmedian(z, axis=0), np.inf)
+            told = np.isfinite(z).sum(0) * 2 >= len(own)
+            z[:, ~told] = np.inf
+            z = np.nanmedian(z, axis=0)
             close = np.flatnonzero(z < STRAY)
             for c in close:
                 points, when = self.pieces.points[own], self.pieces.frame[own]

@@ -1,55 +1,17 @@
-"""Motions of segments from their markers, and the points where two segments meet."""
+"""The points where two segments meet, with what a motion leaves open, and how far joints were turned."""
 
 from __future__ import annotations
-
-import warnings
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.se3 import log_so3
 from kinefit.identification.model import MarkerJoint
+from kinefit.solvers.rigid_clusters import local, middle
 
 SECOND_RANGE = 0.35
 """Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
 and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
-
-
-def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
-    """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=axis))
-
-
-def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
-    """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
-
-    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where
-    nothing is seen.
-    """
-    prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
-    seen = np.isfinite(y[..., 0])
-    count = np.maximum(seen.sum(1), 1)[:, None]
-    x_all = np.where(seen[..., None], x, 0.0)
-    y_all = np.where(seen[..., None], y, 0.0)
-    x_mid, y_mid = x_all.sum(1) / count, y_all.sum(1) / count
-    a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
-    b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
-    size = (a * a).sum((1, 2))[:, None, None]
-    cross = np.einsum("fki,fkj->fij", b, a) + (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
-    u, _, vt = np.linalg.svd(cross)
-    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    R = u @ vt
-    t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
-    nothing = ~seen.any(1)
-    R[nothing], t[nothing] = np.nan, np.nan
-    return R, t
-
-
-def local(R: NDArray, t: NDArray, y: NDArray) -> NDArray:
-    """(F, k, 3) [m] points y of the world in the frames of a segment."""
-    return np.einsum("fji,fkj->fki", R, y - t[:, None])
 
 
 def meet(

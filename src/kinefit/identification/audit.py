@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._rigid import middle
 from kinefit.identification._swaps import best_run, crossings, pair_gain, swap_gains
 from kinefit.identification.learn import learn_model
 from kinefit.identification.marker_sets import MarkerSet, find_marker_set
 from kinefit.identification.model import MarkerModel
 from kinefit.identification.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
 from kinefit.observations import Markers
+from kinefit.solvers.rigid_clusters import middle
 
 PARTNERS = 6
 """Markers whose distances speak for a label: those that hold them best."""

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification._rigid import joint_residual, local, middle, rigid_frames
+from kinefit.identification._rigid import joint_residual
 from kinefit.identification.from_frame import Skeleton
 from kinefit.identification.marker_sets import GIVE, RANGE
+from kinefit.solvers.rigid_clusters import local, middle, rigid_frames, shape_of
 
 GIVE_WITHIN = 0.012
 """[m] deviation of a distance up to which two markers are of one segment: twice what the catalogue's markers give by
@@ -120,16 +121,6 @@ def strays(positions: NDArray, group: set[int]) -> NDArray:
         away = middle(((back - middle(back, axis=0)) ** 2).sum(-1), axis=0)
         out[who] = np.where(np.isfinite(away), np.sqrt(away / 3), np.inf)
     return out
-
-
-def shape_of(y: NDArray) -> NDArray:
-    """(k, 3) mean shape of markers that move together, y (F, k, 3)."""
-    shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
-    shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
-    for _ in range(3):
-        typical = middle(local(*rigid_frames(shape, y), y), axis=0)
-        shape = np.where(np.isfinite(typical), typical, shape)
-    return shape
 
 
 def widened(group: set[int], apart: NDArray) -> set[int]:

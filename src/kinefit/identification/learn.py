@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._rigid import meet, middle, rigid_frames, told, turned
+from kinefit.identification._rigid import meet, told, turned
 from kinefit.identification.clusters import learn_segments
 from kinefit.identification.from_frame import (
     JOINT_SPREAD,
@@ -26,6 +26,7 @@ from kinefit.identification.from_frame import (
 from kinefit.identification.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.identification.model import MarkerJoint, MarkerModel
 from kinefit.observations import Markers
+from kinefit.solvers.rigid_clusters import middle, rigid_frames
 
 MOST_FRAMES = 1000
 """Frames that are looked at, spread over the take: neighbours in time say the same."""

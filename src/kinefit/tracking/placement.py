@@ -127,6 +127,28 @@ def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike
     return best
 
 
+def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) -> str:
+    """The body's own marker set that labels belong to; "" where they are landmarks of the body.
+
+    Raises
+    ------
+    ObservationError
+        The body knows none of them.
+    BodyError
+        It has no such set.
+    """
+    labels = set(labels)
+    sets = {marker_set: body.markers(marker_set)} if marker_set else {**body.marker_sets, "": body.landmarks}
+    shared = {name: len(labels.intersection(points.names)) for name, points in sets.items()}
+    best = max(shared, key=lambda name: shared[name])
+    if not shared[best]:
+        raise ObservationError(
+            f"none of the labels is known to body '{body.name}': {_listed(tuple(sorted(labels)))}",
+            remedy=f"Marker sets of the body: {', '.join(body.marker_sets) or 'none'}; or name its landmarks.",
+        )
+    return best
+
+
 def _listed(labels: tuple[str, ...]) -> str:
     return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
 
