@@ -40,9 +40,9 @@ def hinge(k):
 def test_a_ball_without_noise_is_found_exactly():
     markers, centre, _ = moving(ball)
     found = functional_centre(markers, PELVIS, THIGH)
-    assert np.allclose(found.centre, centre, atol=1e-9)
+    assert np.allclose(found.centre, centre, atol=1e-6)
     assert found.axis is None
-    assert found.spread < 1e-9
+    assert found.spread < 1e-6
 
 
 @pytest.mark.parametrize("child", [("E",), ("E", "F"), THIGH])

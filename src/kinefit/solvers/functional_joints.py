@@ -19,9 +19,10 @@ from kinefit.errors import ObservationError, choices
 from kinefit.observations import Markers
 from kinefit.solvers.rigid_clusters import local, middle, rigid_frames, shape_of
 
-LEAST_TURN = np.deg2rad(4.0)
-"""[rad] standard deviation of a turn that tells a centre: a segment's pose that is off by 2 mm at the joint moves the
-centre by 2 mm over the turn, here 3 cm."""
+LEAST_TURN = np.deg2rad(8.0)
+"""[rad] standard deviation of a turn that tells a centre. Skin leaves a segment's pose some 3 mm off at the joint, so
+the centre by 3 mm over the turn, here 2 cm. In jumps and walks, whose hips turn by 4 to 5 degrees about their second
+axis, centres were 28 to 61 mm from the laboratory's; what all joints together tell was 8 to 18 mm from it."""
 
 _FEWEST = 10  # frames
 _STARTS = 30  # of a sphere fit: one of them without outliers, where a tenth of the frames has some
