@@ -56,7 +56,7 @@ def test_points_get_their_labels_back(folder, subject):
     assert np.isfinite(off).mean() > 0.99
     assert np.nanmax(off) < 0.001
     assert named.first_frame == 11
-    rows = list(csv.DictReader((folder / "points-named-doubts.csv").open()))
+    rows = list(csv.DictReader((folder / "points-named-doubts.csv").read_text().splitlines()))
     assert all(int(r["first_frame"]) >= 11 for r in rows)
     assert ("doubtful frames: none" in text) == (not rows)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +25,9 @@ SLACK = 10.0
 BUDGET = 1200
 """Nodes; a search that needs more has a wrong noise level or too few points: from then on only first choices count."""
 
+
+DEAREST = 8.0
+"""Most that one segment's wish for a point costs another."""
 
 QUOTA = 200
 """Nodes for each choice of the root."""
@@ -114,6 +118,7 @@ class Search:
             for child in t.children:
                 self.below[t.index] |= self.below[child]
         self.blocked: frozenset[tuple[int, int]] = frozenset()  # (segment, point) that may not be
+        self.bids = {t.index: np.zeros(len(points)) for t in tables}  # what each point costs a segment: see `bid`
         self.promise = {t.index: 0.0 for t in tables}  # least cost of a segment and all below it, as found so far
 
     @property
@@ -314,20 +319,48 @@ class Search:
             found += self.decode(child, (node, c))
         return found
 
-    def reweigh(self, extra: dict[int, NDArray]) -> None:
-        """Weigh anew with a cost for each point that a segment chooses: segment -> (N,)."""
+    def reweigh(self) -> None:
+        """Weigh all nodes anew, with bids."""
         for node in self.nodes:
-            price = extra.get(node.table.index)
-            if price is None:
-                self.weigh(node)
-            else:
-                self.weigh(node, self.price(node, price))
+            self.weigh(node, self.price(node, self.bids[node.table.index]))
 
     def price(self, node: Node, price: NDArray) -> NDArray:
         """(C,) what the points that each choice takes cost."""
         padded = np.append(price, 0.0)
         new = np.where(node.table.shared >= 0, -1, node.index)
         return padded[new].sum(1)
+
+    def bid(self, root: Node, labels: int, rounds: int, until: Callable[[], bool]) -> None:
+        """Weigh all nodes by what each point costs a segment as others want it: loopy belief propagation.
+
+        A parent and its children never share a point; of all other segments one at most may have it. They tell each
+        other `rounds` times, or `until` it is enough.
+        """
+        owner = np.full(labels, -1)
+        for t in self.tables:
+            owner[t.markers[t.shared < 0]] = t.index
+        segments = sorted(self.by_index)
+        apart = np.ones((len(segments), len(segments)), bool)
+        for t in self.tables:
+            apart[t.index, [t.index, *t.children]] = False
+            apart[[*t.children], t.index] = False
+        price = np.array([self.bids[s] for s in segments])
+        for _ in range(rounds):
+            use = np.zeros(price.shape)
+            np.add.at(use, owner, self.marginals(root, labels)[:, :-1])
+            use = np.clip(use, 0.0, 1 - np.exp(-DEAREST))
+            wish = np.exp(np.minimum(np.log(np.maximum(use, 1e-9)) - np.log1p(-use) + price, DEAREST))
+            fresh = np.log1p(apart @ wish)
+            price = 0.5 * (price + fresh) if price.any() else fresh
+            self.bids = dict(zip(segments, price))
+            self.reweigh()
+            if until():
+                break
+
+    def cost_of(self, chosen: list[tuple[Node, int]]) -> float:
+        """Of decoded choices, without bids."""
+        node, c = chosen[0]
+        return float(node.best[c] - sum(self.price(n, self.bids[n.table.index])[k] for n, k in chosen))
 
     def marginals(self, root: Node, labels: int) -> NDArray:
         """(M, N + 1) probability of each point to be each label, the last for none."""

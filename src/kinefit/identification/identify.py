@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
-from itertools import count as counter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.identification._kernels_evidence import place_joint
-from kinefit.identification._search import BUDGET, Node, Search
+from kinefit.identification._search import Node, Search
 from kinefit.identification._tables import SegmentTable, segment_tables
 from kinefit.identification.model import MarkerModel
 
 ATTEMPTS = 8
 """Searches of a frame that is not explained well; each takes about 0.1 s."""
 
-AGAIN, MOST_AGAIN = 100, 400
-"""Nodes for a search anew without a point, and for all such."""
+ROUNDS = 6
+"""Of segments that tell each other which points they want."""
 
 MOST_NODES = 4500
 """Nodes of all attempts at a frame, a second or so; one that needs more is left as it is."""
@@ -27,15 +25,8 @@ MOST_NODES = 4500
 SURE = 15.0
 """A lead that needs to be no longer."""
 
-CLASHES = 24
-"""Points that two labels claim and that are decided one after the other; more are a sign of a wrong noise level."""
-
-
 CLEAR = 12.0
 """Cost by which every choice leads the next, where nothing needs weighing."""
-
-ELSEWHERE = 5.0
-"""Cost of a point that the best explanation needs elsewhere."""
 
 OUTLIERS, OUTLYING = 0.05, 4.0
 """Share of markers beyond the noise, and how far: a usual contamination of a Gaussian."""
@@ -189,8 +180,7 @@ def _solve(
     tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float
 ) -> Solution:
     search = Search(tables, at, gaps, scale, gain, box, gate)
-    root, chosen, cost, clashes = _without_conflicts(search)
-    search.gather(root)
+    root, chosen, cost, clashes = _without_conflicts(search, 1 + max(int(t.markers.max()) for t in tables))
     squares, freedom, matched = 0.0, 0, 0
     for node, c in chosen:
         n = int((node.index[c] >= 0).sum())
@@ -201,29 +191,31 @@ def _solve(
     return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched, clashes)
 
 
-def _without_conflicts(search: Search) -> tuple[Node, list[tuple[Node, int]], float, bool]:
-    """The best explanation in which no two labels share a point: best first over who must do without it."""
-    order = counter()
-    queue: list[tuple[float, int, frozenset[tuple[int, int]], Node, list[tuple[Node, int]]]] = []
+def _without_conflicts(search: Search, labels: int) -> tuple[Node, list[tuple[Node, int]], float, bool]:
+    """The best explanation in which no two labels share a point.
 
-    def push(blocked: frozenset[tuple[int, int]]) -> None:
-        search.blocked = blocked
-        search.budget = len(search.memo) + (AGAIN if blocked else BUDGET)
-        root = search.node(search.tables[0], None, -1)
-        chosen = search.decode(root)
-        heapq.heappush(queue, (float(root.best[chosen[0][1]]), next(order), blocked, root, chosen))
+    What clashes is bid for; what still clashes then is decided best first over who must do without it.
+    """
+    root = search.node(search.tables[0], None, -1)
+    chosen = search.decode(root)
+    search.gather(root)
+    cost = float(root.best[chosen[0][1]])
+    if _clash(chosen) is None:
+        return root, chosen, cost, False
+    best: tuple[float, list[tuple[Node, int]]] | None = None
 
-    push(frozenset())
-    start = len(search.memo)
-    for _ in range(CLASHES):
-        cost, _, blocked, root, chosen = heapq.heappop(queue)
-        clash = _clash(chosen)
-        if clash is None or len(search.memo) > start + MOST_AGAIN:
-            break
-        point, segments = clash
-        for s in segments:
-            push(blocked | {(s, point)})
-    return root, chosen, cost, clash is not None
+    def until() -> bool:
+        nonlocal best
+        now = search.decode(root)
+        if _clash(now) is None:
+            dear = search.cost_of(now)
+            best = (dear, now) if best is None or dear < best[0] else best
+        return best is not None
+
+    search.bid(root, labels, ROUNDS, until)
+    if best is not None:
+        return root, best[1], best[0], False
+    return root, search.decode(root), cost, True
 
 
 def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
@@ -241,7 +233,6 @@ def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None
 
 def _decide(found: Solution, count: int, certain: float) -> Identification:
     """Labels that are probable enough, by the share of all explanations that agree on them."""
-    search = found.search
     guess = np.full(count, -1)
     for node, c in found.chosen:
         fresh = node.table.shared < 0
@@ -250,14 +241,9 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
         confidence = np.full(count, 1 - float(np.exp(-CLEAR)))
     else:
         confidence = _shares(found, guess)
-    users = np.bincount(guess[guess >= 0], minlength=len(search.points))
-    twice = (guess >= 0) & (users[guess] > 1)  # the search ended before it was decided
-    if twice.sum() > 4:
-        confidence[:] = 0.0
-    for node, _ in found.chosen:
-        if twice[node.table.markers].any():
-            for s in search.below[node.table.index]:
-                confidence[search.by_index[s].markers] = 0.0
+    for point in np.flatnonzero(np.bincount(guess[guess >= 0]) > 1):  # what nobody gave way in
+        users = np.flatnonzero(guess == point)
+        guess[users[users != users[np.argmax(confidence[users])]]] = -1
     _complete(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)
@@ -274,18 +260,10 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
 def _shares(found: Solution, guess: NDArray) -> NDArray:
     """(M,) share of the likelihood of all explanations that agree with a guess about each label.
 
-    A point that the best explanation gives to a segment elsewhere costs others: it would have to be given up there.
+    A point that other segments want costs.
     """
-    search = found.search
-    near = {t.index: {t.index, t.parent, *t.children} for t in search.tables}
-    extra = {t.index: np.zeros(len(search.points)) for t in search.tables}
-    for node, c in found.chosen:
-        mine = node.index[c][(node.table.shared < 0) & (node.index[c] >= 0)]
-        for t in search.tables:
-            if node.table.index not in near[t.index]:
-                extra[t.index][mine] = ELSEWHERE
-    search.reweigh(extra)
-    return search.marginals(found.root, len(guess))[np.arange(len(guess)), guess]
+    found.search.bid(found.root, len(guess), ROUNDS, lambda: False)
+    return found.search.marginals(found.root, len(guess))[np.arange(len(guess)), guess]
 
 
 def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
