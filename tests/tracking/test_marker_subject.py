@@ -41,7 +41,7 @@ def test_sets_lie_on_the_body_and_are_symmetric(name):
 
 
 def test_sets_go_by_all_their_names():
-    assert placement(BODY, "HDM05_41").points.names == placement(BODY, "CMU_41").points.names
+    assert placement(BODY, "hdm05-41").points.names == placement(BODY, "CMU_41").points.names
     labels = placement(BODY, "STANFORD_47").points.names
     assert {"r.ASIS", "L.ASIS", "r_knee", "L_knee", "R_Shoulder", "L_Shoulder"} <= set(labels)
 

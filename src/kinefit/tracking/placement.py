@@ -94,7 +94,7 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
         points = body.markers(name)
         return Placement(name, points, np.full(len(points), LANDMARK_SPREAD))
     for record in _catalogue().values():
-        if name in (record.name, *record.also):
+        if _plain(name) in map(_plain, (record.name, *record.also)):
             return _placed(body, record)
     raise ObservationError(
         choices("marker set", name, [*body.marker_sets, *marker_set_names()]), remedy="Or give a file of one (.toml)."
@@ -147,6 +147,10 @@ def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) 
             remedy=f"Marker sets of the body: {', '.join(body.marker_sets) or 'none'}; or name its landmarks.",
         )
     return best
+
+
+def _plain(name: str) -> str:
+    return "".join(c for c in name.lower() if c.isalnum())
 
 
 def _listed(labels: tuple[str, ...]) -> str:
