@@ -60,6 +60,7 @@ class Node:
     index : (C, k) int, points, -1 for none; cost : (C,) own; squares : (C,) weighted residual squares
     new : (C, W) uint64, points that are chosen here (not given by the parent), as bits; all : given ones too
     empty : the choice of no point at all
+    loss : (C,) what leaving contested points out costs, of choices that do nothing else; else 0
     below : for each choice the nodes of the children; None where it is not followed
     best : (C,) cost with the best below; total : (C,) -log of the sum over all below; inf where not followed
     allowed : choices dearer than this with all below were not followed
@@ -74,6 +75,7 @@ class Node:
     all: NDArray
     hold: Hold
     empty: int
+    loss: NDArray
     below: list[list[Node] | None]
     best: NDArray
     total: NDArray
@@ -88,6 +90,7 @@ class Search:
     points : (N, 3) [m]
     scale : factor on the model's deviations
     gain : what a matched marker earns against a missing one, log(1/m³)
+    contested : (W,) bits of points that several segments want: each is tried without them, whatever that costs it
     """
 
     def __init__(
@@ -99,6 +102,7 @@ class Search:
         gain: float,
         volume: float,
         gate: float,
+        contested: NDArray | None = None,
     ):
         self.tables = tables
         self.by_index = {t.index: t for t in tables}
@@ -111,27 +115,23 @@ class Search:
         self.bits = np.zeros((len(points) + 1, words), np.uint64)  # the last row: no point
         for i in range(len(points)):
             self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
-        self.quota, self.budget = QUOTA, BUDGET
+        self.contested = np.zeros(words, np.uint64) if contested is None else contested
+        self.wanted = np.zeros(words, np.uint64)  # bits of points that a segment would choose, had its parent not
+        self.quota = QUOTA
         self.nodes: list[Node] = []
-        self.below = {t.index: {t.index} for t in tables}
-        for t in reversed(tables):
-            for child in t.children:
-                self.below[t.index] |= self.below[child]
-        self.blocked: frozenset[tuple[int, int]] = frozenset()  # (segment, point) that may not be
         self.bids = {t.index: np.zeros(len(points)) for t in tables}  # what each point costs a segment: see `bid`
-        self.promise = {t.index: 0.0 for t in tables}  # least cost of a segment and all below it, as found so far
+        self.promise = {t.index: 0.0 for t in tables}  # least cost so far of a segment and all below
 
     @property
     def spent(self) -> bool:
         """Whether the search has had its nodes."""
-        return len(self.memo) > min(self.quota, self.budget)
+        return len(self.memo) > min(self.quota, BUDGET)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
         hold, taken = Hold(), self.bits[-1]
         context: tuple = ()
-        blocked = frozenset(pair for pair in self.blocked if pair[0] in self.below[table.index])
         if parent is not None:
             points, taken = parent.index[choice], parent.all[choice]
             common = table.shared >= 0
@@ -140,14 +140,17 @@ class Search:
             if not (given >= 0).any():
                 hold = self.joint(parent, choice, table)
                 context = (parent.table.index, parent.context, tuple(points.tolist()))
-        key = (table.index, blocked, context)
+        key = (table.index, context)
         found = self.memo.get(key)
         if found is None:
             found = self.memo[key] = self.expand(table, context, given, hold, self.bits[-1])
+            hope = float(found.cost.min()) + sum(self.promise[child] for child in table.children)
+            self.promise[table.index] = min(self.promise[table.index], hope)
         clash = np.bitwise_or.reduce(found.new, 0) & taken
         if clash.any():  # others may come near the best without these points
+            self.wanted |= found.new[0] & taken
             context = (context, tuple(clash.tolist()))
-            key = (table.index, blocked, context)
+            key = (table.index, context)
             found = self.memo.get(key)
             if found is None:
                 found = self.memo[key] = self.expand(table, context, given, hold, taken)
@@ -181,7 +184,7 @@ class Search:
         return x, y, sigma
 
     def choices(
-        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
+        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray, slack: float = SLACK
     ) -> tuple[NDArray, NDArray, NDArray]:
         """(C, k) points, (C,) costs, (C,) weighted squares of likely choices; the first is to choose none."""
         k = len(table.markers)
@@ -189,7 +192,6 @@ class Search:
         free = hold.sigma <= 0 and not (given >= 0).any()
         joint = table.joint_here if table.joint_here is not None else np.zeros(3)
         blocked = (self.bits[:-1] & taken).any(1)
-        blocked[[point for s, point in self.blocked if s == table.index]] = True
         blocked[given[given >= 0]] = False
         volume = self.volume
         if len(hold.reach):
@@ -198,7 +200,7 @@ class Search:
         count = enumerate_segment(
             self.points, self.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
             hold.pivot, hold.sigma,
-            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, SLACK,
+            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, slack,
             2 if free else 1, index, cost, squares,
         )  # fmt: skip
         return index[:count], cost[:count], squares[:count]
@@ -210,13 +212,30 @@ class Search:
         keep = keep[np.argsort(cost[keep])]
         if 0 not in keep:  # no choice at all
             keep = np.append(keep, 0)
-        index, cost, squares = index[keep], cost[keep], squares[keep]
+        empty = int(np.flatnonzero(keep == 0)[0])
+        index, cost, squares, loss = index[keep], cost[keep], squares[keep], np.zeros(len(keep))
+        best = index[0]
+        if (np.bitwise_or.reduce(self.bits[np.where(given == -2, best, -1)], 0) & self.contested).any():
+            more = self.without(table, given, hold, best)
+            new = ~(more[0][:, None] == index).all(-1).any(1)
+            index, cost, squares = (np.concatenate([a, b[new]]) for a, b in zip((index, cost, squares), more))
+            less = ((index == best) | (index < 0)).all(1) & (index >= 0).any(1)
+            loss = np.where(less, cost - cost[0], 0.0)
         new = np.where(given == -2, index, -1)
         return Node(
             table, context, index, cost, squares,
             np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0), np.empty(0),
+            hold, empty, loss, [None] * len(cost), np.empty(0), np.empty(0),
         )  # fmt: skip
+
+    def without(self, table: SegmentTable, given: NDArray, hold: Hold, best: NDArray) -> tuple[NDArray, ...]:
+        """The best choice without some of the contested points: indexes, costs, squares."""
+        others = np.bitwise_or.reduce(self.bits[:-1], 0) & ~np.bitwise_or.reduce(self.bits[best], 0)
+        index, cost, squares = self.choices(table, given, hold, others, np.inf)
+        own = self.bits[best] & self.contested
+        may = own.any(1) & (given == -2)
+        keep = ((index == best) | (may & (index < 0))).all(1)
+        return index[keep], cost[keep], squares[keep]
 
     def alone(self, table: SegmentTable) -> tuple[float, int, float]:
         """Of a segment on its own: the least cost, how many markers that has, by how much any other choice is dearer.
@@ -243,7 +262,7 @@ class Search:
             below: list[Node] = []
             bound = total = float(node.cost[c])
             bound += sum(self.promise[t.index] for t in children)
-            limit = min(allowed, best + SLACK)
+            limit = min(allowed, best + SLACK) + float(node.loss[c])
             follow = not self.spent or (c == 0 and c != node.empty)
             for t in children if follow and bound <= limit else ():
                 bound -= self.promise[t.index]
@@ -271,7 +290,7 @@ class Search:
             bits = self.bits[index[:, 0]]
             below: list[list[Node] | None] = [[self.absent(self.by_index[child]) for child in table.children]]
             self.memo[key] = Node(
-                table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), zero.copy(), np.inf
+                table, (), index, zero, zero, bits, bits, Hold(), 0, zero, below, zero.copy(), zero.copy(), np.inf
             )
         return self.memo[key]
 

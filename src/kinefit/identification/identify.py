@@ -35,6 +35,10 @@ ENOUGH = 0.65
 """Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
 
 
+WHOLE = 0.95
+"""Share of the largest segments' markers that a noise level explains when no coarser one need be looked at."""
+
+
 @dataclass(frozen=True)
 class IdentifySettings:
     """How `identify` searches; nothing of it is about one body or one recording.
@@ -120,12 +124,14 @@ def identify(
         if best is None or (found.clashes, found.cost) < (best.clashes, best.cost):
             best = found
         enough = 0.9 * len(at) if len(at) <= count else ENOUGH * count
-        if (not found.clashes and found.matched >= enough and found.noise < 1.25 * scale) or spent > MOST_NODES:
+        if (found.matched >= enough and found.noise < 1.25 * scale) or spent > MOST_NODES:
             break
     assert best is not None
-    off = best.noise > settings.finest and not 0.85 < best.search.scale / best.noise < 1.2
-    if best.matched > 3 and not best.clashes and off:
-        found = _solve(best.search.tables, at, gaps, 1.05 * best.noise, gain, box, settings.gate)
+    contested = best.search.wanted | _shared(best.search, best.chosen)
+    noisy = best.noise > 1.2 * best.search.scale
+    if best.matched > 3 and (noisy or contested.any()):
+        scale = 1.05 * best.noise if noisy else best.search.scale
+        found = _solve(best.search.tables, at, gaps, scale, gain, box, settings.gate, contested)
         best = found if found.matched >= 0.8 * best.matched else best
     return _decide(best, count, settings.certain)
 
@@ -153,9 +159,11 @@ def _attempts(
         if cost < best:
             best, chosen = cost, len(levels) - 1
             share = sum(f[1] for f in found) / sum(len(model.segments[s]) for s in large)
+            if share > WHOLE:
+                break
         elif share > ENOUGH + 0.05:
             break
-        scale = max(1.6 * scale, 0.25)
+        scale = max(1.6 * scale, 1.0)  # not between: a body is firm here and loose there
     ranked = [
         (abs(n - chosen) + rank, -n, root, scale)
         for n, (scale, roots) in enumerate(levels) if n or not chosen for rank, root in enumerate(roots[:2])
@@ -177,10 +185,13 @@ class Solution:
 
 
 def _solve(
-    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float
+    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float,
+    contested: NDArray | None = None,
 ) -> Solution:
-    search = Search(tables, at, gaps, scale, gain, box, gate)
-    root, chosen, cost, clashes = _without_conflicts(search, 1 + max(int(t.markers.max()) for t in tables))
+    search = Search(tables, at, gaps, scale, gain, box, gate, contested)
+    root = search.node(tables[0], None, -1)
+    search.gather(root)
+    chosen, cost, clashes = _without_conflicts(search, root, 1 + max(int(t.markers.max()) for t in tables))
     squares, freedom, matched = 0.0, 0, 0
     for node, c in chosen:
         n = int((node.index[c] >= 0).sum())
@@ -188,47 +199,36 @@ def _solve(
             squares += float(node.squares[c])
             freedom += 1 if n == 2 else 3 * n - 6
         matched += int((node.index[c][node.table.shared < 0] >= 0).sum())
+    matched -= int(np.bitwise_count(_shared(search, chosen)).sum())
     return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched, clashes)
 
 
-def _without_conflicts(search: Search, labels: int) -> tuple[Node, list[tuple[Node, int]], float, bool]:
-    """The best explanation in which no two labels share a point.
-
-    What clashes is bid for; what still clashes then is decided best first over who must do without it.
-    """
-    root = search.node(search.tables[0], None, -1)
+def _without_conflicts(search: Search, root: Node, labels: int) -> tuple[list[tuple[Node, int]], float, bool]:
+    """The best explanation, its cost, and whether two labels share a point in it: what clashes is bid for."""
     chosen = search.decode(root)
-    search.gather(root)
-    cost = float(root.best[chosen[0][1]])
-    if _clash(chosen) is None:
-        return root, chosen, cost, False
-    best: tuple[float, list[tuple[Node, int]]] | None = None
+    clash = bool(_shared(search, chosen).any())
+    found: list[tuple[float, list[tuple[Node, int]]]] = []
 
     def until() -> bool:
-        nonlocal best
         now = search.decode(root)
-        if _clash(now) is None:
-            dear = search.cost_of(now)
-            best = (dear, now) if best is None or dear < best[0] else best
-        return best is not None
+        if not _shared(search, now).any():
+            found.append((search.cost_of(now), now))
+        return bool(found)
 
-    search.bid(root, labels, ROUNDS, until)
-    if best is not None:
-        return root, best[1], best[0], False
-    return root, search.decode(root), cost, True
+    if clash:
+        search.bid(root, labels, ROUNDS, until)
+        chosen, clash = (found[0][1], False) if found else (search.decode(root), True)
+    return chosen, search.cost_of(chosen), clash
 
 
-def _clash(chosen: list[tuple[Node, int]]) -> tuple[int, tuple[int, int]] | None:
-    taken: dict[int, tuple[int, int]] = {}
+def _shared(search: Search, chosen: list[tuple[Node, int]]) -> NDArray:
+    """(W,) bits of points that two segments take."""
+    once = np.zeros_like(search.contested)
+    twice = once.copy()
     for node, c in chosen:
-        t = node.table
-        for marker, point, shared in zip(t.markers.tolist(), node.index[c].tolist(), t.shared.tolist()):
-            if point < 0 or shared >= 0:
-                continue
-            if point in taken and taken[point][0] != marker:
-                return point, (taken[point][1], node.table.index)
-            taken[point] = (marker, node.table.index)
-    return None
+        twice |= once & node.new[c]
+        once |= node.new[c]
+    return twice
 
 
 def _decide(found: Solution, count: int, certain: float) -> Identification:
