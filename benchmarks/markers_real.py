@@ -26,7 +26,7 @@ from kinefit.identification.model import MarkerModel
 from kinefit.identification.takes import identify_take
 from kinefit.observations import Markers
 
-FRAMES = 60
+FRAMES = int(os.environ.get("FRAMES", 60))
 VARIANTS: dict[str, dict[str, Any]] = {"all": {}, "10 % removed": {"missing": 0.1}, "ten ghosts": {"ghosts": 10}}
 
 

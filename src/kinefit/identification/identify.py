@@ -19,7 +19,7 @@ ATTEMPTS = 8
 ROUNDS = 6
 """Of segments that tell each other which points they want."""
 
-MOST_NODES = 4500
+MOST_NODES = 2500
 """Nodes of all attempts at a frame, a second or so; one that needs more is left as it is."""
 
 SURE = 15.0

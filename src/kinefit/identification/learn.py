@@ -35,6 +35,10 @@ SELDOM = 0.01
 """A label that fewer of the frames show is left out: mostly a rest of somebody's editing ("RBAC-1")."""
 
 
+WIDEST = 4.0
+"""[m] that the markers of one subject spread over at most."""
+
+
 def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet | str | None = None) -> MarkerModel:
     """What the markers of a labelled take hold to each other.
 
@@ -54,6 +58,13 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
     if template is None:
         marker_set = find_marker_set(markers.names)
     positions, labels, gaps = usable(markers, marker_set or None)
+    with np.errstate(all="ignore"):
+        extent = float(np.nanmedian(np.nanmax(positions, axis=1) - np.nanmin(positions, axis=1), axis=0).max())
+    if not extent < WIDEST:
+        raise ObservationError(
+            f"the labels spread over {extent:.4g} m", file=markers.source or None,
+            remedy='One subject at a time, in the right unit: unit = "mm", --unit mm ...',
+        )
     tables = distances(positions)
     if isinstance(marker_set, MarkerSet):
         skeleton = adopt(skeleton_of(labels, marker_set), tables[1])

@@ -16,9 +16,11 @@ from kinefit.identification.identify import Identification, identify
 from kinefit.identification.model import MarkerModel
 from kinefit.observations import Markers
 
-FIRST, FITS = 12, 0.4
-"""Frames that are asked first, and the share of labels that must be found in half of them: a model of another subject
-and marker set finds a third at most, and takes long; the right one finds nine in ten."""
+FIRST, TRIAL, FITS = 12, 4, 0.7
+"""Frames that are asked first, how many of them before all others, and the share of labels that must be found in half
+of them (in one of the trial): a model of another subject finds half at most, and takes long; the right one finds more
+than nine in ten."""
+
 
 @dataclass(frozen=True)
 class TakeSettings:
@@ -125,8 +127,12 @@ def identify_take(
     work = Naming(model, pieces, markers.rate, step, identify_frame)
     anchors = _anchors(counts, max(1, round(settings.every * markers.rate)))
     first = anchors[:: max(1, len(anchors) // FIRST)]
-    work.ask(first)
-    share = float(np.median(work.named))
+    trial = first[:: max(1, len(first) // TRIAL)]
+    work.ask(trial)
+    share = max(work.named)
+    if share >= FITS:
+        work.ask(sorted(set(first) - set(trial)))
+        share = float(np.median(work.named))
     if share < FITS:
         raise ObservationError(
             f"the take does not fit the model of {model.name}: it finds {100 * share:.0f} % of the labels",
