@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,13 +20,8 @@ ROOM = 48
 SLACK = 10.0
 """Choices whose cost is this much above the best are dropped: e^-10 of its likelihood."""
 
-
-BUDGET = 1200
+BUDGET = 600
 """Nodes; a search that needs more has a wrong noise level or too few points: from then on only first choices count."""
-
-
-DEAREST = 8.0
-"""Most that one segment's wish for a point costs another."""
 
 QUOTA = 200
 """Nodes for each choice of the root."""
@@ -349,54 +343,7 @@ class Search:
         new = np.where(node.table.shared >= 0, -1, node.index)
         return padded[new].sum(1)
 
-    def bid(self, root: Node, labels: int, rounds: int, until: Callable[[], bool]) -> None:
-        """Weigh all nodes by what each point costs a segment as others want it: loopy belief propagation.
-
-        A parent and its children never share a point; of all other segments one at most may have it. They tell each
-        other `rounds` times, or `until` it is enough.
-        """
-        owner = np.full(labels, -1)
-        for t in self.tables:
-            owner[t.markers[t.shared < 0]] = t.index
-        segments = sorted(self.by_index)
-        apart = np.ones((len(segments), len(segments)), bool)
-        for t in self.tables:
-            apart[t.index, [t.index, *t.children]] = False
-            apart[[*t.children], t.index] = False
-        price = np.array([self.bids[s] for s in segments])
-        for _ in range(rounds):
-            use = np.zeros(price.shape)
-            np.add.at(use, owner, self.marginals(root, labels)[:, :-1])
-            use = np.clip(use, 0.0, 1 - np.exp(-DEAREST))
-            wish = np.exp(np.minimum(np.log(np.maximum(use, 1e-9)) - np.log1p(-use) + price, DEAREST))
-            fresh = np.log1p(apart @ wish)
-            price = 0.5 * (price + fresh) if price.any() else fresh
-            self.bids = dict(zip(segments, price))
-            self.reweigh()
-            if until():
-                break
-
     def cost_of(self, chosen: list[tuple[Node, int]]) -> float:
         """Of decoded choices, without bids."""
         node, c = chosen[0]
         return float(node.best[c] - sum(self.price(n, self.bids[n.table.index])[k] for n, k in chosen))
-
-    def marginals(self, root: Node, labels: int) -> NDArray:
-        """(M, N + 1) probability of each point to be each label, the last for none."""
-        share: dict[int, NDArray] = {id(n): np.zeros(len(n.cost)) for n in self.nodes}
-        weight = np.exp(root.total.min() - root.total)
-        share[id(root)] += weight / weight.sum()
-        table = np.zeros((labels, len(self.points) + 1))
-        for node in reversed(self.nodes):  # parents before children
-            p = share[id(node)]
-            if not p.any():
-                continue
-            fresh = node.table.shared < 0
-            for c in np.flatnonzero(p > 1e-6).tolist():
-                table[node.table.markers[fresh], node.index[c, fresh]] += p[c]
-                for child in node.below[c] or ():
-                    fits = ~(child.new & node.all[c]).any(1)
-                    cost = np.where(fits, child.total + self.between(node, c, child), np.inf)
-                    weight = np.exp(cost.min() - cost)
-                    share[id(child)] += p[c] * weight / weight.sum()
-        return table
