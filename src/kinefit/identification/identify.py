@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,9 @@ OUTLIERS, OUTLYING = 0.05, 4.0
 
 ENOUGH = 0.65
 """Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
+
+TRUSTED = 0.72
+"""Share of the points that an explanation must have a name for, if there are no more than labels; else it is chance."""
 
 WHOLE = 0.95
 """Share of the largest segments' markers that a noise level explains when no coarser one need be looked at."""
@@ -134,7 +137,10 @@ def identify(
         scale = 1.05 * best.noise if noisy else best.search.scale
         found = _solve(best.search.tables, at, gaps, scale, gain, box, settings.gate, contested)
         best = found if found.matched >= 0.8 * best.matched else best
-    return _decide(best, count, settings.certain)
+    found = _decide(best, count, settings.certain)
+    if best.matched < (TRUSTED * len(at) if len(at) <= count else ENOUGH * count):  # accidents
+        return replace(found, assignment=np.full(count, -1), confidence=np.zeros(count), ambiguous=True)
+    return found
 
 
 def _attempts(
