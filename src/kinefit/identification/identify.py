@@ -137,10 +137,10 @@ def identify(
         scale = 1.05 * best.noise if noisy else best.search.scale
         found = _solve(best.search.tables, at, gaps, scale, gain, box, settings.gate, contested)
         best = found if found.matched >= 0.8 * best.matched else best
-    found = _decide(best, count, settings.certain)
+    named = _decide(best, count, settings.certain)
     if best.matched < (TRUSTED * len(at) if len(at) <= count else ENOUGH * count):  # accidents
-        return replace(found, assignment=np.full(count, -1), confidence=np.zeros(count), ambiguous=True)
-    return found
+        return replace(named, assignment=np.full(count, -1), confidence=np.zeros(count), ambiguous=True)
+    return named
 
 
 def _attempts(
