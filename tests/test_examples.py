@@ -83,3 +83,18 @@ def test_a_live_source(capsys):
     assert error < 0.015
     assert tracker.dropped == tracker.late == 0
     assert capsys.readouterr().out.count("quality") == 8
+
+
+def test_markers_without_names(tmp_path, capsys):
+    module = example("05_markers")
+    labelled, points = module.simulated()
+    found, motion = module.main(out=tmp_path)
+    truth = labelled.positions[: len(points), [labelled.names.index(n) for n in found.labels]]
+    off = np.linalg.norm(found.positions - truth, axis=-1)
+    measured = found.column >= 0
+    assert measured.mean() > 0.97
+    assert off[measured].max() < 1e-9
+    assert len(motion) == len(points)
+    assert np.nanmedian(motion.residuals["markers"].norms) < 0.004
+    assert "look at" not in capsys.readouterr().out
+    assert {"labelled.c3d", "body.osim", "motion.mot"} <= {path.name for path in tmp_path.iterdir()}

@@ -49,6 +49,7 @@ PEERS: dict[str, Peer] = {
     "mujoco": Peer(*_MUJOCO, "mujoco_mink", ("mujoco",)),
     "mink": Peer(*_MUJOCO, "mujoco_mink", ("mink",)),
     "opensim": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_ik"),
+    "opensim_takes": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_takes"),
     "momentum": Peer(*_MOMENTUM, ("markers",), **_MOMENTUM_FILES),
     "momentum_planes": Peer(*_MOMENTUM, ("planes",), **_MOMENTUM_FILES),
 }

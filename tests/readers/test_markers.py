@@ -214,6 +214,8 @@ BAD_TRC = {
     "none of the 2 markers": trc(["1\t0.00\t0\t0\t0\t0\t0\t0", "2\t0.01\t\t\t\t\t\t"]),
     "nothing in this file": trc([]),
     "rate 0": trc(ROWS, rate="0"),
+    "missing or no number .*infinity": trc(ROWS).replace("\t4\t2\t", "\t4\tinf\t"),
+    "1000000000000 markers in 4 frames": trc(ROWS).replace("\t4\t2\t", "\t4\t1e12\t"),
     "not a TRC file": "PathFileType\t4\n",
 }
 
@@ -225,6 +227,25 @@ def test_bad_trc(tmp_path, problem):
     with pytest.raises(KinefitError, match=problem) as caught:
         read_markers(path)
     assert caught.value.file == path
+
+
+@settings(max_examples=300)
+@given(st.data())
+def test_damaged_trc_never_crashes(tmp_path_factory, data):
+    raw = bytearray(trc(ROWS * 2).encode())
+    if data.draw(st.booleans()):
+        raw = raw[: data.draw(st.integers(0, len(raw)))]
+    for _ in range(data.draw(st.integers(0, 6)) if raw else 0):
+        raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.sampled_from(list(b"\t\n\r 0-.eEnX\xff\x00")))
+    path = tmp_path_factory.getbasetemp() / "damaged.trc"
+    path.write_bytes(raw)
+    try:
+        markers = read_markers(path)
+    except KinefitError as error:
+        assert error.file == path
+    else:
+        assert np.isfinite(markers.positions).any()
+        assert 0 < markers.rate < np.inf
 
 
 def test_missing_and_foreign_files(tmp_path):

@@ -14,8 +14,8 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "view", "export", "retarget", "simulate", "evaluate",
-    "warmup",
+    "demo", "init", "calibrate", "detect", "check", "track", "markers", "view", "export", "retarget", "simulate",
+    "evaluate", "warmup",
 )  # fmt: skip
 
 _EPILOG = """\b
@@ -24,6 +24,7 @@ Examples:
   kinefit init my_take                  a take file for a recording of your own
   kinefit check my_take/take.toml       what is wrong with it, and what would mend it
   kinefit track my_take/take.toml       angles, figures, videos and a report
+  kinefit markers --help                points without names: labelled takes, joint angles
   kinefit export motion.npz --to bvh    a result in another format
   kinefit COMMAND --help                what a command takes, with examples
 

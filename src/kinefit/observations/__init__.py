@@ -6,7 +6,7 @@ one sensor, `frames` what it saw at one time.
 
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
-from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, Markers, SkeletonMotion
+from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, MarkerEvent, Markers, SkeletonMotion
 
 __all__ = [
     "MEDIAPIPE_33",
@@ -17,6 +17,7 @@ __all__ = [
     "Frame",
     "KeypointFrame",
     "Keypoints",
+    "MarkerEvent",
     "MarkerFrame",
     "Markers",
     "PointCloud",

@@ -171,6 +171,23 @@ class Detections:
         )
 
 
+@dataclass(frozen=True)
+class MarkerEvent:
+    """Something marked in a recording.
+
+    Parameters
+    ----------
+    label : str, such as "Foot Strike".
+    time : float [s] on the recording's own clock, which begins with frame 1.
+    context : str, such as "Left"; subject : str
+    """
+
+    label: str
+    time: float
+    context: str = ""
+    subject: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class Markers:
     """3D positions of markers over time, labelled (names) or not (names such as "*1").
@@ -188,6 +205,8 @@ class Markers:
     first_frame : int
         Number that the file gives its first frame.
     source : str
+    unit : str, of the file that it came from: "mm", "m" ...; positions are in metres whatever it says.
+    events : what was marked in the recording.
     """
 
     names: tuple[str, ...]
@@ -197,6 +216,8 @@ class Markers:
     up: str | None = None
     first_frame: int = 0
     source: str = ""
+    unit: str = "m"
+    events: tuple[MarkerEvent, ...] = ()
 
     def __post_init__(self) -> None:
         positions = _frozen(self.positions)

@@ -16,6 +16,7 @@ from kinefit.errors import FileError
 
 _BLOCK = 512
 _REMEDY = "Export the file again, or repair it with a C3D editor such as Mokka."
+_EVENTS, _MOST_EVENTS = 12345, 18  # key and room of the header's events
 _PROCESSORS = {84: "intel", 85: "dec", 86: "mips"}
 _SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
 
@@ -26,7 +27,9 @@ Values = list[str] | NDArray
 class C3d:
     """Content of a C3D file, in the file's own units.
 
-    points : (F, N, 3); missing : (F, N) bool; residual : (F, N); parameters : {"GROUP:NAME": list of str or array}.
+    points : (F, N, 3); missing : (F, N) bool; residual : (F, N); parameters : {"GROUP:NAME": list of str or array};
+    analog : (F, A) raw samples of every frame, channel by channel for each of `samples` times; events : of the header,
+    (label, seconds).
     """
 
     points: NDArray
@@ -35,6 +38,9 @@ class C3d:
     rate: float
     first_frame: int
     parameters: dict[str, Values]
+    analog: NDArray
+    samples: int
+    events: tuple[tuple[str, float], ...]
 
 
 def read_c3d(path: Path) -> C3d:
@@ -114,7 +120,7 @@ def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
     if kind not in _SIZES or len(shape) < rank or len(data) < size:
         raise FileError("longer than its record, or of no known type", file=path, place=key, remedy=_REMEDY)
     if kind != -1:
-        return _numbers(data, kind, processor)
+        return _numbers(data, kind, processor).reshape(shape, order="F")
     width = shape[0] if shape else 1
     cells = [data[i : i + width] for i in range(0, size, width)] if size else []
     return [_text(cell) for cell in cells]
@@ -129,12 +135,12 @@ def _text(cell: bytes) -> str:
 
 def _number(parameters: dict[str, Values], key: str) -> float | None:
     values = parameters.get(key)
-    return float(values[0]) if isinstance(values, np.ndarray) and len(values) else None
+    return float(values.flat[0]) if isinstance(values, np.ndarray) and values.size else None
 
 
 def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path: Path) -> C3d:
     word = "<u2" if processor != "mips" else ">u2"
-    count, analog, first, last, _, _, _, start = (int(v) for v in np.frombuffer(raw[2:18], word))
+    count, analog, first, last, _, _, _, start, samples = (int(v) for v in np.frombuffer(raw[2:20], word))
     scale, rate = (float(_numbers(raw[at : at + 4], 4, processor)[0]) for at in (12, 20))
     scale, rate = _number(parameters, "POINT:SCALE") or scale, _number(parameters, "POINT:RATE") or rate
     used = _number(parameters, "POINT:USED")
@@ -154,14 +160,30 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
             f"the file is truncated: {max(room, 0)} of {frames} frames can be read", file=path,
             remedy="Copy or export it again.",
         )
-    data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)[:, : 4 * count * width]
+    data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)
     with np.errstate(invalid="ignore"):  # signalling NaN
-        values = _numbers(data.tobytes(), width, processor).reshape(frames, count, 4).astype(float)
+        values = _numbers(data[:, : 4 * count * width].tobytes(), width, processor)
+        values = values.reshape(frames, count, 4).astype(float)
+        sampled = _numbers(data[:, 4 * count * width :].tobytes(), width, processor).reshape(frames, analog)
     points = values[..., :3] * (scale if scale > 0 else 1.0)
     fourth = np.nan_to_num(values[..., 3], nan=-1.0, posinf=-1.0, neginf=-1.0)
     missing = (fourth < 0) | ~np.isfinite(points).all(axis=-1) | ~points.any(axis=-1)
     residual = np.where(missing, np.nan, np.mod(np.trunc(fourth), 256) * abs(scale))
-    return C3d(points, missing, residual, rate, first, parameters)
+    if width == 2 and "".join(map(str, parameters.get("ANALOG:FORMAT", []))).upper().startswith("UNSIGNED"):
+        sampled = sampled.astype(sampled.dtype.newbyteorder("=")).view(np.uint16)
+    events = _header_events(raw, processor)
+    return C3d(points, missing, residual, rate, first, parameters, sampled, max(samples, 1), events)
+
+
+def _header_events(raw: bytes, processor: str) -> tuple[tuple[str, float], ...]:
+    """Labels and times [s] of the header's events, of four characters each; none where its key is not there."""
+    key, count = np.frombuffer(raw[298:302], ">u2" if processor == "mips" else "<u2")
+    if key != _EVENTS or not 0 < count <= _MOST_EVENTS:
+        return ()
+    with np.errstate(invalid="ignore"):
+        times = _numbers(raw[304 : 304 + 4 * _MOST_EVENTS], 4, processor)[:count].astype(float)
+    labels = [_text(raw[396 + 4 * i : 400 + 4 * i]) for i in range(count)]
+    return tuple((label, float(t)) for label, t in zip(labels, times, strict=True) if np.isfinite(t))
 
 
 def _frames(parameters: dict[str, Values], first: int, last: int, room: int) -> tuple[int, int]:
@@ -171,7 +193,7 @@ def _frames(parameters: dict[str, Values], first: int, last: int, room: int) -> 
     if stated is not None and np.isfinite(stated):
         counts.append(int(stated) % 65536 if abs(stated) < 65536 else int(stated))
     ends = [parameters.get(f"TRIAL:ACTUAL_{end}_FIELD") for end in ("START", "END")]
-    if all(isinstance(e, np.ndarray) and len(e) == 2 and e.dtype.itemsize == 2 for e in ends):
+    if all(isinstance(e, np.ndarray) and e.shape == (2,) and e.dtype.itemsize == 2 for e in ends):
         start, stop = (int(e[0]) % 65536 + 65536 * (int(e[1]) % 65536) for e in ends)  # type: ignore[index]
         first = start
         counts.append(stop - start + 1)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError, choices
-from kinefit.observations import Markers
+from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers._c3d import C3d, read_c3d
 
 UNITS = {
@@ -35,7 +35,8 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     Markers
         Positions [m] in the file's own world. Not seen (NaN) is what has a negative residual, an empty cell, or lies
         exactly at the origin. Angles, forces and the like that a C3D keeps among its points are left out. Points
-        without a label are called "*1", "*2" ...; a label that is there twice gets the suffix "_2".
+        without a label are called "*1", "*2" ...; a label that is there twice gets the suffix "_2". Events of a C3D are
+        kept.
 
     Raises
     ------
@@ -104,14 +105,29 @@ def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
     if not keep:
         raise ObservationError("all points of this file are computed quantities, none is a marker", file=path)
     screen = "".join(_texts(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
-    metres = _metres(unit or next(iter(_texts(c3d, "POINT:UNITS")), None), path)
+    unit = unit or next(iter(_texts(c3d, "POINT:UNITS")), None)
+    metres = _metres(unit, path)
     if c3d.missing[:, keep].all():
         raise _unseen(len(keep), len(c3d.points), path)
     positions = np.where(c3d.missing[..., None], np.nan, c3d.points) * metres
     return Markers(
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
         up=screen if screen in ("x", "y", "z") else None, first_frame=c3d.first_frame, source=str(path),
+        unit=str(unit).strip().lower(), events=_events(c3d),
     )
+
+
+def _events(c3d: C3d) -> tuple[MarkerEvent, ...]:
+    """Events of the group EVENT, else of the header, in the order of their times."""
+    times = c3d.parameters.get("EVENT:TIMES")
+    labels, contexts, subjects = (_texts(c3d, f"EVENT:{name}") for name in ("LABELS", "CONTEXTS", "SUBJECTS"))
+    found = [MarkerEvent(label, time) for label, time in c3d.events]
+    if isinstance(times, np.ndarray) and times.dtype.kind == "f" and times.size and times.size % 2 == 0:
+        pairs = times.reshape((2, -1), order="F").astype(float)  # minutes, seconds
+        seconds = 60.0 * pairs[0] + pairs[1]
+        many = [(texts + [""] * len(seconds))[: len(seconds)] for texts in (labels, contexts, subjects)]
+        found = [MarkerEvent(n, float(t), c, s) for n, t, c, s in zip(many[0], seconds, *many[1:], strict=True)]
+    return tuple(sorted((e for e in found if np.isfinite(e.time)), key=lambda e: e.time))
 
 
 def _read_trc(path: Path, unit: str | None) -> Markers:
@@ -123,13 +139,15 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
     try:
         rate, stated = float(header["datarate"]), int(float(header["numframes"]))
         count = int(float(header["nummarkers"]))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         problem = f"DataRate, NumFrames or NumMarkers is missing or no number ({error})"
         raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
         raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
     cells = lines[3].split("\t") if "\t" in lines[3] else lines[3].split()
     names = [cell.strip() for cell in cells if cell.strip()][2:]
+    if not 0 <= count <= len(text) or stated < 0:  # a cell takes a character at least
+        raise FileError(f"{count} markers in {stated} frames", file=path, place="line 3", remedy="Correct NumMarkers.")
     names += [""] * (count - len(names))
     metres = _metres(unit or header.get("units"), path)
     frames, times, positions = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
@@ -151,7 +169,7 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
         raise _unseen(len(names), len(frames), path)
     return Markers(
         _unique(names), rate, np.where(missing[..., None], np.nan, positions * metres), first_frame=int(frames[0]),
-        source=str(path),
+        source=str(path), unit=str(unit or header.get("units")).strip().lower(),
     )
 
 

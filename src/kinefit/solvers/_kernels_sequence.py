@@ -9,8 +9,8 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.bodies._kernels import forward, retract
 from kinefit.correspondences._kernels import plane_rows, point_rows
-from kinefit.solvers._kernels import assemble
-from kinefit.solvers._kernels_linear import adapt, damped_step
+from kinefit.solvers._kernels import assemble, joint_moves
+from kinefit.solvers._kernels_linear import adapt, damped_step, invert
 
 _TRIES = 60  # of more damping, for a matrix that is not positive
 
@@ -32,12 +32,13 @@ def gather(order, x, n, weight, target, normal, weights):
 def fit_sequence(
     parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
     owner, rest, target, weight, plane_owner, plane_rest, plane_order, plane_x, plane_n, plane_w,
-    kind, scale, max_iterations, tolerance, damping_share, roots, angles, costs, iterations,
+    usual, posture, kind, scale, max_iterations, tolerance, damping_share, roots, angles, costs, iterations,
 ):  # fmt: skip
     """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
 
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
+    Each angle is drawn towards usual (F, D) with weight posture (D,).
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
     mean diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than
     `tolerance` of the cost ends a frame.
@@ -74,6 +75,11 @@ def fit_sequence(
                 data, segment, group, count, kind, scale, trial_root[:3, 3], parents, dof_start, chain, depth, screws,
                 factor, blocks, other_H, other_g,
             )  # fmt: skip
+            for d in range(n_angles):
+                away = usual[f, d] - trial_q[d]
+                other_H[6 + d, depth[6 + d]] += posture[d]
+                other_g[6 + d] += posture[d] * away
+                new_cost += posture[d] * away * away
             if first:
                 cost = new_cost
                 H, other_H, g, other_g = other_H, H, other_g, g
@@ -110,3 +116,54 @@ def fit_sequence(
         for i in range(n_angles):
             angles[f, i] = q[i]
         costs[f], iterations[f] = cost, used
+
+
+@jit
+def certainties(
+    parents, dof_start, dof_parent, last_dof, chain, depth, prismatic, axes, rest_joints,
+    owner, rest, target, weight, posture, kind, scale, roots, angles, dof_std, joint_std, factors,
+):  # fmt: skip
+    """How sure fitted frames are: dof_std (F, n), joint_std (F, S, 3), and robust factors (F, K), 0 where unseen.
+
+    Points as in `fit_sequence`; posture (D,) weights. A frame that cannot be inverted is infinite.
+    """
+    n_segments, n_angles, points = parents.size, axes.shape[0], owner.size
+    n = n_angles + 6
+    data, segment, group = np.empty((8, 3 * points)), np.empty(3 * points, np.int64), np.empty(3 * points, np.int64)
+    factor, blocks = np.empty(3 * points), np.empty((n_segments, 27))
+    frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
+    C, g, P = np.empty(chain.shape), np.empty(n), np.empty((n, n))
+    moves, column = np.empty((n_segments, 3, n)), np.empty(n)
+    for f in range(roots.shape[0]):
+        forward(parents, dof_start, prismatic, axes, rest_joints, roots[f], angles[f], frames, screws)
+        count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
+        assemble(
+            data, segment, group, count, kind, scale, roots[f, :3, 3], parents, dof_start, chain, depth, screws,
+            factor, blocks, C, g,
+        )  # fmt: skip
+        for k in range(points):
+            factors[f, k] = 0.0
+        for i in range(count):
+            factors[f, group[i]] = factor[i]
+        for d in range(n_angles):
+            C[6 + d, depth[6 + d]] += posture[d]
+        if not invert(C, chain, depth, P):
+            dof_std[f] = np.inf
+            joint_std[f] = np.inf
+            continue
+        for i in range(n):
+            dof_std[f, i] = math.sqrt(P[i, i])
+        joint_moves(frames, screws, rest_joints, roots[f], dof_parent, last_dof, moves)
+        for s in range(n_segments):
+            for axis in range(3):
+                m, total = moves[s, axis], 0.0
+                d = last_dof[s]
+                while d >= 0:
+                    column[d] = 0.0
+                    e = last_dof[s]
+                    while e >= 0:
+                        column[d] += P[d, e] * m[e]
+                        e = dof_parent[e]
+                    total += m[d] * column[d]
+                    d = dof_parent[d]
+                joint_std[f, s, axis] = math.sqrt(total if total > 0.0 else 0.0)

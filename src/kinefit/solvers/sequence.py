@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
+from kinefit.solvers._kernels_sequence import certainties as _certainties
 from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
 from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import bounds_of
@@ -56,6 +57,8 @@ def fit_sequence(
     loss: Loss = SQUARED,
     limits: bool = True,
     locked: NDArray | None = None,
+    posture: float = 0.0,
+    usual: NDArray | None = None,
     damping: float = 1e-3,
     max_iterations: int = 50,
     tolerance: float = 1e-6,
@@ -72,6 +75,10 @@ def fit_sequence(
     sigma : scalar or (K,) [m]
     planes : Planes
         Tangent planes for other points, as well or instead.
+    posture : float
+        Weight of the usual posture, as a share of 1/spread²: it decides what the measurements leave open.
+    usual : (F, D) or (D,) [rad or m]
+        The posture meant; default: the body's.
     damping : float
         First λ as a share of H's mean diagonal.
     tolerance : float
@@ -105,6 +112,54 @@ def fit_sequence(
         p.points.segments[p_order],
         np.ascontiguousarray(body.points_rest(p.points)[p_order].T),
         p_order, np.ascontiguousarray(p.x_world), np.ascontiguousarray(p.normal), 1.0 / p.sigma**2,
+        np.ascontiguousarray(np.broadcast_to(tree.usual if usual is None else usual, angles.shape), float),
+        posture / np.square(tree.spread),
         loss.kind, loss.scale, max_iterations, tolerance, damping, roots, angles, costs, iterations,
     )  # fmt: skip
     return Sequence(roots, angles, costs, iterations)
+
+
+@dataclass(frozen=True, eq=False)
+class Certainty:
+    """How sure fitted frames are.
+
+    Parameters
+    ----------
+    dof_std : (F, n) [m, rad] one standard deviation of every degree of freedom.
+    joint_std : (F, S, 3) [m] one of every joint centre along the world's axes.
+    factors : (F, K) the points' robust factors in 0..1, 0 where unseen.
+    """
+
+    dof_std: NDArray
+    joint_std: NDArray
+    factors: NDArray
+
+
+def certainty(
+    body: Body,
+    Ts_world_root: NDArray,
+    angles: NDArray,
+    points: PointSet,
+    x_world: ArrayLike,
+    *,
+    sigma: ArrayLike = 0.005,
+    loss: Loss = SQUARED,
+    posture: float = 0.0,
+) -> Certainty:
+    """Standard deviations of frames that `fit_sequence` fitted to points, from each frame's own covariance.
+
+    Infinite in a frame of which something is open; with a share `posture` that is no angle, and the prior's own spread
+    tells how open it is.
+    """
+    tree, x = body.tree, np.array(x_world, float, order="C")
+    seen = np.isfinite(x).all(axis=2)
+    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    F, S, n = len(x), len(tree.segments), tree.n_dofs
+    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(seen.shape)
+    _certainties(
+        tree.parents, tree.dof_start, tree.dof_parent, tree.last_dof, tree.chain, tree.depth, tree.prismatic, tree.axes,
+        tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight,
+        posture / np.square(tree.spread), loss.kind, loss.scale, np.ascontiguousarray(Ts_world_root, float),
+        np.ascontiguousarray(angles, float), dof_std, joint_std, factors,
+    )  # fmt: skip
+    return Certainty(dof_std, joint_std, factors)

@@ -32,7 +32,8 @@ from kinefit.tracking.channels import make_channels
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
 from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.markers import known_markers
+from kinefit.tracking.marker_poses import bare
+from kinefit.tracking.placement import known_set
 from kinefit.tracking.subject import Progress, fit_subject
 
 _SIZES = 4  # depth images from which a person's size is found ...
@@ -192,8 +193,8 @@ class FrameSource:
 def _markers(
     markers: Markers, frame: int, sensor: str, body: Body, given: str | None, time: float
 ) -> MarkerFrame:
-    chosen, names = known_markers(body, markers, given)
-    return MarkerFrame(sensor, time, names, markers.positions[frame], chosen)
+    names = tuple(bare(n) for n in markers.names)
+    return MarkerFrame(sensor, time, names, markers.positions[frame], known_set(body, names, given))
 
 
 def _sized(body: Body, take: Take, source: FrameSource, up: NDArray, progress: Progress | None) -> Sized:

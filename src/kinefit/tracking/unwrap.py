@@ -9,6 +9,7 @@ from kinefit.bodies.charts import SIGNS, twin
 from kinefit.bodies.tree import KinematicTree
 
 _TURN = 2.0 * np.pi
+_SMALL = 1.5  # [rad] a step smaller than that, all three angles together, leads to no other form: that is 2 π away
 
 
 def unwrap(tree: KinematicTree, angles: NDArray) -> NDArray:
@@ -51,10 +52,12 @@ def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArr
 def _ball(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
     """Angles (T, 3) of a ball joint, each in the form nearest to the one before, all within limits as far as can be."""
     out = np.array(q)
-    for t in range(1, len(out)):
-        forms = np.stack([out[t], twin(out[t])])
+    jumps = np.flatnonzero(np.abs(np.diff(q, axis=0)).sum(axis=1) > _SMALL) + 1
+    for t, end in zip(jumps, np.append(jumps[1:], len(q)), strict=False):
+        forms = np.stack([q[t], twin(q[t])])
         forms += _TURN * np.round((out[t - 1] - forms) / _TURN)
-        out[t] = forms[np.argmin(np.abs(forms - out[t - 1]).sum(axis=1))]
+        nearer = int(np.argmin(np.abs(forms - out[t - 1]).sum(axis=1)))
+        out[t:end] = forms[nearer] + (SIGNS if nearer else 1.0) * (q[t:end] - q[t])
     whole = []
     for form in (out, np.pi + SIGNS * out):
         finite = np.isfinite(low) & np.isfinite(high)

@@ -1,0 +1,126 @@
+"""Who is who in real takes without labels: single frames and whole takes: `python -m benchmarks.markers_real`.
+
+Labels are removed and the order is shuffled in every frame; what teaches is another take of the subject, or another
+part of the take with a tenth of it between. Settings were chosen on the cases marked "chosen"; the figures are those of
+the others, the table shows all. One was not: that noise is sought no finer than the model's own was found on cases of
+both kinds, so that the figures of single frames are no held-out ones in this. FRAMES frames a case (60).
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.figures import figure
+from benchmarks.marker_takes import CASES, Case, broken, load, shuffled, training
+from kinefit.identification.identify import identify
+from kinefit.identification.learn import learn_model
+from kinefit.identification.model import MarkerModel
+from kinefit.identification.takes import identify_take
+from kinefit.observations import Markers
+
+FRAMES = int(os.environ.get("FRAMES", 60))
+VARIANTS: dict[str, dict[str, Any]] = {"all": {}, "10 % removed": {"missing": 0.1}, "ten ghosts": {"ghosts": 10}}
+
+
+@dataclass(frozen=True)
+class Score:
+    """Shares of the labels that were seen: right, wrong; of those not seen but named: counted as wrong."""
+
+    right: float
+    wrong: float
+    median: float = np.nan
+    slowest: float = np.nan
+
+
+def prepare(case: Case) -> tuple[MarkerModel, Markers] | None:
+    """The model of a case and its take; None where files are absent."""
+    taught, take = training(case), load(case.test)
+    return None if taught is None or take is None else (learn_model(taught), take)
+
+
+def single_frames(
+    model: MarkerModel, take: Markers, frames: int = FRAMES, seed: int = 0, *, missing: float = 0.0, ghosts: int = 0
+) -> Score:
+    """Frames one by one, spread over the take."""
+    rng = np.random.default_rng(seed)
+    right = wrong = seen = 0
+    times = []
+    whole = np.flatnonzero(np.isfinite(take.positions[..., 0]).sum(1) >= 0.5 * take.positions.shape[1])
+    for f in whole[np.unique(np.linspace(0, len(whole) - 1, frames).round().astype(int))]:
+        points, truth = shuffled(take, model.labels, int(f), rng, missing, ghosts)
+        start = time.process_time()
+        found = identify(model, points).assignment
+        times.append(time.process_time() - start)
+        right += int(((found == truth) & (truth >= 0)).sum())
+        wrong += int(((found != truth) & (found >= 0)).sum())
+        seen += int((truth >= 0).sum())
+    return Score(right / seen, wrong / seen, float(np.median(times)), float(np.max(times)))
+
+
+def whole_take(model: MarkerModel, take: Markers, seed: int = 0, **breaking: float) -> Score:
+    """A take whose trajectories are broken; its time is that of one frame."""
+    cut = broken(take, seed, **breaking)
+    column = np.array([take.names.index(n) if n in take.names else -9 for n in model.labels])
+    start = time.process_time()
+    found = identify_take(model, cut.markers)
+    spent = (time.process_time() - start) / len(take)
+    named = np.where(found.column >= 0, cut.truth[np.arange(len(take))[:, None], found.column], -2)
+    seen = (cut.truth[:, :, None] == column).any(1)
+    right, wrong = (named == column) & seen, (found.column >= 0) & (named != column)
+    return Score(float(right.sum() / seen.sum()), float(wrong.sum() / seen.sum()), spent, spent)
+
+
+def table(names: list[str]) -> dict[str, tuple[Case, dict[str, Score]]]:
+    """Print and return all scores: right, wrong [%], median and slowest time of a frame [ms]."""
+    out = {}
+    print(f"{'':28s}  labels in segments | " + " | ".join([*VARIANTS, "whole take, broken"]))
+    for case in CASES:
+        ready = prepare(case) if not names or any(n in case.name for n in names) else None
+        if ready is None:
+            continue
+        model, take = ready
+        scores = {name: single_frames(model, take, **options) for name, options in VARIANTS.items()}
+        scores["whole"] = whole_take(model, take)
+        line = f"{case.name:28s}{'*' if case.chosen else ' '} {len(model):3d} in {len(model.segments):2d}"
+        for s in scores.values():
+            line += f" | {100 * s.right:6.2f} {100 * s.wrong:5.2f} {1e3 * s.median:4.0f}/{1e3 * s.slowest:5.0f}"
+        print(line, flush=True)
+        out[case.name] = case, scores
+    return out
+
+
+def run(names: list[str] | None = None) -> None:
+    """Print every figure of real takes; settings were chosen on the cases with a star, which do not count."""
+    rows = [row for row in table(names or []).values() if row[0].full and not row[0].chosen]
+    reason = "" if rows else "no recordings"
+
+    def least(kind: str) -> float | None:
+        return min((100 * s[kind].right for _, s in rows), default=None)
+
+    def most_wrong(kind: str) -> float | None:
+        return max((100 * s[kind].wrong for _, s in rows), default=None)
+
+    moved = [100 * s["all"].right for case, s in rows if case.exercised]
+    mean = float(np.mean(moved)) if moved else None
+    figure("markers.real.single.least", least("all"), "% right", ">= 98.5", reason)
+    figure("markers.real.single.mean", mean, "% right", ">= 99.5", reason)
+    figure("markers.real.single.wrong", most_wrong("all"), "%", "<= 0.2", reason)
+    figure("markers.real.removed.least", least("10 % removed"), "% right", ">= 97", reason)
+    figure("markers.real.ghosts.least", least("ten ghosts"), "% right", ">= 98", reason)
+    figure("markers.real.whole.least", least("whole"), "% right", ">= 99.9", reason)
+    figure("markers.real.whole.wrong", most_wrong("whole"), "%", "<= 0.2", reason)
+    large = [s["all"].slowest for case, s in rows if case.name == "clusters 61"]
+    figure("markers.real.clusters61", 1e3 * large[0] if large else None, "ms a frame, slowest", "<= 200", reason)
+
+
+if __name__ == "__main__":
+    run(sys.argv[1:])

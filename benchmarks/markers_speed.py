@@ -1,0 +1,86 @@
+"""Time of identification and fitting together, and of a large set's frames: `python -m benchmarks.markers_speed`.
+
+Time is the processor's of one core, so that what else a machine does is not counted; compiled kernels are there.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.figures import figure
+from benchmarks.marker_takes import broken, load, shuffled
+from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
+from kinefit.identification.model import MarkerModel
+
+LARGE = "nimblephysics/data__osim__WeirdFormatTests__markers.trc"
+"""61 markers, most of them in clusters."""
+
+FRAMES = 20
+
+
+def run() -> None:
+    """Print every figure."""
+    large_set()
+    whole_take()
+
+
+def large_set() -> None:
+    """Frames of a take of 61 markers one by one, a model learnt from the take's other part; then with 20 ghosts."""
+    taught, asked = load((LARGE, 0.0, 0.45)), load((LARGE, 0.55, 1.0))
+    for name, ghosts in (("markers_large_61", 0), ("markers_large_61_ghosts_20", 20)):
+        if taught is None or asked is None:
+            figure(name, None, "ms a frame, slowest", "<= 200", "the recording is absent")
+            continue
+        model, rng = learn_model(taught), np.random.default_rng(0)
+        identify(model, shuffled(asked, model.labels, 0, rng)[0])  # compiled
+        times, right, seen = [], 0, 0
+        for f in np.unique(np.linspace(0, len(asked) - 1, FRAMES).astype(int)):
+            points, truth = shuffled(asked, model.labels, int(f), rng, ghosts=ghosts)
+            start = time.process_time()
+            found = identify(model, points).assignment
+            times.append(1e3 * (time.process_time() - start))
+            right += int(((found == truth) & (truth >= 0)).sum())
+            seen += int((truth >= 0).sum())
+        print(f"# {len(model)} markers: median {np.median(times):.0f} ms, {100 * right / seen:.1f} % of labels right")
+        figure(name, max(times), "ms a frame, slowest", "<= 200")
+
+
+def whole_take() -> None:
+    """60 s at 120 Hz of 41 markers, a break dancer's take forwards and backwards, its trajectories broken."""
+    file = "mocaprecovery/data__85_12.c3d"
+    taught, take = load((file, 0.0, 0.45)), load((file, 0.0, 1.0))
+    if taught is None or take is None:
+        figure("markers_60s", None, "s", "<= 30", "the recording is absent")
+        return
+    x = np.concatenate([take.positions, take.positions[::-1]])[:7200]
+    labelled = replace(take, positions=x, residual=None)
+    model = learn_model(taught)
+    both(model, broken(replace(labelled, positions=x[:240])).markers)  # compiled
+    points = broken(labelled).markers
+    wall, start = time.perf_counter(), time.process_time()
+    named = both(model, points)
+    spent, wall = time.process_time() - start, time.perf_counter() - wall
+    print(f"# 60 s: {len(points)} frames of {len(labelled.names)} markers in {len(points.names)} columns")
+    print(f"# identified in {named:.1f} s, fitted in {spent - named:.1f} s; {wall:.1f} s by the clock on the wall")
+    figure("markers_60s", spent, "s", "<= 30")
+
+
+def both(model: MarkerModel, points: Markers) -> float:
+    """Points to labels to angles; seconds of the processor until they had labels."""
+    start = time.process_time()
+    labelled = identify_take(model, points).markers(points)
+    named = time.process_time() - start
+    subject = fit_marker_subject(load_body("humanoid"), labelled)
+    fit_markers(subject.body, labelled, subject.marker_set, sigma=subject.sigma)
+    return named
+
+
+if __name__ == "__main__":
+    run()

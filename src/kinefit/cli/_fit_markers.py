@@ -1,0 +1,113 @@
+"""What `kinefit markers fit` does: a marker file onto a body, and the results in every format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from kinefit.bodies import Body, PointSet, load_body
+from kinefit.cli import _results
+from kinefit.cli._screen import Step
+from kinefit.errors import ExportError
+from kinefit.motion import Motion, rotation_between_up
+from kinefit.tracking.marker_subject import MarkerSubject
+
+FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
+"""Formats that are written where none are named."""
+
+_MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
+
+
+def fit_file(
+    path: str | PathLike[str],
+    body: Body | str | PathLike[str] = "humanoid",
+    out: str | PathLike[str] | None = None,
+    *,
+    static: str | PathLike[str] | None = None,
+    marker_set: str | None = None,
+    height: float | None = None,
+    unit: str | None = None,
+    up: str | None = None,
+    limits: bool = True,
+    formats: Iterable[str] = FORMATS,
+    step: Step | None = None,
+) -> dict[str, tuple[Motion, dict[str, Path]]]:
+    """Fit a file of labelled markers and write what was found.
+
+    Parameters
+    ----------
+    path : C3D or TRC file with labels; several people bear their names as prefixes ("Anna:LASI").
+    body : Body, a name of the catalogue or a body file: generic, it is brought to the subject's size.
+    out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
+    static : C3D or TRC file, optional
+        A static trial of the same subject (or several people), from which size and offsets come together with `path`.
+    marker_set : str, optional
+        Name of a marker set or a file of one; default: the one that shares most labels.
+    height : float [m], optional, of the subject, barefoot.
+    unit : str, optional, of files that tell none or a wrong one.
+    up : str, optional, vertical axis of the world where the file does not tell it; default: found from the markers.
+    limits : bool, whether joints stay within their ranges.
+    formats : names of `_results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
+    step : (what, done, total) -> None, told of progress.
+
+    Returns
+    -------
+    person -> (Motion, format -> file); one person without prefix is called "".
+
+    Raises
+    ------
+    KinefitError
+        A file cannot be read or written, too few labels are known, or no frame shows enough: see `fit_markers`.
+    """
+    from kinefit.exporters import write_markers, write_osim
+    from kinefit.readers.markers import read_markers
+    from kinefit.tracking.marker_people import split_people
+    from kinefit.tracking.marker_subject import fit_marker_subject
+    from kinefit.tracking.markers import fit_markers
+
+    step = step or (lambda what, done, total: None)
+    source, formats = Path(path), tuple(formats)
+    folder = Path(out) if out is not None else source.with_name(f"{source.stem}-kinefit")
+    unknown = [name for name in formats if name not in (*_results.NAMES, "markers")]
+    if unknown:
+        raise ExportError(f"no format {unknown[0]!r}", remedy=f"There are: {', '.join(_results.NAMES)}, markers.")
+    _results.check_folder(folder)
+    generic = body if isinstance(body, Body) else load_body(Path(body) if isinstance(body, PathLike) else body)
+    people = split_people(read_markers(source, unit=unit))
+    trials = split_people(read_markers(static, unit=unit)) if static else {}
+    found: dict[str, tuple[Motion, dict[str, Path]]] = {}
+    for person, markers in people.items():
+        trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
+        subject = fit_marker_subject(
+            generic, [markers] if trial is None else [trial, markers], marker_set, height=height, progress=step
+        )
+        motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=limits, up=up)
+        files: dict[str, Path] = {}
+        own = folder / person if len(people) > 1 else folder
+        plain = [name for name in formats if name not in ("markers", "osim")]
+        _results.write_results(motion, own, plain, step, files)
+        if "osim" in formats:
+            write_osim(wearing(subject), own / _results.NAMES["osim"])
+            files["osim"] = own / _results.NAMES["osim"]
+        if "markers" in formats:
+            R = rotation_between_up(motion.up, "y")
+            write_markers(replace(markers, positions=markers.positions @ R.T, up="y"), own / _MARKERS, unit="m")
+            files["markers"] = own / _MARKERS
+        found[person] = motion, files
+    return found
+
+
+def wearing(subject: MarkerSubject) -> Body:
+    """The subject's body with its markers among the landmarks, so that a model of it has them in its marker set."""
+    body, points = subject.body, subject.points
+    new = [k for k, name in enumerate(points.names) if name not in body.landmarks.names]
+    both = PointSet(
+        body.landmarks.names + tuple(points.names[k] for k in new),
+        np.concatenate([body.landmarks.segments, points.segments[new]]),
+        np.concatenate([body.landmarks.points, points.points[new]]),
+    )
+    return replace(body, landmarks=both)

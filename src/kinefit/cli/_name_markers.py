@@ -1,0 +1,152 @@
+"""What `kinefit markers learn` and `identify` do with files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from kinefit.cli._screen import Step
+from kinefit.errors import ObservationError
+from kinefit.identification.files import load_model
+from kinefit.identification.from_frame import model_from_frame
+from kinefit.identification.gate import Finding, training_gate
+from kinefit.identification.learn import learn_model
+from kinefit.identification.marker_sets import find_marker_set, load_marker_set
+from kinefit.identification.model import MarkerModel
+from kinefit.identification.people import identify_people, one_after_the_other
+from kinefit.identification.takes import TakeIdentification, TakeSettings
+from kinefit.observations import Markers
+
+
+def learn_files(
+    paths: Sequence[str | PathLike[str]], *, name: str | None = None, marker_set: str | None = None,
+    frame: int | None = None, unit: str | None = None,
+) -> tuple[MarkerModel, list[Finding]]:
+    """A subject's model from labelled files, or from one frame of the first; and what the training leaves open.
+
+    Parameters
+    ----------
+    name : of the subject, default: the first file's
+    marker_set : of the catalogue, or a file of one; "" for none; default: the one that knows most labels
+    frame : number of a frame counted from 0; -1: the one that shows most markers
+
+    Raises
+    ------
+    KinefitError
+        A file cannot be read, its labels do not fit the marker set, or no frame shows enough.
+    """
+    from kinefit.readers.markers import read_markers
+
+    markers = one_after_the_other([read_markers(path, unit=unit) for path in paths])
+    name = name or Path(paths[0]).stem
+    if frame is None:
+        model = learn_model(markers, name=name, template=marker_set)
+        return model, training_gate(markers, model)
+    known = load_marker_set(marker_set) if marker_set else find_marker_set(markers.names)
+    if known is None:
+        raise ObservationError(
+            "no marker set of the catalogue knows the labels", file=str(paths[0]),
+            remedy="Name one (--set), or learn from a take in which all joints move.",
+        )
+    if not -1 <= frame < len(markers):
+        problem = f"no frame {frame}: there are {len(markers)}"
+        raise ObservationError(problem, file=str(paths[0]), remedy="Count from 0.")
+    chosen = int(np.argmax(np.isfinite(markers.positions[..., 0]).sum(1))) if frame < 0 else frame
+    model = model_from_frame(markers.positions[chosen], markers.names, known, name=name)
+    shown = replace(markers, positions=markers.positions[chosen : chosen + 1], residual=None)
+    return model, training_gate(shown, model)
+
+
+def identify_file(
+    path: str | PathLike[str],
+    model: MarkerModel | str | PathLike[str] | Sequence[MarkerModel | str | PathLike[str]],
+    out: str | PathLike[str] | None = None,
+    *,
+    settings: TakeSettings | None = None,
+    unit: str | None = None,
+    rest: bool = False,
+    step: Step | None = None,
+) -> tuple[Markers, dict[str, TakeIdentification], dict[str, Path]]:
+    """Name the markers of a file and write it with labels, with a table of doubtful frames beside it.
+
+    Parameters
+    ----------
+    path : C3D or TRC file; its labels, if it has any, are not looked at
+    model : of the subject, or a file of it
+        Several for several subjects, whose labels then bear their names ("Anna:C7").
+    out : .c3d or .trc, default beside the file: NAME-named with the same ending. A C3D of a C3D keeps its analog
+        channels and parameters.
+    unit : of files that tell none or a wrong one
+    rest : whether points that are nobody's are kept, as "*1", "*2" ...
+
+    Returns
+    -------
+    the labelled markers, name of the subject -> TakeIdentification, "markers" and "doubts" -> file
+
+    Raises
+    ------
+    KinefitError
+        A file cannot be read or written, or no subject is found.
+    """
+    from kinefit.exporters import write_markers
+    from kinefit.exporters._atomic import write_text
+    from kinefit.readers.markers import read_markers
+
+    source = Path(path)
+    target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
+    given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
+    models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
+    markers = read_markers(source, unit=unit)
+    found = identify_people(models, markers, settings=settings, progress=step)
+    labelled = _together(models, found, markers, rest)
+    both_c3d = source.suffix.lower() == target.suffix.lower() == ".c3d"
+    write_markers(labelled, target, like=source if both_c3d else None)
+    doubts = target.with_name(f"{target.stem}-doubts.csv")
+    named = {m.name: f for m, f in zip(models, found, strict=True)}
+    write_text(doubts, _doubts(named, markers, len(models) > 1))
+    return labelled, named, {"markers": target, "doubts": doubts}
+
+
+def _together(models: list[MarkerModel], found: list[TakeIdentification], markers: Markers, rest: bool) -> Markers:
+    """One take of all subjects; with `rest` the points of nobody."""
+    parts = [f.markers(markers) for f in found]
+    if len(models) > 1:
+        for i, model in enumerate(models):
+            parts[i] = replace(parts[i], names=tuple(_prefixed(model.name, n) for n in parts[i].names))
+    names = tuple(n for p in parts for n in p.names)
+    positions = np.concatenate([p.positions for p in parts], axis=1)
+    residual = None
+    if markers.residual is not None:
+        residual = np.concatenate([np.asarray(p.residual) for p in parts], axis=1)
+    if rest:
+        left = np.array(markers.positions)
+        for f in found:
+            frame, m = np.nonzero(f.column >= 0)
+            left[frame, f.column[frame, m]] = np.nan
+        keep = np.flatnonzero(np.isfinite(left[..., 0]).any(0))
+        names += tuple(f"*{i + 1}" for i in range(len(keep)))
+        positions = np.concatenate([positions, left[:, keep]], axis=1)
+        if residual is not None and markers.residual is not None:
+            residual = np.concatenate([residual, markers.residual[:, keep]], axis=1)
+    return replace(markers, names=names, positions=positions, residual=residual)
+
+
+def _prefixed(name: str, label: str) -> str:
+    return f"{name}:{label.rpartition(':')[2]}"
+
+
+def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> str:
+    """Doubtful frames as CSV, worst first; frames as the file counts them."""
+    rows = sorted((d.confidence, d.first, name, d) for name, f in found.items() for d in f.doubts)
+    lines = ["first_frame,last_frame,first_time,last_time,label,kind,confidence"]
+    for _, _, name, d in rows:
+        label = _prefixed(name, d.label) if many else d.label
+        lines.append(
+            f"{d.first + markers.first_frame},{d.last + markers.first_frame},{d.first / markers.rate:.3f},"
+            f"{d.last / markers.rate:.3f},{label},{d.kind},{d.confidence:.3f}"
+        )
+    return "\n".join(lines) + "\n"

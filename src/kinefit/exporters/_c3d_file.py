@@ -1,0 +1,116 @@
+"""C3D files as they lie on disk, for writing: header, parameter groups, points and analog samples.
+
+Format: C3D User Guide, Motion Lab Systems, 2008. Little-endian, coordinates and samples as 32-bit floats.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+
+Value = Sequence[str] | NDArray
+Groups = Mapping[str, Mapping[str, Value]]
+
+MOST = 65535
+"""What an unsigned word counts to: points, and frames in the header (beyond which the group TRIAL counts)."""
+
+_BLOCK, _INTEL = 512, 84
+_CHARS, _BYTES, _INTEGERS, _REALS = -1, 1, 2, 4  # kinds of parameters
+_LONGEST = 255  # entries along one dimension, and characters of one text
+
+
+def c3d_bytes(
+    points: NDArray, fourth: NDArray, groups: Groups, *, scale: float, rate: float, first: int,
+    analog: NDArray | None = None, samples: int = 1,
+) -> bytes:
+    """A whole file.
+
+    Parameters
+    ----------
+    points : (F, N, 3) in the file's unit; fourth : (F, N) residual and cameras as the format packs them, -1 unseen.
+    groups : {"POINT": {"UNITS": ["mm"], ...}, ...}; POINT's USED, SCALE, RATE, FRAMES, DATA_START and TRIAL are added.
+    scale : negative, as floats have it; its size is the unit of residuals.
+    rate : float [Hz]; first : number of the first frame.
+    analog : (F, C) raw samples of every frame, channel by channel for each of `samples` times.
+    """
+    frames, count = points.shape[:2]
+    last = first + frames - 1
+    channels = 0 if analog is None else analog.shape[1]
+    point: dict[str, Value] = {
+        "USED": np.array(count, np.uint16), "SCALE": np.array(scale, np.float32), "RATE": np.array(rate, np.float32),
+        "FRAMES": np.array(min(frames, MOST), np.uint16), "DATA_START": np.array(0, np.uint16),
+    }  # fmt: skip
+    trial: dict[str, Value] = {
+        f"ACTUAL_{end}_FIELD": np.array([number % 65536, number // 65536], np.uint16)
+        for end, number in (("START", first), ("END", last))
+    }
+    whole: dict[str, dict[str, Value]] = {name: dict(values) for name, values in groups.items()}
+    whole["POINT"] = point | whole.get("POINT", {})
+    whole["TRIAL"] = trial | {k: v for k, v in whole.get("TRIAL", {}).items() if k not in trial}
+    blocks = -(-len(_parameters(whole, 0)) // _BLOCK)
+    if blocks > 255:
+        raise ExportError(f"{blocks} blocks of parameters, 255 are what C3D can hold", remedy="Use fewer labels.")
+    whole["POINT"]["DATA_START"] = np.array(2 + blocks, np.uint16)
+    table = np.concatenate([points, fourth[..., None]], axis=2).astype("<f4").reshape(frames, -1)
+    if analog is not None:
+        table = np.concatenate([table, analog.astype("<f4")], axis=1)
+    clipped = (min(first, MOST), min(last, MOST))
+    head = struct.pack(
+        "<BBHHHHHfHHf", 2, 0x50, count, channels, *clipped, 10, scale, 2 + blocks, samples if channels else 1, rate
+    )
+    data = table.tobytes()
+    counted = frames <= MOST  # some readers count more frames than the header can by the file's length
+    return head.ljust(_BLOCK, b"\0") + _padded(_parameters(whole, blocks)) + (_padded(data) if counted else data)
+
+
+def label_groups(labels: Sequence[str], about: Sequence[str]) -> dict[str, Value]:
+    """LABELS, LABELS2 ... and DESCRIPTIONS: no list holds more than 255."""
+    out: dict[str, Value] = {}
+    for k in range(0, len(labels), _LONGEST):
+        suffix = str(k // _LONGEST + 1) if k else ""
+        out[f"LABELS{suffix}"] = labels[k : k + _LONGEST]
+        out[f"DESCRIPTIONS{suffix}"] = about[k : k + _LONGEST]
+    return out
+
+
+def screens(up: str) -> dict[str, Value]:
+    """X_SCREEN and Y_SCREEN of a world whose vertical axis is `up`."""
+    sign, vertical = ("-", up[1:]) if up.startswith("-") else ("+", up)
+    across = "xyz"[("xyz".index(vertical) + 1) % 3]
+    return {"X_SCREEN": [f"+{across.upper()}"], "Y_SCREEN": [f"{sign}{vertical.upper()}"]}
+
+
+def _padded(data: bytes) -> bytes:
+    return data + bytes(-len(data) % _BLOCK)
+
+
+def _parameters(groups: Groups, blocks: int) -> bytes:
+    """The parameter section, which takes so many blocks."""
+    out = bytes([1, 0x50, blocks % 256, _INTEL])
+    for number, (name, parameters) in enumerate(groups.items(), 1):
+        out += _record(name, -number, b"\0")
+        for label, value in parameters.items():
+            out += _record(label, number, _coded(value) + b"\0")
+    return out + bytes(2)
+
+
+def _record(name: str, group: int, content: bytes) -> bytes:
+    """One group or parameter: lengths, name, way to the next record, content."""
+    short = name.encode("latin-1", errors="replace")[:127]
+    return struct.pack("<bb", len(short), group) + short + struct.pack("<H", 2 + len(content)) + content
+
+
+def _coded(value: Value) -> bytes:
+    if not isinstance(value, np.ndarray):
+        coded = [text.encode("utf-8")[:_LONGEST] for text in value]
+        width = max(map(len, coded), default=0)
+        cells = b"".join(text.ljust(width) for text in coded)
+        return struct.pack("<b", _CHARS) + bytes([2, width, len(coded)]) + cells
+    kind = _REALS if value.dtype.kind == "f" else _BYTES if value.dtype.itemsize == 1 else _INTEGERS
+    array = value.astype({_REALS: "<f4", _BYTES: "i1", _INTEGERS: "<i2"}[kind])
+    return struct.pack("<b", kind) + bytes([value.ndim, *value.shape]) + array.tobytes(order="F")

@@ -1,0 +1,1 @@
+"""Unlabelled markers: who is who (P5)."""

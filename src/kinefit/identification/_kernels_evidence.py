@@ -1,0 +1,155 @@
+"""Rigid fits of a few points, and how likely points are whatever their pose: numba."""
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+
+_HALF_LOG = 1.5 * math.log(2 * math.pi)
+_TURNS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
+_FLAT = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
+
+
+@jit
+def largest_quaternion(N, q):
+    """q: unit eigenvector (w, x, y, z) of the largest eigenvalue of the symmetric 4 x 4 N (Jacobi; N is destroyed)."""
+    V = np.eye(4)
+    for _ in range(12):
+        off = 0.0
+        for i in range(3):
+            for j in range(i + 1, 4):
+                off += N[i, j] * N[i, j]
+        if off <= 1e-30 * (N[0, 0] ** 2 + N[1, 1] ** 2 + N[2, 2] ** 2 + N[3, 3] ** 2):
+            break
+        for i in range(3):
+            for j in range(i + 1, 4):
+                if N[i, j] == 0.0:
+                    continue
+                theta = (N[j, j] - N[i, i]) / (2 * N[i, j])
+                t = 1 / (abs(theta) + math.sqrt(theta * theta + 1))
+                t = t if theta >= 0 else -t
+                c = 1 / math.sqrt(t * t + 1)
+                s = t * c
+                for k in range(4):
+                    a, b = N[k, i], N[k, j]
+                    N[k, i], N[k, j] = c * a - s * b, s * a + c * b
+                for k in range(4):
+                    a, b = N[i, k], N[j, k]
+                    N[i, k], N[j, k] = c * a - s * b, s * a + c * b
+                for k in range(4):
+                    a, b = V[k, i], V[k, j]
+                    V[k, i], V[k, j] = c * a - s * b, s * a + c * b
+    best = 0
+    for i in range(1, 4):
+        best = i if N[i, i] > N[best, best] else best
+    for k in range(4):
+        q[k] = V[k, best]
+
+
+@jit
+def rigid(n, x, y, w, R, t, H):
+    """Weighted rigid motion of x[:n] onto y[:n] by proper rotations: Σ w |y - R x - t|².
+
+    Fills R, t and H = Σ w (|x|² I - x xᵀ) about the weighted centroid, in the frame of x.
+    """
+    total = 0.0
+    a, b = np.zeros(3), np.zeros(3)
+    for i in range(n):
+        total += w[i]
+        for k in range(3):
+            a[k] += w[i] * x[i, k]
+            b[k] += w[i] * y[i, k]
+    a /= total
+    b /= total
+    S = np.zeros((3, 3))
+    H[:] = 0.0
+    for i in range(n):
+        x0, x1, x2 = x[i, 0] - a[0], x[i, 1] - a[1], x[i, 2] - a[2]
+        for k in range(3):
+            d = w[i] * (y[i, k] - b[k])
+            S[0, k] += x0 * d
+            S[1, k] += x1 * d
+            S[2, k] += x2 * d
+        H[0, 0] += w[i] * (x1 * x1 + x2 * x2)
+        H[1, 1] += w[i] * (x0 * x0 + x2 * x2)
+        H[2, 2] += w[i] * (x0 * x0 + x1 * x1)
+        H[0, 1] -= w[i] * x0 * x1
+        H[0, 2] -= w[i] * x0 * x2
+        H[1, 2] -= w[i] * x1 * x2
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    N = np.empty((4, 4))
+    N[0, 0] = S[0, 0] + S[1, 1] + S[2, 2]
+    N[1, 1] = S[0, 0] - S[1, 1] - S[2, 2]
+    N[2, 2] = S[1, 1] - S[0, 0] - S[2, 2]
+    N[3, 3] = S[2, 2] - S[0, 0] - S[1, 1]
+    N[0, 1] = N[1, 0] = S[1, 2] - S[2, 1]
+    N[0, 2] = N[2, 0] = S[2, 0] - S[0, 2]
+    N[0, 3] = N[3, 0] = S[0, 1] - S[1, 0]
+    N[1, 2] = N[2, 1] = S[0, 1] + S[1, 0]
+    N[1, 3] = N[3, 1] = S[2, 0] + S[0, 2]
+    N[2, 3] = N[3, 2] = S[1, 2] + S[2, 1]
+    q = np.empty(4)
+    largest_quaternion(N, q)
+    qw, qx, qy, qz = q[0], q[1], q[2], q[3]
+    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
+    R[1, 0], R[1, 1], R[1, 2] = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
+    R[2, 0], R[2, 1], R[2, 2] = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    rss = 0.0
+    for k in range(3):
+        t[k] = b[k] - R[k, 0] * a[0] - R[k, 1] * a[1] - R[k, 2] * a[2]
+    for i in range(n):
+        for k in range(3):
+            e = y[i, k] - t[k] - R[k, 0] * x[i, 0] - R[k, 1] * x[i, 1] - R[k, 2] * x[i, 2]
+            rss += w[i] * e * e
+    return rss
+
+
+@jit
+def evidence(n, x, y, sigma, work):
+    """-log of the density of n points of a rigid segment, its place and turn integrated out; and the weighted squares.
+
+    ∫∫ Π N(y; R x + t, σ²) dt dR = Π (2πσ²)^-3/2 (2π/W)^3/2 (2π)^3/2 det(H)^-1/2 / 8π² exp(-rss/2), W = Σ 1/σ².
+    """
+    if n == 0:
+        return 0.0, 0.0
+    R, t, H, w = work[0:3], work[3], work[4:7], work[7:].reshape(-1)
+    total, cost = 0.0, 0.0
+    for i in range(n):
+        w[i] = 1 / (sigma[i] * sigma[i])
+        total += w[i]
+        cost += _HALF_LOG + 3 * math.log(sigma[i])
+    rss = 0.0
+    if n > 1:
+        rss = rigid(n, x, y, w, R, t, H)
+        a, b, c = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT
+        d, e, f = H[0, 1], H[0, 2], H[1, 2]
+        det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+        turn = _TURNS + 0.5 * math.log(det if det > 1e-12 else 1e-12)
+        cost += turn if turn > 0.0 else 0.0
+    return 0.5 * rss + cost - _HALF_LOG + 1.5 * math.log(total), rss
+
+
+@jit
+def place_joint(n, x, y, sigma, joint, out):
+    """out: where a segment's fit puts a joint [m]; returns the variance of that per coordinate [m²], averaged."""
+    R, t, H, w = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(n)
+    total = 0.0
+    for i in range(n):
+        w[i] = 1 / (sigma[i] * sigma[i])
+        total += w[i]
+    rigid(n, x, y, w, R, t, H)
+    r = np.empty(3)
+    for k in range(3):
+        out[k] = t[k] + R[k, 0] * joint[0] + R[k, 1] * joint[1] + R[k, 2] * joint[2]
+        r[k] = joint[k]
+        for i in range(n):
+            r[k] -= w[i] * x[i, k] / total
+    a, b, c, d, e, f = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT, H[0, 1], H[0, 2], H[1, 2]
+    det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    i00, i11, i22 = b * c - f * f, a * c - e * e, a * b - d * d
+    i01, i02, i12 = e * f - d * c, d * f - b * e, d * e - a * f
+    square = r[0] ** 2 + r[1] ** 2 + r[2] ** 2
+    inner = r[0] ** 2 * i00 + r[1] ** 2 * i11 + r[2] ** 2 * i22
+    inner += 2 * (r[0] * r[1] * i01 + r[0] * r[2] * i02 + r[1] * r[2] * i12)
+    return 1 / total + (square * (i00 + i11 + i22) - inner) / (3 * det)

@@ -1,0 +1,244 @@
+"""Marker sets: which labels belong to which segment, where on a body, and where segments meet."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError, choices
+
+FEWEST = 4
+"""Labels that a set and a take must have in common, and half of the take's or the set's: fewer agree by chance."""
+
+GIVE = 0.004
+"""[m] give of a marker where the set does not tell."""
+
+RANGE = 1.5
+"""[rad] range of a joint where the set does not tell."""
+
+_Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SetSegment:
+    """A segment of a marker set.
+
+    Parameters
+    ----------
+    name : str
+    parent : int, index of its parent, -1 for the root
+    markers : labels that move with it; a label may be in two segments that meet there
+    joint : (3,) [m] where it meets its parent, in the frame of the set's places; None for the root
+    give : (k,) [m]
+        How far each of its markers strays from the segment along one axis in vigorous motion: skin, soft parts. The
+        catalogue's are medians over seven takes of six subjects; a distance gives by both of its ends.
+    range : float [rad]
+        How far its joint turns at most, about any one axis, in vigorous motion.
+    """
+
+    name: str
+    parent: int
+    markers: tuple[str, ...]
+    joint: NDArray | None = None
+    give: tuple[float, ...] = ()
+    range: float = RANGE
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSet:
+    """Labels, their places on an average body, segments.
+
+    Parameters
+    ----------
+    name : str
+    labels : (K,)
+    places : (K, 3) [m]
+        On a body of 1.75 m standing upright with hanging arms, palms forward: x forward, y up, z to the right, from
+        the middle of the hips. NaN where the set leaves it to the laboratory (markers of a cluster).
+    segments : SetSegment, parents before children
+    also : other names of the set
+    computed : labels that are no markers but computed points (joint centres); they are left out everywhere
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    places: NDArray
+    segments: tuple[SetSegment, ...]
+    also: tuple[str, ...] = ()
+    computed: tuple[str, ...] = ()
+
+    def match(self, labels: Iterable[str]) -> tuple[str | None, ...]:
+        """What the set calls each of a take's labels; None where it does not know it.
+
+        A prefix up to a colon (the subject's name), letter case, and the marks . _ - and blank do not count.
+        """
+        plain = {_plain(name): name for name in self.labels}
+        return tuple(plain.get(_plain(label)) for label in labels)
+
+    def is_computed(self, label: str) -> bool:
+        """Whether a label names a computed point, not a marker."""
+        return _plain(label) in {_plain(c) for c in self.computed}
+
+
+def _plain(label: str) -> str:
+    return "".join(c for c in label.rpartition(":")[2].lower() if c not in "._- ")
+
+
+def marker_set_names() -> tuple[str, ...]:
+    """Names of the marker sets that come with kinefit."""
+    return tuple(sorted(_catalogue()))
+
+
+def load_marker_set(name_or_file: str | PathLike[str]) -> MarkerSet:
+    """A marker set of the catalogue ("CMU_41", "HDM05_41", "PIG" ...), or from a TOML file.
+
+    Raises
+    ------
+    ObservationError
+        Unknown name.
+    FileError
+        A file that cannot be read, or is no marker set: with the place.
+    """
+    name = str(name_or_file)
+    if name.lower().endswith(".toml"):
+        try:
+            text = Path(name_or_file).read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileError(f"cannot read the marker set ({error})", file=name, remedy="Give a TOML file.") from error
+        return _parse(text, name)
+    for found in _catalogue().values():
+        if _plain(name) in {_plain(n) for n in (found.name, *found.also)}:
+            return found
+    raise ObservationError(choices("marker set", name, marker_set_names()), remedy="Or give a file of one (.toml).")
+
+
+def find_marker_set(labels: Iterable[str]) -> MarkerSet | None:
+    """The set of the catalogue that knows most of the labels; None if none knows half of them, or half of its own.
+
+    Of sets that know as many, the one with fewest other labels.
+    """
+    labels = tuple(labels)
+    best, best_key = None, (FEWEST - 1, 0)
+    for found in _catalogue().values():
+        known = sum(n is not None or found.is_computed(label) for label, n in zip(labels, found.match(labels)))
+        key = (known, -len(found.labels))
+        if key > best_key and (2 * known >= len(labels) or 2 * known >= len(found.labels)):
+            best, best_key = found, key
+    return best
+
+
+class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    name: str
+    markers: list[str]
+    parent: str | None = None
+    joint: _Vector | None = None
+    give: float = GIVE
+    loose: dict[str, float] = {}
+    range: float = np.degrees(RANGE)
+
+
+class _File(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    name: str
+    segment: list[_Segment]
+    places: dict[str, _Vector] = {}
+    also: list[str] = []
+    sides: list[tuple[str, str]] = []
+    single: list[str] = []
+    computed: list[str] = []
+
+
+@cache
+def _catalogue() -> dict[str, MarkerSet]:
+    folder = resources.files("kinefit.identification") / "marker_sets"
+    files = sorted((e for e in folder.iterdir() if e.name.endswith(".toml")), key=lambda e: e.name)
+    return {found.name: found for e in files if (found := _parse(e.read_text("utf-8"), e.name))}
+
+
+def _parse(text: str, source: str) -> MarkerSet:
+    try:
+        record = msgspec.convert(tomllib.loads(text), _File)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"not valid TOML ({error})", file=source, remedy="See https://toml.io.") from error
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at `$")
+        remedy = "It has name, sides, [places] [m] and [[segment]] with name, parent, joint [m], markers."
+        place = place.strip(".`")
+        raise FileError(f"not a marker set: {problem}", file=source, place=place or None, remedy=remedy) from error
+    return _built(record, source)
+
+
+def _built(record: _File, source: str) -> MarkerSet:
+    """The set with its left side: labels of `sides`, segments that end in _r; z changes its sign."""
+
+    def mirror(label: str) -> str | None:
+        if label in record.single:
+            return None
+        return next((left + label[len(right):] for right, left in record.sides if label.startswith(right)), None)
+
+    segments: list[SetSegment] = []
+    names: list[str] = []
+    for s in record.segment:
+        right = s.name.endswith("_r") and bool(record.sides)
+        for side in ("_r", "_l") if right else ("",):
+            name = s.name.removesuffix("_r") + side if right else s.name
+            parent = s.parent.removesuffix("_r") + side if right and s.parent and s.parent.endswith("_r") else s.parent
+            give = {label: s.loose.get(label, s.give) for label in s.markers}
+            give |= {m: g for label, g in give.items() if (m := mirror(label)) and m not in give}
+            own = [n for label in s.markers for n in (label, mirror(label)) if n] if side == "" else s.markers
+            own = [m for label in s.markers if (m := mirror(label))] if side == "_l" else list(dict.fromkeys(own))
+            problem, remedy = _wrong(s, name, parent, own, names)
+            if problem:
+                raise FileError(problem, file=source, place=f"segment '{name}'", remedy=remedy)
+            joint = None if s.joint is None else np.array(s.joint) * ([1, 1, -1] if side == "_l" else 1)
+            if own:
+                turn = float(np.radians(s.range))
+                number = -1 if parent is None else names.index(parent)
+                segments.append(SetSegment(name, number, tuple(own), joint, tuple(give[m] for m in own), turn))
+                names.append(name)
+    if not segments:
+        raise FileError("no segment", file=source, remedy="Give at least one [[segment]].")
+    labels = tuple(dict.fromkeys(label for s in segments for label in s.markers))
+    at: dict[str, list[float]] = {}
+    for label, (x, y, z) in record.places.items():
+        at[label] = [x, y, z]
+        if left := mirror(label):
+            at.setdefault(left, [x, y, -z])
+    if unknown := sorted(set(record.places) - set(labels)):
+        raise FileError(
+            f"places of labels that no segment has: {', '.join(unknown)}", file=source, place="places",
+            remedy="Add each to a segment's markers, or leave it out.",
+        )
+    places = np.array([at.get(label, [np.nan] * 3) for label in labels])
+    computed = [n for label in record.computed for n in (label, mirror(label)) if n]
+    return MarkerSet(record.name, labels, places, tuple(segments), tuple(record.also), tuple(dict.fromkeys(computed)))
+
+
+def _wrong(s: _Segment, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
+    """What is wrong with a segment, and what to do; empty if nothing is."""
+    if name in names:
+        return "a segment is there twice", "Give each its own name."
+    if (parent is None) != (not names):
+        return "the first segment is the root; every other has a parent", "Put the root first, children after parents."
+    if parent is not None and parent not in names:
+        return choices("segment", parent, names), "Parents come first."
+    if not s.markers or len(set(own)) < len(own):
+        return "no markers, or one twice", "List each label once."
+    if strangers := sorted(set(s.loose) - set(s.markers)):
+        return f"`loose` names {', '.join(strangers)}, which it does not have", "Give labels of its markers."
+    numbers = [s.give, s.range, *s.loose.values(), *(s.joint or ())]
+    if not np.isfinite(numbers).all() or min(s.give, s.range, *s.loose.values()) <= 0:
+        return "joint, give or range is not finite, or not positive", "Give metres, and degrees for the range."
+    return "", ""

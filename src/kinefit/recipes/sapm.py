@@ -1,0 +1,139 @@
+"""Segment-based articulated point matching, as Holstein and Li print it (P5): candidate tables, then the hierarchy.
+
+For names that can be relied on take `kinefit.identification.identify`; this is the published method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.identification.model import MarkerModel
+from kinefit.recipes._sapm_steps import MANY, candidate_table, coarse_updates, errors, mean_distance, nearest, triples
+
+CORRECTIONS = 3
+"""Matches of a segment that are tried until its children can be found (backward correction)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A model and a frame.
+
+    Parameters
+    ----------
+    epsilon, beta : ε of (2) and (4), β of (3)
+    """
+
+    model: MarkerModel
+    points: NDArray
+    epsilon: float
+    beta: float
+
+    def markers(self, s: int) -> list[int]:
+        """Labels of a segment."""
+        return list(self.model.segments[s])
+
+    def places(self, s: int) -> NDArray:
+        """(k, 3) [m] of the model."""
+        return np.asarray(self.model.reference, float)[self.markers(s)]
+
+
+def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: float = 0.8) -> NDArray:
+    """(M,) int: the point of each label, -1 where none was found (P5 3).
+
+    Parameters
+    ----------
+    points : (N, 3) [m]
+    epsilon : tolerated distortion, as a share of a segment's mean distance; the paper takes 0.10 to 0.15 for people
+    beta : share of a segment's points that a match has more of; the paper takes 0.8 to 0.9
+
+    Raises
+    ------
+    ObservationError
+        Points of the wrong shape or not finite.
+    """
+    at = np.asarray(points, float)
+    if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
+        raise ObservationError(f"points of shape {at.shape}, or not finite", remedy="Give (N, 3) [m] without gaps.")
+    subject = Subject(model, at, epsilon, beta)
+    size = [len(m) for m in model.segments]
+    root = max(range(len(size)), key=lambda s: (size[s], sum(s in (j.parent, j.child) for j in model.joints)))
+    found, broken = identify_below(subject, root, -1, np.full(len(model), -1))
+    for s in broken:  # children of broken chains come last, without a pivot
+        found, _ = identify_below(subject, s, -1, found, alone=True)
+    return found
+
+
+def identify_below(
+    subject: Subject, s: int, parent: int, found: NDArray, alone: bool = False
+) -> tuple[NDArray, list[int]]:
+    """A segment and all below it, depth first; what was found, and segments of chains that broke (P5 3.2).
+
+    A match is confirmed by its children's; where one cannot be found, the segment's next match is tried, and the one
+    with most points wins.
+    """
+    links = [(j.parent + j.child - s) for j in subject.model.joints if s in (j.parent, j.child)]
+    children = [c for c in links if c != parent and not (alone and (found[subject.markers(c)] >= 0).all())]
+    best, best_broken, most = found, children, -1
+    for match in islice(segment_matches(subject, s, parent, found), CORRECTIONS):
+        now, broken = found.copy(), []
+        now[subject.markers(s)] = match
+        for child in children:
+            now, below = identify_below(subject, child, s, now)
+            broken += below
+        if (now >= 0).sum() > most:
+            best, best_broken, most = now, broken, int((now >= 0).sum())
+        if not broken:
+            break
+    return (best, best_broken) if most >= 0 else (found, [s] if not alone else [])
+
+
+def segment_matches(subject: Subject, s: int, parent: int, found: NDArray) -> Iterator[NDArray]:
+    """(k,) each: matches of a segment that hold (2) and (3), from its tables in order of priority (P5 Fig. 1)."""
+    x, epsilon, points = subject.places(s), subject.epsilon, subject.points
+    length, count = mean_distance(x), len(x)
+    known = found[subject.markers(s)]
+    free = ~np.isin(np.arange(len(points)), found[found >= 0])
+    free[known[known >= 0]] = True
+    seen: set[tuple[int, ...]] = set()
+    for tables, model, at in pivots(subject, s, parent, found, free):
+        tables = [t for t in tables if t.filled > subject.beta * len(model)]
+        for table in sorted(tables, key=lambda t: -t.size):
+            update = coarse_updates if count >= MANY else triples
+            for R, t in update(table, model, at, epsilon * length):
+                match = nearest(x, R, t, points, free, 2 * length * epsilon)
+                here = match >= 0
+                if here.sum() < max(min(3, count), 2) or here.sum() <= subject.beta * count or tuple(match) in seen:
+                    continue
+                e, _, _ = errors(x[here], points[match[here]])
+                if e.mean() < epsilon * length and (known < 0).any() | (match == known).any():
+                    seen.add(tuple(match))
+                    yield match
+
+
+def pivots(subject: Subject, s: int, parent: int, found: NDArray, free: NDArray) -> Iterator[tuple]:
+    """Candidate tables of a segment, for one pivot after the other: its joint if known, seen or virtual; else any."""
+    x, points, epsilon = subject.places(s), subject.points, subject.epsilon
+    known = found[subject.markers(s)]
+    at = np.vstack([points, np.zeros(3)])
+    if (known >= 0).any():
+        i = int(np.flatnonzero(known >= 0)[0])
+        yield [candidate_table(x, points, free, i, points[known[i]], known[i], epsilon)], x, at
+        return
+    above = subject.places(parent) if parent >= 0 else np.empty((0, 3))
+    match = found[subject.markers(parent)] if parent >= 0 else np.empty(0, int)
+    if (match >= 0).sum() >= 3:  # a virtual joint
+        joint = next(j for j in subject.model.joints if {j.parent, j.child} == {s, parent})
+        there, here = (joint.in_parent, joint.in_child) if joint.parent == parent else (joint.in_child, joint.in_parent)
+        _, R, t = errors(above[match >= 0], points[match[match >= 0]])
+        at[-1] = R @ there + t
+        model = np.vstack([x, here])
+        yield [candidate_table(model, points, free, len(x), at[-1], -1, epsilon)], model, at
+        return
+    for i in range(max(1, round((1 - subject.beta) * len(x)))):
+        yield [candidate_table(x, points, free, i, points[q], int(q), epsilon) for q in np.flatnonzero(free)], x, at

@@ -1,0 +1,55 @@
+"""Clusters of markers that move together: their mean shape, and its pose in every frame."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
+    """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
+
+
+def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
+    """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
+
+    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where
+    nothing is seen.
+    """
+    prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
+    seen = np.isfinite(y[..., 0])
+    count = np.maximum(seen.sum(1), 1)[:, None]
+    x_all = np.where(seen[..., None], x, 0.0)
+    y_all = np.where(seen[..., None], y, 0.0)
+    x_mid, y_mid = x_all.sum(1) / count, y_all.sum(1) / count
+    a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
+    b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
+    size = (a * a).sum((1, 2))[:, None, None]
+    cross = np.einsum("fki,fkj->fij", b, a) + (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
+    u, _, vt = np.linalg.svd(cross)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    R = u @ vt
+    t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
+    nothing = ~seen.any(1)
+    R[nothing], t[nothing] = np.nan, np.nan
+    return R, t
+
+
+def local(R: NDArray, t: NDArray, y: NDArray) -> NDArray:
+    """(F, k, 3) [m] points y of the world in the frames of a segment."""
+    return np.einsum("fji,fkj->fki", R, y - t[:, None])
+
+
+def shape_of(y: NDArray) -> NDArray:
+    """(k, 3) mean shape of markers that move together, y (F, k, 3), laid onto the frame that shows most of them."""
+    shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
+    shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
+    for _ in range(3):
+        typical = middle(local(*rigid_frames(shape, y), y), axis=0)
+        shape = np.where(np.isfinite(typical), typical, shape)
+    return shape

@@ -1,0 +1,49 @@
+"""What `kinefit markers fit` leaves in a folder."""
+
+import numpy as np
+import pytest
+
+from kinefit import Markers, read_markers, read_motion
+from kinefit.cli._fit_markers import FORMATS, fit_file
+from kinefit.errors import ExportError, FileError
+from kinefit.exporters import write_markers
+from kinefit.simulation import squat_and_wave
+from kinefit.tracking.placement import placement
+
+
+@pytest.fixture(scope="module")
+def two_people(tmp_path_factory):
+    """A C3D of two people with different marker sets in one room."""
+    truth = squat_and_wave(rate=30)
+    sets = [placement(truth.body, name).points for name in ("CMU_41", "PIG")]
+    names = [f"{who}:{n}" for who, points in zip(("Anna", "Bob"), sets, strict=True) for n in points.names]
+    x = [truth.positions(points) + (0, 2.0 * i, 0) for i, points in enumerate(sets)]
+    path = tmp_path_factory.mktemp("people") / "two.c3d"
+    ball = np.ones((len(truth), 1, 3))
+    write_markers(Markers((*names, "Ball:top"), 30.0, np.concatenate([*x, ball], axis=1), up="z"), path)
+    return path
+
+
+def test_every_person_has_a_folder(two_people, tmp_path):
+    found = fit_file(two_people, out=tmp_path)
+    assert list(found) == ["Anna", "Bob"]
+    for person, (motion, files) in found.items():
+        assert set(files) == set(FORMATS)
+        assert all(path.is_file() and path.parent == tmp_path / person for path in files.values())
+        assert len(read_motion(files["motion"])) == len(motion) == 60
+        assert motion.up == "z"
+    away = found["Bob"][0].Ts_world_root[:, :3, 3] - found["Anna"][0].Ts_world_root[:, :3, 3]
+    assert np.abs(away - (0, 2, 0)).max() < 0.05
+    worn = read_markers(found["Anna"][1]["markers"])
+    model = found["Anna"][1]["osim"].read_text()
+    assert "RFWT" in worn.names and all(f'<Marker name="{n}">' in model for n in worn.names if n != "C7")
+    assert np.nanmin(worn.positions[..., 1]) > -0.1  # OpenSim's world: y is up
+    assert np.nanmax(worn.positions[..., 1]) < 2.2
+
+
+def test_what_cannot_be_done_is_told_first(two_people, tmp_path):
+    with pytest.raises(ExportError, match="no format 'xyz'"):
+        fit_file(two_people, out=tmp_path, formats=["xyz"])
+    with pytest.raises(FileError, match="no such file"):
+        fit_file(tmp_path / "none.c3d")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,105 @@
+"""`kinefit markers`: learn, identify, audit and fit, from file to file."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit import Markers, read_markers
+from kinefit.cli import main
+from kinefit.exporters import write_markers
+from kinefit.simulation import squat_and_wave
+from kinefit.tracking.placement import placement
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """labelled.c3d, the same in any order and without labels (points.c3d), with two labels swapped (swapped.c3d)."""
+    out = tmp_path_factory.mktemp("markers")
+    motion = squat_and_wave(rate=30)
+    points = placement(motion.body, "CMU_41").points
+    labelled = Markers(points.names, 30.0, motion.positions(points), up="z", first_frame=11)
+    write_markers(labelled, out / "labelled.c3d")
+    order = np.random.default_rng(0).permutation(len(points))
+    names = tuple(f"*{i + 1}" for i in range(len(points)))
+    write_markers(replace(labelled, names=names, positions=labelled.positions[:, order]), out / "points.c3d")
+    x = np.array(labelled.positions)
+    a, b = labelled.names.index("LKNE"), labelled.names.index("RKNE")
+    x[20:40, [a, b]] = x[20:40, [b, a]]
+    write_markers(replace(labelled, positions=x), out / "swapped.c3d")
+    return out
+
+
+def call(*words):
+    told = CliRunner().invoke(main, ["markers", *map(str, words)])
+    return told.exit_code, told.output
+
+
+@pytest.fixture(scope="module")
+def subject(folder):
+    code, text = call("learn", folder / "labelled.c3d", "-o", folder / "anna.json", "--name", "Anna")
+    assert code == 0, text
+    assert "Anna: 42 markers in" in text
+    assert "Written:" in text
+    return folder / "anna.json"
+
+
+def test_points_get_their_labels_back(folder, subject):
+    code, text = call("identify", folder / "points.c3d", subject)
+    assert code == 0, text
+    truth, named = read_markers(folder / "labelled.c3d"), read_markers(folder / "points-named.c3d")
+    assert set(named.names) == set(truth.names)
+    order = [named.names.index(n) for n in truth.names]
+    off = np.linalg.norm(named.positions[:, order] - truth.positions, axis=-1)
+    assert np.isfinite(off).mean() > 0.99
+    assert np.nanmax(off) < 0.001
+    assert named.first_frame == 11
+    rows = list(csv.DictReader((folder / "points-named-doubts.csv").read_text().splitlines()))
+    assert all(int(r["first_frame"]) >= 11 for r in rows)
+    assert ("doubtful frames: none" in text) == (not rows)
+
+
+def test_learn_from_one_frame(folder, tmp_path):
+    code, text = call("learn", folder / "labelled.c3d", "--frame", 3, "-o", tmp_path / "one.json")
+    assert code == 0, text
+    assert (tmp_path / "one.json").is_file()
+    code, text = call("learn", folder / "labelled.c3d", "--frame", 99999, "-o", tmp_path / "two.json")
+    assert code == 2
+    assert "no frame 99999" in text
+    assert not (tmp_path / "two.json").exists()
+
+
+def test_audit_finds_the_swap(folder):
+    code, text = call("audit", folder / "labelled.c3d", folder / "swapped.c3d", "--strict")
+    assert code == 2
+    assert "labelled.c3d: nothing found" in text
+    assert "LKNE" in text.split("swapped.c3d")[1]
+
+
+@pytest.mark.slow
+def test_fit_of_points_without_names(folder, subject, tmp_path):
+    words = ("--subject", subject, "-o", tmp_path / "out", "--formats", "mot,osim")
+    code, text = call("fit", folder / "points.c3d", *words)
+    assert code == 0, text
+    assert (tmp_path / "out" / "motion.mot").is_file()
+    assert (tmp_path / "out" / "points-named.c3d").is_file()
+
+
+def test_what_is_wrong_is_told(folder, subject, tmp_path):
+    code, text = call("identify", folder / "nothing.c3d", subject)
+    assert code == 2
+    assert "no such file" in text
+    code, text = call("identify", folder / "points.c3d", folder / "labelled.c3d")
+    assert code == 2
+    assert "kinefit markers learn" in text
+    code, text = call("learn", folder / "labelled.c3d", "--no-set", "--frame", 1)
+    assert code == 2
+
+
+@pytest.mark.parametrize("name", ["learn", "identify", "fit", "audit"])
+def test_help_has_examples(name):
+    code, text = call(name, "--help")
+    assert code == 0
+    assert f"kinefit markers {name}" in text
