@@ -43,7 +43,7 @@ _TURN = (6, 5, 3)  # e23, e13, e12
 _SHIFT = (9, 10, 12)  # e1∧e, e2∧e, e3∧e
 _SIGNS = np.array([1.0, -1.0, 1.0])  # I3 ω = ω1 e23 − ω2 e13 + ω3 e12
 _MOTOR = (0, 3, 5, 6, 9, 10, 12, 15)
-_EPSILON = I3 * e  # commutes with motors and has the square 0
+_EPSILON = Multivector((15,), np.ones(1))  # I3 e: commutes with motors and has the square 0
 
 
 def _first(x: ArrayLike, size: int, what: str) -> NDArray:

@@ -256,6 +256,4 @@ def stack(elements: list[Multivector] | tuple[Multivector, ...]) -> Multivector:
 
 
 e1, e2, e3, e, e0 = (Multivector((1 << i,), np.ones(1)) for i in range(5))
-E = e ^ e0
-I3 = e1 ^ e2 ^ e3
-I = I3 ^ E
+I3, E, I = (Multivector((blade,), np.ones(1)) for blade in (7, 24, 31))  # e1∧e2∧e3, e∧e0 and their product

@@ -1,6 +1,7 @@
 """Surfaces of a body's segments: tapered elliptical cylinders and meshes."""
 
 from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
+from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.nearest import Nearest, nearest
 from kinefit.bodies.surfaces.tables import SurfaceTables
@@ -11,6 +12,8 @@ Surface = TaperedCylinder | MeshSurface
 __all__ = [
     "BodyMesh",
     "Box",
+    "FourierCurve",
+    "FourierSurface",
     "MeshSurface",
     "Nearest",
     "Surface",
