@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import figure
 
 _POSES, _LIMBS, _NEAR = 16, 16, 0.1  # [m] a joint this near its true place is found
+_PEOPLE, _NEARLY, _MOST = 20, 0.15, 0.8  # of a start that tracking can go on from, this share of joints is so near [m]
 _UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -20,6 +22,8 @@ def run() -> None:
 
     body = load_body("humanoid10")
     _recovered(body)
+    for name in ("tof", "kinect"):
+        _movements(name)
     _limbs(body)
     _size(body)
 
@@ -104,6 +108,39 @@ def _recovered(body: Any) -> None:
             figure("start_recovered_standing", float(np.mean(rate[0::2])), "of joints", ">= 0.9")
             figure("start_recovered_sitting", float(np.mean(rate[1::2])), "of joints", ">= 0.9")
             figure("start_seconds", float(np.median(spent)), "s CPU", "<= 3")
+
+
+def _movements(sensor: str) -> None:
+    """Twenty people in the midst of ten movements, in a room with a table, as a sensor of that kind sees them."""
+    from kinefit.tracking.depth_start import start_from_points
+
+    found = []
+    for person, state, camera, depth in moving(sensor, _PEOPLE):
+        start = start_from_points(person, None, camera, depth, up=_UP)[0]
+        found.append(np.linalg.norm(joints(person, start.state) - joints(person, state), axis=1))
+    error = np.array(found)
+    good = np.mean(error < _NEARLY, axis=1) >= _MOST
+    figure(f"start_{sensor}", float(np.mean(good)), f"of {len(good)} starts with 80 % of joints to 150 mm", ">= 0.8")
+    figure(f"start_{sensor}_100", float(np.mean(error < _NEAR)), "of joints within 100 mm", ">= 0.8")
+    figure(f"start_{sensor}_150", float(np.mean(error < _NEARLY)), "of joints within 150 mm", ">= 0.8")
+
+
+def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
+    """Body, state, camera and depth image of people of all sizes in movements, every fourth at its beginning."""
+    from kinefit.simulation.movements import MOVEMENTS, movement, people
+    from kinefit.simulation.placing import in_front
+    from kinefit.simulation.scenes import Scene
+    from kinefit.simulation.sensors import DEPTH_SENSORS, measured_depth
+
+    kind, names = DEPTH_SENSORS[sensor], tuple(MOVEMENTS)
+    for k in range(count):
+        crowd = people(seed=k // len(names))
+        person = crowd[(3 * k + k // len(names)) % len(crowd)]
+        truth = movement(names[k % len(names)], person.body, rate=10.0, speed=person.speed)
+        frame = int(np.random.default_rng(1000 + k).integers(len(truth))) if k % 4 else 0
+        camera = in_front(truth, kind.camera(), azimuth=person.azimuth, near=kind.near, far=kind.far)
+        depth = measured_depth(Scene.of(truth, camera), frame, camera, kind, np.random.default_rng([k, frame]))
+        yield person.body, truth.state(frame), camera, depth
 
 
 def _limbs(body: Any) -> None:

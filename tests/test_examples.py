@@ -76,3 +76,10 @@ def test_a_known_motion_without_a_file():
     joints, angles = example("03_known_motion").main(frames=10)
     assert joints.mean() < 12
     assert np.median(angles) < 4
+
+
+def test_a_live_source(capsys):
+    error, tracker = example("04_live_fusion").main(frames=8)
+    assert error < 0.015
+    assert tracker.dropped == tracker.late == 0
+    assert capsys.readouterr().out.count("quality") == 8

@@ -6,8 +6,13 @@ import pytest
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import clean, to_points
+from kinefit.images.depth_noise import denoised
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
 from kinefit.readers.depth import read_depth
+from kinefit.simulation.movements import movement
+from kinefit.simulation.placing import in_front
+from kinefit.simulation.scenes import Scene
+from kinefit.simulation.sensors import KINECT, TOF, measured_depth
 
 CAMERA = Camera("kinect", (320, 240), [[287.5, 0, 159.5], [0, 287.5, 119.5], [0, 0, 1]])
 UP = (0.0, -1.0, 0.0)
@@ -45,6 +50,15 @@ def test_a_tilted_sensor_and_a_wall_alone():
     np.testing.assert_allclose(find_floor(x, up).normal, UP, atol=0.01)
     assert find_floor(to_points(scene(wall=3.0, noise=0.005), CAMERA, step=3), UP) is None
     assert find_floor(x[:50], UP) is None
+
+
+def test_a_floor_that_fills_a_tenth_of_the_image_is_found_whatever_is_drawn():
+    depth = scene(floor=1.35, wall=4.2, noise=0.01)
+    x = to_points(depth, CAMERA, step=3)
+    assert 0.05 < np.mean(x[:, 1] > 1.3) < 0.13
+    for seed in range(5):
+        floor = find_floor(x, UP, seed=seed)
+        np.testing.assert_allclose(floor.normal, UP, atol=0.03)
 
 
 def test_a_body_has_no_floor_in_it(data_dir):
@@ -108,6 +122,23 @@ def test_clusters_join_what_is_near_and_part_what_is_far():
         reach = (reach.astype(int) @ reach) > 0
     assert not (same & ~reach).any()
     assert len(clusters(np.zeros((0, 3)))) == 0
+
+
+@pytest.mark.parametrize("name", ["wave", "sit_down", "shake_hands"])
+@pytest.mark.parametrize("sensor", [TOF, KINECT], ids=lambda sensor: sensor.name)
+def test_a_person_in_a_room_is_found_whatever_the_sensors_noise(name, sensor):
+    motion = movement(name, rate=1.0)
+    camera = in_front(motion, sensor.camera(), near=sensor.near, far=sensor.far)
+    room = Scene.of(motion, camera)
+    for frame in (0, 2):
+        depth = measured_depth(room, frame, camera, sensor, np.random.default_rng(frame))
+        clear = denoised(depth, camera)
+        floor = find_floor(to_points(clear, camera, step=camera.size[0] // 160), (0.0, 1.0, 0.0))
+        np.testing.assert_allclose(floor.normal, (0.0, 1.0, 0.0), atol=0.03)
+        truth = np.isin(room.view(frame, camera).raster.segment, range(len(motion.body.tree.segments))) & (depth > 0)
+        found = people(clear, camera, floor=floor, gap=0.075)
+        overlap = [(blob.mask & truth).sum() / (blob.mask | truth).sum() for blob in found]
+        assert len(found) <= 3 and max(overlap) > 0.85
 
 
 def test_nothing_in_view_is_nobody():

@@ -9,6 +9,11 @@ from tests.tracking.depth_oracle import ARMS, BODY, UP, camera, depth_of, facing
 from kinefit.bodies import BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.images.depth import to_points
+from kinefit.rendering import render_body
+from kinefit.simulation.movements import movement
+from kinefit.simulation.placing import in_front
+from kinefit.simulation.scenes import Scene
+from kinefit.simulation.sensors import TOF, measured_depth
 from kinefit.tracking.depth_start import restart_limb, start_from_points
 
 CAMERA = camera()
@@ -36,6 +41,30 @@ def test_every_start_keeps_the_limits_and_sees_the_whole_body(starts):
     for start in starts:
         assert np.all(start.state.angles >= tree.lower - 1e-9) and np.all(start.state.angles <= tree.upper + 1e-9)
     assert np.all(starts[0].visible > 0.05) and np.all(starts[0].visible <= 1.0)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """A standing person in a room by a table, from a time-of-flight camera: 4 cm of noise, flying pixels, holes."""
+    motion = movement("point", BODY, rate=1.0)
+    camera_tof = in_front(motion, TOF.camera(), near=TOF.near, far=TOF.far)
+    depth = measured_depth(Scene.of(motion, camera_tof), 0, camera_tof, TOF, np.random.default_rng(0))
+    return camera_tof, motion.state(0), depth
+
+
+def test_a_posture_is_found_in_a_time_of_flight_image_of_a_room(noisy):
+    camera_tof, state, depth = noisy
+    start = start_from_points(BODY, None, camera_tof, depth, up=UP, attempts=1)[0]
+    assert np.mean(np.linalg.norm(joints(start.state) - joints(state), axis=1) < 0.15) >= 0.9
+
+
+@pytest.mark.slow
+def test_points_with_the_noise_of_a_time_of_flight_camera_keep_their_outline(noisy):
+    camera_tof, state, depth = noisy
+    silhouette = render_body(BODY, state, camera_tof).depth < np.inf
+    points = to_points(depth, camera_tof, mask=silhouette)
+    start = start_from_points(BODY, points, camera_tof, depth, up=UP)[0]
+    assert np.mean(np.linalg.norm(joints(start.state) - joints(state), axis=1) < 0.15) >= 0.9
 
 
 @pytest.mark.slow

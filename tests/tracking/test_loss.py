@@ -38,6 +38,11 @@ def seen(body, state, camera, noise=0.0, seed=0):
     return (depth + noise * rng.normal(size=depth.shape)).astype(np.float32)
 
 
+def judged(body, state, layers, depth, camera, **settings):
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    return judge_segments(layers.mesh.posed(frames), layers, depth, camera, **settings)
+
+
 def turned(body, state, name, radians):
     """A state with one coordinate turned."""
     delta = np.zeros(body.tree.n_dofs)
@@ -47,7 +52,7 @@ def turned(body, state, name, radians):
 
 def test_truth_is_trusted(scene):
     body, state, camera, layers = scene
-    verdict = judge_segments(body, state, layers, seen(body, state, camera, 0.01), camera, noise=(0.01, 0.0))
+    verdict = judged(body, state, layers, seen(body, state, camera, 0.01), camera, noise=(0.01, 0.0)).evidence
     visible = ~verdict.hidden
     assert visible.sum() >= 0.8 * len(body.tree.segments)
     assert not verdict.lost.any()
@@ -66,7 +71,7 @@ def test_every_limb_put_elsewhere_is_flagged(scene):
         away = np.linalg.norm(layers.mesh.posed(frames) - truth, axis=1)
         count = np.maximum(np.bincount(layers.mesh.segment), 1)
         far = np.bincount(layers.mesh.segment, away) / count > 0.3
-        verdict = judge_segments(body, other, layers, depth, camera)
+        verdict = judged(body, other, layers, depth, camera).evidence
         assert (verdict.lost | verdict.hidden)[far].all(), body.tree.coordinates[d]
         moved += far.sum()
     assert moved >= 4
@@ -76,30 +81,30 @@ def test_what_stands_behind_something_is_hidden_and_not_lost(scene):
     body, state, camera, layers = scene
     depth = seen(body, state, camera)
     depth[:] = np.minimum(depth, 0.8)  # a board before all of it
-    verdict = judge_segments(body, state, layers, depth, camera)
+    verdict = judged(body, state, layers, depth, camera)
     drawn = verdict.counts[:, kernels.OWN] > 0
-    assert verdict.hidden.all() and not verdict.lost.any()
+    assert verdict.evidence.hidden.all() and not verdict.evidence.lost.any()
     assert (verdict.covered[drawn & (verdict.counts[:, 1:].sum(axis=1) > 0)] == 1.0).all()
 
 
 def test_a_body_that_is_not_there_is_lost(scene):
     body, state, camera, layers = scene
     empty = np.full((240, 320), WALL, np.float32)
-    verdict = judge_segments(body, state, layers, empty, camera)
+    verdict = judged(body, state, layers, empty, camera).evidence
     assert (verdict.lost | verdict.hidden).all() and verdict.lost.sum() >= 0.7 * len(verdict.lost)
 
 
 def test_no_measurement_tells_nothing(scene):
     body, state, camera, layers = scene
-    verdict = judge_segments(body, state, layers, np.zeros((240, 320), np.float32), camera)
+    verdict = judged(body, state, layers, np.zeros((240, 320), np.float32), camera).evidence
     assert verdict.hidden.all() and not verdict.lost.any() and not verdict.quality.any()
 
 
 def test_verdicts_of_sensors_add_up(scene):
     body, state, camera, layers = scene
-    clear = judge_segments(body, state, layers, seen(body, state, camera), camera)
-    nothing = judge_segments(body, state, layers, np.zeros((240, 320), np.float32), camera)
-    assert np.array_equal((clear + nothing).supported, clear.supported)
+    clear = judged(body, state, layers, seen(body, state, camera), camera)
+    nothing = judged(body, state, layers, np.zeros((240, 320), np.float32), camera)
+    assert np.array_equal((clear.evidence + nothing.evidence).agreeing, clear.evidence.agreeing)
 
 
 def test_layers_against_plain_numpy():
@@ -120,4 +125,4 @@ def test_layers_against_plain_numpy():
 def test_an_image_of_another_size_is_refused(scene):
     body, state, camera, layers = scene
     with pytest.raises(ObservationError, match="depth image of 160x120"):
-        judge_segments(body, state, layers, np.zeros((120, 160), np.float32), camera)
+        judged(body, state, layers, np.zeros((120, 160), np.float32), camera)

@@ -8,7 +8,7 @@ import pytest
 from kinefit.bodies import BodyState, load_body
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import normal_equations
-from kinefit.tracking.prediction import Prediction, belief
+from kinefit.tracking.prediction import Prediction, belief, forgetting
 
 BODY = load_body("arm")
 N = BODY.tree.n_dofs
@@ -100,3 +100,53 @@ def test_another_chart_goes_on_the_same_way():
     np.testing.assert_allclose(prediction._velocity[7], -velocity[7])
     _, other = prediction.ahead()
     assert np.all(np.linalg.eigvalsh(other) > 0)
+
+
+def carried(*steps, memory=1e9):
+    """State, covariance and velocity after some steps that nothing is measured in."""
+    prediction = a_filter(memory)
+    prediction.start(BODY.usual_state(), np.full(N, 0.1))
+    for _ in range(3):
+        ahead, information = prediction.ahead()
+        prediction.correct(ahead.retract(np.full(N, 0.01)), 0.1 * np.linalg.inv(information))
+    for step in steps:
+        ahead, information = prediction.ahead(step)
+        prediction.correct(ahead, np.linalg.inv(information))
+    return prediction.state, np.linalg.inv(information), prediction.velocity
+
+
+@pytest.mark.parametrize("memory", [1e9, 0.1])
+def test_frames_that_were_dropped_are_gone_over_at_once(memory):
+    (at_once, P, v), (one_by_one, Q, w) = carried(3, memory=memory), carried(1, 1, 1, memory=memory)
+    np.testing.assert_allclose(one_by_one.difference(at_once), 0, atol=1e-12)
+    np.testing.assert_allclose(P, Q, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(v, w, rtol=1e-9)
+
+
+@pytest.mark.parametrize("parts", [(0.5, 0.5), (0.25, 0.75), (0.4, 0.6)])
+def test_parts_of_a_step_make_a_step(parts):
+    (whole, P, v), (pieces, Q, w) = carried(1), carried(*parts)
+    np.testing.assert_allclose(pieces.difference(whole), 0, atol=1e-12)
+    np.testing.assert_allclose(v, w, rtol=1e-9)
+    # The random acceleration holds for a step, so that a step in parts is a little more uncertain.
+    jolt = (np.where(np.arange(N) < 3, 1.0, ACCELERATION) * DT**2) ** 2
+    more = np.diag(Q - P) / jolt
+    assert (more > -1e-9).all() and (more < 1 / 12).all()
+
+
+def test_a_velocity_fades_alike_in_whole_steps_and_in_parts():
+    assert carried(0.5, 0.5, memory=0.05)[2] == pytest.approx(carried(1, memory=0.05)[2])
+
+
+def test_forgetting_is_marginalising():
+    rng = np.random.default_rng(4)
+    A = rng.normal(size=(N, N + 3))
+    information, lost = A @ A.T, rng.random(N) < 0.4
+    out, kept = forgetting(information, lost), ~lost
+    schur = information[np.ix_(kept, kept)] - information[np.ix_(kept, lost)] @ np.linalg.solve(
+        information[np.ix_(lost, lost)], information[np.ix_(lost, kept)]
+    )
+    np.testing.assert_allclose(out[np.ix_(kept, kept)], schur, rtol=1e-6, atol=1e-8)
+    assert not out[lost].any() and not out[:, lost].any()
+    np.testing.assert_allclose(forgetting(information, np.zeros(N, bool)), information, rtol=1e-6, atol=1e-8)
+    assert not forgetting(information, np.ones(N, bool)).any()

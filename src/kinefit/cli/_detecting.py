@@ -92,11 +92,11 @@ def ensure_detections(
 
 
 def with_detections(take: Take, step: _screen.Step) -> Take:
-    """The take with the built-in detector's keypoints where it asks for them, or names none and has videos."""
+    """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
     from kinefit.readers.take import KeypointsEntry
 
     asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
-    videos = any(camera.video for camera in take.cameras)
+    videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo)
     if not asked and (take.keypoints or not videos):
         return take
     files = ensure_detections(take, progress=step)

@@ -79,27 +79,38 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 def write_overlays(
     motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
 ) -> None:
-    """Write an overlay video of every camera that has one, and a picture of all; enter into `files` what is there."""
-    from kinefit.exporters import draw_overlay, write_montage, write_overlay
+    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
+    from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
     from kinefit.exporters.overlay import nearest_frame
     from kinefit.readers.video import Video
 
-    if not seen.videos or seen.rig is None:
+    if not (seen.videos or seen.depth) or seen.rig is None:
         return
     pictures, middle = {}, motion.times[len(motion) // 2]
     for name, path in seen.videos.items():
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
-        with Video(path) as video:
-            shown = min(max(round((middle - offset) * video.rate), 0), len(video) - 1)
-            at = nearest_frame(motion, shown / video.rate + offset)
-            pictures[name] = draw_overlay(video.read(shown), motion, at, seen.rig[name], **given)
-            bar, count = f"overlay {name}", len(video)
+        with Video(path) as colour:
+            shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
+            at = nearest_frame(motion, shown / colour.rate + offset)
+            pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
+            bar, count = f"overlay {name}", len(colour)
             step(bar, 0, count)
             write_overlay(
-                motion, seen.rig[name], video, folder / "overlays" / f"{name}.mp4", time_offset=offset,
+                motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,
                 progress=lambda done: step(bar, done, count), **given,  # noqa: B023
             )  # fmt: skip
+        files["overlays"] = folder / "overlays"
+    for video in seen.depth:
+        camera, shown = seen.rig[video.sensor], video.nearest(float(middle))
+        at = nearest_frame(motion, float(video.times[shown]))
+        pictures[video.sensor] = depth_picture(video.frame(shown).depth, motion, at, camera, label=video.sensor)
+        bar, count = f"overlay {video.sensor}", len(video)
+        step(bar, 0, count)
+        write_depth_overlay(
+            motion, camera, video, folder / "overlays" / f"{video.sensor}.mp4",
+            progress=lambda done: step(bar, done, count),  # noqa: B023
+        )  # fmt: skip
         files["overlays"] = folder / "overlays"
     write_montage(pictures, folder / "montage.png")
     files["montage"] = folder / "montage.png"

@@ -77,6 +77,7 @@ def run(
     take = read_take(path)
     _results.check_folder(out)
     files: dict[str, Path] = {}
+    notes: list[str] = []
     total = 0
     try:
         with _screen.bars() as step:
@@ -87,6 +88,7 @@ def run(
                     take, smooth=smooth, contacts=contacts,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
+                notes.extend(seen.notes)
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
             motion = replace(motion, provenance=provenance(take, **motion.provenance))
@@ -103,6 +105,8 @@ def run(
         if files and isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
         raise
+    for note in notes:
+        _screen.say(f"note: {note}")
     print_summary(motion, points=verbose)
     print_files(files)
     if total:

@@ -121,7 +121,7 @@ def free_space_rows(
         if not (-0.5 < u < width - 0.5 and -0.5 < v < height - 0.5):
             continue
         iu, iv = int(u + 0.5), int(v + 0.5)
-        if not depth[iv, iu] > r20 * x + r21 * y + r22 * z + t2 + tolerance:
+        if not abs(depth[iv, iu]) > r20 * x + r21 * y + r22 * z + t2 + tolerance:
             continue
         gap, gx, gy, gz, g2, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for place in range(2):

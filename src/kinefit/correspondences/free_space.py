@@ -24,7 +24,8 @@ class FreeSpace:
 
     Parameters
     ----------
-    depth : (H, W) [m] along the optical axis, 0 where nothing was measured
+    depth : (H, W) [m]
+        Along the optical axis; 0 where nothing was measured, negative where it is known to be something else's.
     nearest : (h, w) int32, row * w + column of that cell; -1 where the body cannot be in the picture at all
     missing : (h, w) int32, the same among the cells that the body as it stands does not explain; -1 for none
     cell : int [px] width and height of a cell
@@ -50,6 +51,7 @@ class FreeSpace:
         Parameters
         ----------
         depth : (H, W) [m]
+            0 where nothing was measured, negative where it is known to be something else's.
         farthest : float [m]
             What lies farther along the optical axis cannot be the body: the back of its predicted box. What lies
             nearer may hide it, so it counts as a place for it.

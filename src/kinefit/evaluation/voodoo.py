@@ -198,7 +198,8 @@ def fusion_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
 
     tracker = FusionTracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy)
     tracker.start_at(start)
-    return _motion(run, run.truth.body, [tracker.update(seen).state for seen in run.seen(inputs)])
+    found = [tracker.update(seen) for seen in run.seen(inputs)]
+    return _motion(run, run.truth.body, [result.state for result in found if result is not None])
 
 
 METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_method}

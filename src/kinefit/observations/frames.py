@@ -9,6 +9,16 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 
+_FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
+
+
+def _typical(depth: NDArray) -> float:
+    """Median [m] of what was measured in some 300 pixels of an image, 0 where that is nothing."""
+    few = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
+    few.sort()
+    first = int(few.searchsorted(0.0, "right"))
+    return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0
+
 
 def _frozen(array: NDArray, dtype: type) -> NDArray:
     array = np.array(array, dtype=dtype)
@@ -27,6 +37,11 @@ class DepthFrame:
     time : float [s]
     depth : (H, W) float32 [m]
         Along the optical axis; 0 where nothing was measured.
+
+    Raises
+    ------
+    ObservationError
+        No image, or one whose numbers are too large for metres.
     """
 
     sensor: str
@@ -39,7 +54,12 @@ class DepthFrame:
             raise ObservationError(
                 f"a depth image of {self.sensor} has shape {depth.shape}", remedy="Give (height, width) in metres."
             )
-        depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
+        if not (depth.min() >= 0.0 and depth.max() < np.inf):
+            depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
+        typical = _typical(depth)
+        if typical > _FARTHEST:
+            problem = f"millimetres taken for metres? A depth image of {self.sensor} shows things {typical:.0f} m away"
+            raise ObservationError(problem, remedy="Give metres: 0.001 times an image in millimetres.")
         depth.flags.writeable = False
         object.__setattr__(self, "depth", depth)
 
@@ -78,6 +98,12 @@ class PointCloud:
         if points.ndim != 2 or points.shape[1] != 3:
             raise ObservationError(f"a cloud of {self.sensor} has shape {points.shape}", remedy="Give (points, 3).")
         object.__setattr__(self, "points", _frozen(points[np.isfinite(points).all(axis=1)], float))
+        if self.viewpoint is not None:
+            eye = _frozen(self.viewpoint, float)
+            if eye.shape != (3,) or not np.isfinite(eye).all():
+                problem = f"a cloud of {self.sensor} has the viewpoint {self.viewpoint}"
+                raise ObservationError(problem, remedy="Give three numbers in metres, or None.")
+            object.__setattr__(self, "viewpoint", eye)
 
     def __len__(self) -> int:
         return len(self.points)

@@ -41,12 +41,17 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One Gauss-Newton step: the new state, δ (n,), its norm, and the cost before it."""
+    """One Gauss-Newton step: the new state, δ (n,) and its norm, and the equations before it."""
 
     state: BodyState
     delta: NDArray
     norm: float
-    cost: float
+    equations: Equations
+
+    @property
+    def cost(self) -> float:
+        """Of the state before the step."""
+        return self.equations.cost
 
 
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
@@ -93,7 +98,7 @@ def gauss_newton(
             break
         damping *= 100.0
         delta, fall = _step(eq, damping, bounds, held)
-    return Step(state.retract(delta, bounds), delta, float(np.linalg.norm(delta)), eq.cost)
+    return Step(state.retract(delta, bounds), delta, float(np.linalg.norm(delta)), eq)
 
 
 def levenberg_marquardt(

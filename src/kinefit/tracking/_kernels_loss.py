@@ -34,9 +34,9 @@ def add_layer(layer, label, front, behind, owner, counts):
 def judge(front, behind, owner, depth, across, down, focal, slack, constant, quadratic, counts):
     """Count every segment's foremost pixels by what was measured there.
 
-    depth (H, W) [m], 0 for none, `across` and `down` times as wide and high as front, behind and owner (h, w); a
-    measurement agrees within slack + constant + quadratic z² [m], at the pixel or at one of four that are `slack`
-    beside it at that depth; focal [px] of the full image.
+    depth (H, W) [m], 0 for none, negative where it is known to be something else's, `across` and `down` times as wide
+    and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the
+    pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image.
     """
     height, width = depth.shape
     for v in range(front.shape[0]):
@@ -60,8 +60,8 @@ def judge(front, behind, owner, depth, across, down, focal, slack, constant, qua
             z = behind[v, u]
             if agrees:
                 kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE
-            elif m <= 0.0:
+            elif m == 0.0 or abs(-m - front[v, u]) <= bound:
                 kind = UNKNOWN
             else:
-                kind = EMPTY if m > front[v, u] else COVERED
+                kind = EMPTY if abs(m) > front[v, u] else COVERED
             counts[owner[v, u], kind] += 1

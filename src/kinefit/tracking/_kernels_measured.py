@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import ROT, TRANS
 
 
 @jit
-def gated_points(depth, rays, camera, low, high, first_row, last_row, first_column, last_column, step, out):
-    """World points (3, N) of every `step`-th pixel of a window that lie in the box low..high (3,) [m]; how many."""
+def gated_points(
+    depth, rays, camera, low, high, first_row, last_row, first_column, last_column, step, patches, out, share,
+):  # fmt: skip
+    """World points (3, N) of every `step`-th pixel of a window that lie in the box low..high (3,) [m]; how many.
+
+    share (N,): of a patch of surface, about, that stands behind a point, 1 at most: `patches` [1/m²] times z².
+    """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
     r20, r21, r22 = camera[ROT + 6], camera[ROT + 7], camera[ROT + 8]
@@ -23,8 +30,10 @@ def gated_points(depth, rays, camera, low, high, first_row, last_row, first_colu
             x = r00 * a + r10 * b + r20 * c
             y = r01 * a + r11 * b + r21 * c
             z = r02 * a + r12 * b + r22 * c
-            if low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2] and n < out.shape[1]:
+            if low[0] < x < high[0] and low[1] < y < high[1] and low[2] < z < high[2]:
                 out[0, n], out[1, n], out[2, n] = x, y, z
+                part = patches * m * m
+                share[n] = part if part < 1.0 else 1.0
                 n += 1
     return n
 
@@ -36,3 +45,15 @@ def soften(data, scale):
     for i in range(data.shape[1]):
         q = 1.0 + data[6, i] * data[6, i] * inverse
         data[7, i] /= q * q
+
+
+@jit
+def box(x, out):
+    """Least and largest coordinates (2, 3) of points (N, 3)."""
+    for k in range(3):
+        low, high = math.inf, -math.inf
+        for i in range(x.shape[0]):
+            v = x[i, k]
+            low = v if v < low else low
+            high = v if v > high else high
+        out[0, k], out[1, k] = low, high

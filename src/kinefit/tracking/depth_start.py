@@ -7,7 +7,7 @@ the person is explained by the body drawn there, less what is drawn where the se
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +17,17 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import to_points
-from kinefit.images.depth_scene import find_floor, people
+from kinefit.images.depth_noise import denoised, noise_of
+from kinefit.images.depth_scene import Blob, find_floor, people
 from kinefit.tracking._depth_score import limbs
 from kinefit.tracking._depth_search import Search
 from kinefit.tracking._depth_view import DepthView, splat, view_of
 from kinefit.tracking.depth_shape import SurfaceFit, fit_surfaces
 
-_GAP = 0.15  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m
+_GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m; and half
+# of it, for those who stand by a table or a wall: people are then still closed, a pixel is some centimetres wide
+_SAME = 0.65  # overlap of two outlines of one person: an upper body without both arms keeps 0.7 (rule of nines)
+_FLAT = 0.015  # [m] deviation from a plane, of a wall; a person who faces the sensor, arms down, has 0.02 or more
 _GOOD = 0.7  # score of a pose that needs no second attempt: right ones of rendered bodies have 0.73 to 0.9
 _MOST = 3  # largest things in view that are tried
 _FEWEST = 60  # measured points; a person 7.5 m from a camera of 160 x 124 pixels has several hundred
@@ -87,8 +91,11 @@ def start_from_points(
         The body has no surfaces.
     """
     found: list[tuple[Search, BodyState]] = []
+    views: list[DepthView] = []
+    more = _views(body, points, camera, depth, up)
     for attempt in range(max(attempts, 1)):
-        searches = _searches(body, points, camera, depth, up, seed + attempt)
+        views += next(more, [])
+        searches = _searches(body, views, up, seed + attempt)
         found += [(search, state) for search in searches for state in search.best(count)]
         if max(_meant(*f) for f in found) > _GOOD:
             break
@@ -134,8 +141,8 @@ def restart_limb(
     if lost - {s for limb in chosen for s in limb}:
         names = ", ".join(body.tree.segments[s] for limb in limbs(body) for s in limb)
         raise BodyError("a segment of the trunk cannot be sought alone", remedy=f"Choose among: {names}.")
-    searches = _searches(body, points, camera, depth, up, seed)
-    search = max(searches, key=lambda s: s.score.of(state))
+    views = [view for some in _views(body, points, camera, depth, up) for view in some]
+    search = max(_searches(body, views, up, seed), key=lambda s: s.score.of(state))
     ends = search.ends(state)
     found = [(state, search.score.of(state))]
     for limb in chosen:
@@ -170,8 +177,12 @@ def sized_start(
     """
     found: list[tuple[DepthView, BodyState]] = []
     for depth in depths:
-        tried = _searches(body, None, camera, depth, up, seed)
-        search, state = max(((s, s.best(1)[0]) for s in tried), key=lambda t: _meant(*t))
+        tried: list[tuple[Search, BodyState]] = []
+        for views in _views(body, None, camera, depth, up):
+            tried += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
+            if max(_meant(*t) for t in tried) > _GOOD:
+                break
+        search, state = max(tried, key=lambda t: _meant(*t))
         found.append((search.view, state))
     views = [view for view, _ in found]
     states = [state for _, state in found]
@@ -190,16 +201,15 @@ def _unit(up: ArrayLike) -> NDArray:
     return vector / np.linalg.norm(vector)
 
 
-def _searches(
-    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike, seed: int
-) -> list[Search]:
+def _searches(body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int) -> list[Search]:
+    return [Search(body, view, _unit(up), np.random.default_rng(seed)) for view in views]
+
+
+def _views(
+    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike
+) -> Iterator[list[DepthView]]:
+    """Views of the persons that may be meant; then of parts of them, where those may be a person by a table."""
     direction = _unit(up)
-    views = _views(body, points, camera, depth, direction)
-    return [Search(body, view, direction, np.random.default_rng(seed)) for view in views]
-
-
-def _views(body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: NDArray) -> list[DepthView]:
-    """Views of the persons that may be meant."""
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces", remedy="Depth needs some; see the catalogue's bodies.")
     if depth is not None:
@@ -211,13 +221,15 @@ def _views(body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray 
     if points is None:
         if depth is None:
             raise ObservationError("neither points nor a depth image", remedy="Give one of them.")
-        floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
-        blobs = people(depth, camera, floor=floor, gap=_GAP)
-        if not blobs:
+        smooth, none = denoised(depth, camera), True
+        for blobs in _blobs(smooth, camera, direction):
+            yield [view_of(smooth, blob.mask, camera) for blob in blobs]
+            none = False
+        if none:
             raise TrackingError(
                 "nothing in the depth image is of a person's size", remedy=_scale_remedy(depth[depth > 0], body)
             )
-        return [view_of(depth, blob.mask, camera) for blob in blobs[:_MOST]]
+        return
     cloud = np.asarray(points, float).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     coarse, small = splat(cloud, camera)
@@ -230,9 +242,33 @@ def _views(body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray 
             remedy="Give the person's points only, in metres (are these millimetres?).",
         )
     if depth is None:
-        return [view_of(coarse, coarse > 0, small)]
-    near = _resized(coarse, depth.shape)
-    return [view_of(depth, (depth > 0) & (np.abs(depth - near) < 0.05), camera)]
+        yield [view_of(coarse, coarse > 0, small)]
+        return
+    near, sigma = _resized(coarse, depth.shape), noise_of(depth)
+    person = (depth > 0) & (np.abs(depth - near) < 0.05 + 3.0 * sigma)
+    smooth = denoised(depth, camera, sigma)
+    yield [view_of(smooth, person, camera)]
+
+
+def _blobs(depth: NDArray, camera: Camera, up: NDArray) -> Iterator[list[Blob]]:
+    """Things of a person's size, the likeliest first; then those that are only things if less is joined to them."""
+    floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
+    known: list[Blob] = []
+    for gap in _GAPS:
+        new = [b for b in people(depth, camera, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
+        new.sort(key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))
+        known += new
+        if new:
+            yield new[:_MOST]
+
+
+def _same(a: Blob, b: Blob) -> bool:
+    return bool(np.sum(a.mask & b.mask) > _SAME * np.sum(a.mask | b.mask))
+
+
+def _flat(x: NDArray) -> bool:
+    """Whether points (N, 3) [m] lie in a plane, as of a wall."""
+    return bool(np.linalg.eigvalsh(np.cov(x.T))[0] < _FLAT**2)
 
 
 def _resized(coarse: NDArray, shape: tuple[int, ...]) -> NDArray:

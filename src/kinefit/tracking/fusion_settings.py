@@ -14,7 +14,7 @@ class FusionSettings:
     Parameters
     ----------
     points : int
-        Measured points of a depth image that take part, at most.
+        Measured points of a depth image that take part, about.
     samples : int
         Points of the body's surface that look for their measurement.
     reach : float [m]
@@ -25,31 +25,66 @@ class FusionSettings:
     shrink : float
         By which the bound shrinks from iteration to iteration.
     iterations : int, at most
-    tolerance : float [m, rad]
-        Norm of a step below which a frame is done.
+    tolerance : float [standard deviations]
+        Of each degree of freedom, on average: a smaller step ends a frame.
     patch : float [m]
         Size of a patch of surface over which the errors of depth are alike (shape, and the sensor's own): as many
         measurements count as there are patches.
     render_every : int
         Iterations after which the body's own hidden parts are found anew.
+    depth, pixel, marker : float [m], [px], [m]
+        Standard deviation of a sensor that none is given for.
+    background : float [s]
+        How long a thing near the body must be seen, and not be taken for the body, to count as background; see
+        `Background`. inf for depth cameras that move.
+    through : float [px]
+        Standard deviation, in cells of 1/160 of an image's width, of rows that draw what the sensor saw through to
+        where something was measured; see `free_space_rows`. inf for none.
+    collision, flesh : float [m]
+        Softness of what parts that run into each other are kept apart with, and how far they may. See
+        `collision_rows`.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
         How long a velocity lasts that nothing confirms.
     loss : Loss of keypoints and markers, in their standard deviations.
+    pause : float [s]
+        A longer gap between frames tells nothing of the velocity any more; a clock that goes back further was set.
+    search : bool
+        Whether what is lost is sought: a limb takes 50 ms of one core, a whole body 2 s. Without it every frame takes
+        as long as any other, and `start_at` is the only start.
+    poor : float in 0..1
+        Mean quality below which the whole body counts as lost, and is sought as at the start.
+    doubtful : float in 0..1
+        Quality of a segment below which its limb is sought together with one that is lost.
+    search_after, search_every : float [s]
+        How long something must have been lost, and how long to wait between two searches.
     """
 
-    points: int = 2500
-    samples: int = 1500
+    points: int = 1000
+    samples: int = 600
     reach: float = 0.25
     far: float = 0.15
     near: float = 0.03
-    shrink: float = 0.7
-    iterations: int = 12
-    tolerance: float = 2e-3
+    shrink: float = 0.5
+    iterations: int = 8
+    tolerance: float = 0.3
     patch: float = 0.05
     render_every: int = 4
-    angle_acceleration: float = 150.0
+    depth: float = 0.01
+    pixel: float = 4.0
+    marker: float = 0.005
+    background: float = 0.5
+    through: float = 3.0
+    collision: float = 0.01
+    flesh: float = 0.02
+    angle_acceleration: float = 60.0
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
     loss: Loss = field(default_factory=geman_mcclure)
+    pause: float = 1.0
+    search: bool = True
+    poor: float = 0.4
+    doubtful: float = 0.6
+    search_after: float = 0.0
+    search_every: float = 0.1

@@ -12,25 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body
 from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
 from kinefit.tracking import _kernels_loss as kernels
+from kinefit.tracking.evidence import Evidence
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
-FEWEST = 4  # pixels: fewer tell nothing of a segment
-# On a rendered body tracked into 260 lost part-frames, 99 % of them are flagged at 0.03 % false alarms with these two;
-# 0.2 to 0.3 and 0.5 to 0.7 give 97 to 100 % at 0.01 to 0.1 %.
-SHOWN = 0.25  # share of a segment's outline that must be seen: with less nothing holds it but prediction and prior
-BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
+FEWEST = 16  # pixels of a whole outline: fewer tell less of a segment
 DEVIATIONS = 3.0  # of a measurement that agrees
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentVerdict:
-    """What depth images say of each segment; verdicts of several sensors add up.
+    """What a depth image says of each segment.
 
     Parameters
     ----------
@@ -41,9 +38,6 @@ class SegmentVerdict:
     """
 
     counts: NDArray
-
-    def __add__(self, other: SegmentVerdict) -> SegmentVerdict:
-        return SegmentVerdict(self.counts + other.counts)
 
     @property
     def supported(self) -> NDArray:
@@ -61,19 +55,10 @@ class SegmentVerdict:
         return self.counts[:, kernels.COVERED] / np.maximum(self.counts[:, 1:].sum(axis=1), 1)
 
     @property
-    def quality(self) -> NDArray:
-        """(S,) in 0..1: share of what is seen of a segment that speaks for it; 0 where nothing is."""
-        return self.supported / np.maximum(self.seen, 1)
-
-    @property
-    def hidden(self) -> NDArray:
-        """(S,) bool: no sensor sees enough of the segment to say anything; the prediction and the prior hold it."""
-        return self.seen < np.maximum(SHOWN * self.counts[:, kernels.OWN], FEWEST)
-
-    @property
-    def lost(self) -> NDArray:
-        """(S,) bool: it is seen, and less than half of that speaks for it."""
-        return ~self.hidden & (self.quality < BELIEVED)
+    def evidence(self) -> Evidence:
+        """For and against each segment, in outlines of it."""
+        whole = np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        return Evidence(self.supported / whole, (self.seen - self.supported) / whole)
 
 
 class Layers:
@@ -115,15 +100,17 @@ def _part(mesh: BodyMesh, segment: int) -> tuple[int, slice, NDArray]:
 
 
 def judge_segments(
-    body: Body, state: BodyState, layers: Layers, depth: NDArray, camera: Camera, *,
+    vertices_world: NDArray, layers: Layers, depth: NDArray, camera: Camera, *,
     noise: tuple[float, float] = (0.002, 0.002), slack: float = 0.015,
 ) -> SegmentVerdict:  # fmt: skip
-    """Judge every segment of a state by one depth image.
+    """Judge every segment of a body by one depth image.
 
     Parameters
     ----------
+    vertices_world : (V, 3) [m] its mesh in the pose to be judged.
     layers : Layers of this body and camera; overwritten.
-    depth : (H, W) [m] 0 where nothing was measured.
+    depth : (H, W) [m]
+        0 where nothing was measured; negative where it is known to be something else's, see `Background`.
     noise : a [m] and b [1/m] of a depth's standard deviation a + b z².
     slack : float [m]
         What a pose and a shape may be off and still count as right, along the line of sight and across it.
@@ -136,8 +123,7 @@ def judge_segments(
     if depth.shape != (camera.size[1], camera.size[0]):
         problem = f"a depth image of {depth.shape[1]}x{depth.shape[0]} px, camera {camera.name} has {camera.size}"
         raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    layers.draw(layers.mesh.posed(frames))
+    layers.draw(vertices_world)
     width, height = layers.camera.size
     kernels.judge(
         layers.front, layers.behind, layers.owner, depth, camera.size[0] / width, camera.size[1] / height,

@@ -59,6 +59,28 @@ def fit_markers(
     return _motion(body, markers, points, x, roots, angles, sigma, loss, up)
 
 
+def known_markers(body: Body, markers: Markers, marker_set: str | None = None) -> tuple[str, tuple[str, ...]]:
+    """The body's marker set that a recording's labels belong to, and the labels without a subject's prefix.
+
+    "" where the labels are the body's own landmarks.
+
+    Raises
+    ------
+    ObservationError
+        None of its labels is known to the body.
+    """
+    labels = tuple(name.rpartition(":")[2] for name in markers.names)
+    sets = {marker_set: body.markers(marker_set)} if marker_set else {**body.marker_sets, "": body.landmarks}
+    shared = {name: sum(n in points.names for n in labels) for name, points in sets.items()}
+    best = max(shared, key=lambda name: shared[name])
+    if not shared[best]:
+        raise ObservationError(
+            f"none of its labels is known to body '{body.name}'", file=markers.source or None,
+            remedy=f"Marker sets of the body: {', '.join(body.marker_sets) or 'none'}; or name its landmarks.",
+        )
+    return best, labels
+
+
 def _matched(body: Body, markers: Markers, marker_set: str | None) -> tuple[PointSet, list[int]]:
     labels = [name.rpartition(":")[2] for name in markers.names]
     sets = {marker_set: body.markers(marker_set)} if marker_set else body.marker_sets

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,36 +12,28 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels, targets
 from kinefit.geometry.camera import Rig
 from kinefit.observations import KeypointFrame, MarkerFrame
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
+from kinefit.tracking._depth_view import DepthView
+from kinefit.tracking.evidence import SHOWN, Evidence
 
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What a sensor says of a state, segment by segment.
-
-    Parameters
-    ----------
-    agreeing, contrary : (S,) how much of what the sensor can see of each segment agrees, and how much does not.
-    hidden : (S,) how much of it is hidden from the sensor by something in front.
-    """
-
-    agreeing: NDArray
-    contrary: NDArray
-    hidden: NDArray
-
-    def __add__(self, other: Evidence) -> Evidence:
-        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary, self.hidden + other.hidden)
+_AGREES = 3.0  # standard deviations
+_AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
 
 
 class Measurement(Protocol):
     """What one sensor saw at one time, ready to make rows."""
 
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    sensor: str
+    def rows(self, state: BodyState, bound: float) -> Sequence[AnyRows]:
         """Rows at a state; `bound` [m] within which correspondences are sought."""
         ...
 
     def evidence(self, state: BodyState) -> Evidence:
         """How well a state agrees with it."""
+        ...
+
+    def view(self) -> DepthView | None:
+        """What a limb can be sought in, where it shows a surface."""
         ...
 
 
@@ -51,33 +43,39 @@ class KeypointMeasurement:
     Parameters
     ----------
     sigma : float [px] standard deviation of a keypoint with confidence 1.
+
+    Raises
+    ------
+    BodyError, CalibrationError
+        A keypoint set that the body does not have, a camera that the rig does not have.
     """
 
     def __init__(self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float) -> None:
-        self._body, self._packed = body, rig.packed
+        self.sensor, self._body, self._packed = frame.sensor, body, rig.packed
+        seen = np.isfinite(frame.uv).all(axis=1) & (frame.confidence > 0) & (frame.confidence < np.inf)
         known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
-        here = [k for k, name in enumerate(frame.names) if name in known.names]
-        seen = np.isfinite(frame.uv[here]).all(axis=1) & (frame.confidence[here] > 0)
-        here = [k for k, ok in zip(here, seen) if ok]
-        self.points = known.select(tuple(frame.names[k] for k in here))
+        self.points, here = _known(known, frame.names, seen)
         self.uv = np.ascontiguousarray(frame.uv[here])
         self._camera = np.full(len(here), rig.index(frame.sensor))
         self._weight = np.ascontiguousarray(frame.confidence[here]) / sigma**2
 
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows]:
         """Two rows a keypoint."""
-        return [
-            targets.fill(
-                _kernels.pixel_rows, 2, self._body, state, self.points, self._packed, self._camera, self.uv, self._weight
-            )
-        ]
+        camera, uv, weight = self._camera, self.uv, self._weight
+        fill = _kernels.pixel_rows
+        return [targets.fill(fill, 2, self._body, state, self.points, self._packed, camera, uv, weight)]
+
+    def square(self, state: BodyState) -> NDArray:
+        """(K,) squared distances in the image, in variances."""
+        rows = self.rows(state, 0.0)[0]
+        return np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))
 
     def evidence(self, state: BodyState) -> Evidence:
-        """A keypoint speaks for its segment within three standard deviations."""
-        rows = self.rows(state, 0.0)[0]
-        assert hasattr(rows, "group")
-        square = np.bincount(rows.group, rows.weight * rows.residual**2, len(self.points))
-        return _of_points(self._body, self.points, square)
+        """A keypoint speaks for its segment within three standard deviations, and against it beyond."""
+        return of_points(self._body, self.points, self.square(state))
+
+    def view(self) -> None:
+        """Points do not show limbs."""
 
 
 class MarkerMeasurement:
@@ -86,30 +84,49 @@ class MarkerMeasurement:
     Parameters
     ----------
     sigma : float [m]
+
+    Raises
+    ------
+    BodyError
+        A marker set that the body does not have.
     """
 
     def __init__(self, frame: MarkerFrame, body: Body, sigma: float) -> None:
-        self._body = body
+        self.sensor, self._body = frame.sensor, body
         known = body.markers(frame.marker_set) if frame.marker_set else body.landmarks
-        here = [
-            k for k, name in enumerate(frame.names) if name in known.names and np.isfinite(frame.positions[k]).all()
-        ]
-        self.points = known.select(tuple(frame.names[k] for k in here))
+        self.points, here = _known(known, frame.names, np.isfinite(frame.positions).all(axis=1))
         self.x_world = np.ascontiguousarray(frame.positions[here])
         self._weight = np.full(len(here), 1.0 / sigma**2)
 
-    def rows(self, state: BodyState, bound: float) -> list[AnyRows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows]:
         """Three rows a marker."""
         return [targets.fill(_kernels.point_rows, 3, self._body, state, self.points, self.x_world, self._weight)]
 
-    def evidence(self, state: BodyState) -> Evidence:
-        """A marker speaks for its segment within three standard deviations."""
+    def square(self, state: BodyState) -> NDArray:
+        """(M,) squared distances, in variances."""
         gap = self.x_world - self._body.positions(state, self.points)
-        return _of_points(self._body, self.points, self._weight * np.square(gap).sum(axis=1))
+        return np.asarray(self._weight * np.square(gap).sum(axis=1))
+
+    def evidence(self, state: BodyState) -> Evidence:
+        """A marker speaks for its segment within three standard deviations, and against it beyond."""
+        return of_points(self._body, self.points, self.square(state))
+
+    def view(self) -> None:
+        """Points do not show limbs."""
 
 
-def _of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
-    """Evidence of points with squared residuals (K,) in variances; one point is as much as a tenth of a segment's surface."""
-    count = len(body.tree.segments)
-    agreeing = np.bincount(points.segments, square < 9.0, count)
-    return Evidence(agreeing, np.bincount(points.segments, square >= 9.0, count), np.zeros(count))
+def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
+    """Evidence of points with squared residuals (K,) in variances."""
+    tree, out = body.tree, np.zeros((2, len(body.tree.segments)))
+    for s, place, far in zip(points.segments, points.points, square >= _AGREES**2):
+        out[int(far), s] += SHOWN
+        if tree.parents[s] >= 0 and np.linalg.norm(place) < _AT_JOINT:
+            out[int(far), tree.parents[s]] += SHOWN
+    return Evidence(*out)
+
+
+def _known(points: PointSet, names: tuple[str, ...], seen: NDArray) -> tuple[PointSet, list[int]]:
+    """Those of the named points that the body has and that were seen, and their places among the names."""
+    has = set(points.names)
+    here = [k for k, name in enumerate(names) if name in has and seen[k]]
+    return points.select(tuple(names[k] for k in here)), here

@@ -47,6 +47,21 @@ class Prediction:
         self._xx, self._vv = np.diag(spread**2), self._first_velocity.copy()
         self._vx = np.zeros_like(self._xx)
 
+    @property
+    def velocity(self) -> NDArray:
+        """(n,) [m, rad] a frame."""
+        return self._velocity
+
+    @property
+    def std(self) -> NDArray:
+        """(n,) [m, rad] standard deviation of the last state."""
+        return np.sqrt(np.diag(self._xx))
+
+    def go_on(self, state: BodyState, std: NDArray, velocity: NDArray) -> None:
+        """Begin with what is known already; velocity (n,) [m, rad] a frame."""
+        self.start(state, std)
+        self._velocity = velocity
+
     def change_chart(self, angles: NDArray, signs: NDArray) -> None:
         """Go on in other charts of some ball joints: their angles (D,), and the signs (D,) of how they change."""
         assert self.state is not None
@@ -60,17 +75,22 @@ class Prediction:
         """Stay where the body was last seen: for a frame in which nothing is."""
         self._velocity = np.zeros_like(self._velocity)
 
-    def ahead(self, steps: int = 1) -> tuple[BodyState, NDArray]:
-        """The state some frames on (more than one where frames were dropped), and the information (n, n) of it."""
+    def ahead(self, steps: float = 1.0) -> tuple[BodyState, NDArray]:
+        """The state some frames on, and the information (n, n) of it.
+
+        More than one where frames were dropped, less where sensors take turns.
+        """
         assert self.state is not None
         self._ahead = self.state
-        for _ in range(steps):
-            self._velocity = self._keep * self._velocity
-            vx, vv = self._keep * self._vx, self._keep**2 * self._vv
-            self._xx = self._xx + vx + vx.T + vv + self._noise[0]
-            self._vx = vx + vv + self._noise[1]
-            self._vv = vv + self._noise[2]
-            self._ahead = self._ahead.retract(self._velocity, self._bounds)
+        whole = int(steps + 1e-6)
+        for h in [1.0] * whole + [steps - whole] * (steps - whole > 1e-6):
+            keep = self._keep**h
+            self._velocity = keep * self._velocity
+            vx, vv = keep * self._vx, keep**2 * self._vv
+            self._xx = self._xx + h * (vx + vx.T) + h**2 * vv + h**3 * self._noise[0]
+            self._vx = vx + h * vv + h**2 * self._noise[1]
+            self._vv = vv + h * self._noise[2]
+            self._ahead = self._ahead.retract(h * self._velocity, self._bounds)
         self._information = inverse(self._xx)
         return self._ahead, self._information
 
@@ -88,3 +108,11 @@ class Prediction:
 def belief(state: BodyState, predicted: BodyState, information: NDArray) -> ParameterRows:
     """The prediction as one row on all degrees of freedom: r = predicted − state, weighed by an (n, n) information."""
     return ParameterRows(np.arange(len(information)), state.difference(predicted), information)
+
+
+def forgetting(information: NDArray, lost: NDArray) -> NDArray:
+    """Information (n, n) that tells nothing of some degrees of freedom (n,) bool, and of the others what it told."""
+    kept = np.flatnonzero(~lost)
+    out = np.zeros_like(information)
+    out[np.ix_(kept, kept)] = inverse(inverse(information)[np.ix_(kept, kept)])
+    return out

@@ -11,6 +11,7 @@ from kinefit.readers.load import Observations, load_observations
 from kinefit.readers.take import Take, read_take
 from kinefit.tracking.association import choose_people
 from kinefit.tracking.channels import make_channels
+from kinefit.tracking.fusion_take import fuse_take
 from kinefit.tracking.subject import Subject, fit_subject
 from kinefit.tracking.tracker import Settings
 from kinefit.tracking.video import Progress, track
@@ -22,6 +23,9 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file; `smooth` and `contacts` as in `track`.
 
+    A take with depth or stereo is fused frame by frame from all of its sensors (`fuse_take`), any other is fitted to
+    the keypoints of its cameras.
+
     Returns the motion and what the sensors saw (for overlays).
 
     Raises
@@ -32,6 +36,9 @@ def track_take(
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
+    if take.depth or take.stereo:
+        observations = load_observations(take)
+        return fuse_take(take, observations, progress=progress), observations
     body, observations = load_body(take.body), load_keypoints(take)
     assert observations.rig is not None
     motion = track(

@@ -14,24 +14,11 @@ from kinefit.motion import Motion, Residuals
 from kinefit.observations import Keypoints
 from kinefit.tracking.association import choose_people
 from kinefit.tracking.channels import Channels, make_channels
+from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.smoothing import smooth_results
 from kinefit.tracking.subject import Progress, Subject, fit_subject
 from kinefit.tracking.tracker import FrameResult, Settings, Tracker
 from kinefit.tracking.uncertainty import with_lasting_errors
-
-
-class TrackingInterrupted(KeyboardInterrupt):
-    """Ctrl-C while frames were being tracked; what is done is kept.
-
-    Parameters
-    ----------
-    motion : Motion of the frames done, from the first one on.
-    total : int, how many frames there are.
-    """
-
-    def __init__(self, motion: Motion, total: int) -> None:
-        super().__init__(f"{len(motion)} of {total} frames are tracked")
-        self.motion, self.total = motion, total
 
 
 def track(

@@ -1,0 +1,33 @@
+"""Every figure of depth: `python -m benchmarks.depth`; only some parts: `python -m benchmarks.depth depth_scene`."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+PARTS = {
+    "depth_surfaces": "closest points on tapered elliptical cylinders",
+    "depth_grids": "closest points on meshes",
+    "depth_rendering": "drawing a body, and what depth sensors would have seen",
+    "depth_images": "depth image -> points",
+    "depth_stereo": "stereo pair -> points; faces and hands by their colour",
+    "depth_start": "pose and size from depth with no pose given",
+    "depth_real": "real recordings of depth",
+    "depth_scene": "the rendered body of ten parts, on M3T's frames",
+    "depth_voodoo": "the paper's experiment, graded by the truth",
+    "depth_speed": "time a frame, by points and background; beside Open3D",
+}
+
+
+def main(chosen: list[str]) -> None:
+    """Print the figures of the chosen parts; of all, where none is named."""
+    unknown = [name for name in chosen if name not in PARTS]
+    if unknown:
+        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(PARTS)}")
+    for name in chosen or PARTS:
+        print(f"\n# {name}: {PARTS[name]}", flush=True)
+        import_module(f"benchmarks.{name}").run()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,52 @@
+"""What all sensors together say of each segment: it is where it is thought to be, it is not, or nothing sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# On a rendered body tracked into 260 lost part-frames, 99 % of them are flagged at 0.03 % false alarms with these two;
+# 0.2 to 0.3 and 0.5 to 0.7 give 97 to 100 % at 0.01 to 0.1 %.
+SHOWN = 0.25  # of a segment's outline that must be seen: with less nothing holds it but prediction and prior
+BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """For and against each segment's place; what several sensors say adds up.
+
+    Parameters
+    ----------
+    agreeing, contrary : (S,)
+        In outlines of the segment: 1 where a depth image shows all of it. A keypoint or a marker counts `SHOWN`, which
+        is just enough to call a segment seen.
+    """
+
+    agreeing: NDArray
+    contrary: NDArray
+
+    def __add__(self, other: Evidence) -> Evidence:
+        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary)
+
+    @classmethod
+    def none(cls, segments: int) -> Evidence:
+        """Nothing was seen."""
+        return cls(np.zeros(segments), np.zeros(segments))
+
+    @property
+    def quality(self) -> NDArray:
+        """(S,) in 0..1: share of what is seen of a segment that speaks for it; 0 where nothing is."""
+        seen = self.agreeing + self.contrary
+        return self.agreeing / np.where(seen > 0.0, seen, 1.0)
+
+    @property
+    def hidden(self) -> NDArray:
+        """(S,) bool: no sensor sees enough of the segment to say anything; the prediction and the prior hold it."""
+        return self.agreeing + self.contrary < SHOWN - 1e-9
+
+    @property
+    def lost(self) -> NDArray:
+        """(S,) bool: it is seen, and less than half of that speaks for it."""
+        return ~self.hidden & (self.quality < BELIEVED)

@@ -1,0 +1,153 @@
+"""One time's fit: what the sensors saw becomes rows, anew in every iteration, and a state with its error bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.rows import AnyRows, ParameterRows
+from kinefit.solvers.equations import Covariance, inverse, joint_std
+from kinefit.solvers.least_squares import gauss_newton
+from kinefit.tracking.background import Background
+from kinefit.tracking.cloud_measurement import CloudMeasurement
+from kinefit.tracking.depth_measurement import DepthMeasurement
+from kinefit.tracking.evidence import Evidence
+from kinefit.tracking.fusion_settings import FusionSettings
+from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
+from kinefit.tracking.prediction import belief
+from kinefit.tracking.surface import Surface
+
+Held = tuple[BodyState, NDArray]
+"""What is known beforehand: a state, and the information (n, n) of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FusionResult:
+    """One tracked frame.
+
+    Parameters
+    ----------
+    time : float [s]
+    state : BodyState
+    dof_std : (6 + D,) [m, rad]
+    joint_std : (S, 3) [m]
+    segment_quality : (S,) in 0..1
+        Share of what the sensors can see of a segment that agrees with them; 0 where they see nothing of it.
+    lost : (S,) bool
+        Segments that what was measured speaks against.
+    hidden : (S,) bool
+        Segments that no sensor sees: held by the prediction and the prior alone.
+    iterations : int
+    """
+
+    time: float
+    state: BodyState
+    dof_std: NDArray
+    joint_std: NDArray
+    segment_quality: NDArray
+    lost: NDArray
+    hidden: NDArray
+    iterations: int
+
+    @property
+    def quality(self) -> float:
+        """Mean quality of all segments, in 0..1."""
+        return float(np.mean(self.segment_quality))
+
+
+class FusedFit:
+    """A body and its sensors, ready for one fit after the other.
+
+    Parameters
+    ----------
+    body : Body, with surfaces where depth is to be used.
+    rig : Rig
+    rate : float [Hz] of the frames
+    accuracy : {sensor: standard deviation}, [m] or [px]; others have those of the settings.
+    settings : FusionSettings
+    backgrounds : {depth camera: Background}, added to when one is seen first; None for one that is to have none.
+    """
+
+    def __init__(
+        self, body: Body, rig: Rig, rate: float, accuracy: Mapping[str, float], settings: FusionSettings,
+        backgrounds: dict[str, Background | None],
+    ) -> None:  # fmt: skip
+        self.body, self.rig, self.rate, self.accuracy, self.settings = body, rig, rate, accuracy, settings
+        self.surface = Surface(body, settings.samples) if body.surfaces else None
+        self._backgrounds = backgrounds
+        self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
+        self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
+        self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
+
+    def measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
+        """What the sensors saw, ready to make rows about a state."""
+        return [self._measurement(frame, state) for frame in frames]
+
+    def _measurement(self, frame: Frame, state: BodyState) -> Measurement:
+        s, name = self.settings, frame.sensor
+        if isinstance(frame, KeypointFrame):
+            return KeypointMeasurement(frame, self.body, self.rig, self.accuracy.get(name, s.pixel))
+        if isinstance(frame, MarkerFrame):
+            return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
+        surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
+        sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
+        if isinstance(frame, PointCloud):
+            return CloudMeasurement(frame, surface, vertices, sigma, s)
+        camera = self.rig[name]
+        return DepthMeasurement(frame, camera, surface, vertices, sigma, s, self.background(camera))
+
+    def _rows(
+        self, state: BodyState, held: Held | None, measurements: Sequence[Measurement], bound: float
+    ) -> list[AnyRows]:
+        parts: list[AnyRows] = [rows for m in measurements for rows in m.rows(state, bound)]
+        if held is not None:
+            parts.append(belief(state, *held))
+        usual = self.body.tree.usual
+        parts.append(ParameterRows(self._prior, (usual - state.angles)[self._prior - 6], self._prior_weight))
+        if self._pairs is not None:
+            s = self.settings
+            parts.append(collision_rows(self.body, state, pairs=self._pairs, margin=-s.flesh, sigma=s.collision))
+        return parts
+
+    def run(
+        self, time: float, state: BodyState, held: Held | None, measurements: Sequence[Measurement]
+    ) -> tuple[FusionResult, NDArray]:
+        """Fit from a state on, and judge; the result, and the covariance (n, n) with what was held."""
+        s, bound, iterations = self.settings, self.settings.far, 0
+        while iterations < s.iterations:
+            iterations += 1
+            loss = replace(s.loss, scale=s.loss.scale * bound / s.near)  # far points pull too, while all is far off
+            step = gauss_newton(self.body, state, self._rows(state, held, measurements, bound), loss=loss)
+            state = step.state
+            gain = float(step.delta @ step.equations.gradient)  # twice the fall of the cost: squared deviations
+            if gain < s.tolerance**2 * len(step.delta) and bound <= s.near:
+                break
+            bound = max(bound * s.shrink, s.near)
+        posterior = inverse(step.equations.matrix)
+        told, cov = self.judged(state, measurements), Covariance(posterior, np.empty((len(posterior), 0)))
+        std, joints = np.sqrt(np.maximum(np.diag(posterior), 0.0)), joint_std(self.body, state, cov)
+        result = FusionResult(time, state, std, joints, told.quality, told.lost, told.hidden, iterations)
+        return result, posterior
+
+    def judged(self, state: BodyState, measurements: Iterable[Measurement]) -> Evidence:
+        """What measurements say of each segment."""
+        told = Evidence.none(len(self.body.tree.segments))
+        for m in measurements:
+            told = told + m.evidence(state)
+        return told
+
+    def background(self, camera: Camera) -> Background | None:
+        """What stands still before a depth camera; None where nothing is to be learnt."""
+        if camera.name not in self._backgrounds:
+            sigma = self.accuracy.get(camera.name, self.settings.depth)
+            wait = self.settings.background * self.rate
+            still = np.isfinite(wait)
+            self._backgrounds[camera.name] = Background(camera, sigma, max(round(wait), 2)) if still else None
+        return self._backgrounds[camera.name]

@@ -1,0 +1,72 @@
+"""What a tracker needs of a body's surface, made once: samples, a mesh, and room to draw it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces import body_mesh, sample
+from kinefit.correspondences.depth_image import SurfaceSamples
+from kinefit.errors import BodyError
+from kinefit.geometry.camera import Camera
+from kinefit.rendering import Canvas, scaled
+from kinefit.tracking.loss import Layers
+
+_COLUMNS = 160  # of the image in which the body's own hidden parts are found: a forearm at 3 m is four pixels wide
+
+
+class Surface:
+    """A body's surface, for one tracker at a time.
+
+    Parameters
+    ----------
+    body : Body with surfaces
+    count : int, samples of its surface.
+
+    Attributes
+    ----------
+    samples : SurfaceSamples
+    mesh : BodyMesh
+    areas : (S,) [m²] of each segment
+    judged : the state that was drawn segment by segment last, in all cameras
+
+    Raises
+    ------
+    BodyError
+        A body without surfaces.
+    """
+
+    def __init__(self, body: Body, count: int) -> None:
+        if not body.surfaces:
+            remedy = "Depth needs some; see the catalogue's bodies."
+            raise BodyError(f"body '{body.name}' has no surfaces", remedy=remedy)
+        self.body, self.mesh = body, body_mesh(body)
+        points, normals, segment = sample(body, count)
+        self.samples = SurfaceSamples(segment, points.T, normals.T)
+        corners = self.mesh.vertices[self.mesh.faces]
+        twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.areas = 0.5 * np.bincount(self.mesh.face_segment, twice, len(body.tree.segments))
+        self.judged: BodyState | None = None
+        self._posed: tuple[BodyState, NDArray] | None = None
+        self._canvases: dict[Camera, Canvas] = {}
+        self._layers: dict[Camera, Layers] = {}
+
+    def posed(self, state: BodyState) -> NDArray:
+        """(V, 3) [m] its mesh in the world; kept for the state that was asked for last."""
+        if self._posed is None or self._posed[0] is not state:
+            self._posed = state, self.mesh.posed(self.body.tree.forward(state.T_world_root, state.angles)[0])
+        return self._posed[1]
+
+    def depth(self, vertices_world: NDArray, camera: Camera) -> NDArray:
+        """(h, w) [m] its own depth in a camera, small, inf where it is not; overwritten by the next call for it."""
+        small = scaled(camera, min(_COLUMNS / camera.size[0], 1.0))
+        if camera not in self._canvases:
+            self._canvases[camera] = Canvas(small.size)
+        return self._canvases[camera].draw_for(small, vertices_world, self.mesh.faces, cull=True).depth
+
+    def layers(self, camera: Camera) -> Layers:
+        """Room to draw it segment by segment."""
+        if camera not in self._layers:
+            self._layers[camera] = Layers(self.body, camera, mesh=self.mesh)
+        return self._layers[camera]

@@ -1,0 +1,90 @@
+"""A take with a depth sensor, keypoints and a few markers at once, simulated, by the command line."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit import read_motion
+from kinefit.cli import main
+from kinefit.errors import KinefitError
+from kinefit.exporters import write_motion
+from kinefit.readers.load import load_observations
+from kinefit.readers.take import read_take
+from kinefit.simulation.movements import movement, people
+from kinefit.tracking.fusion_take import FrameSource, fuse_take
+
+MARKERS = ("l_wrist", "r_wrist", "l_knee")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One second of a wave as a time-of-flight camera and a colour camera's keypoints saw it, and three markers."""
+    folder = tmp_path_factory.mktemp("wave")
+    truth = movement("wave", people()[2].body, rate=10.0)
+    write_motion(truth, folder / "truth.npz")
+    told = CliRunner().invoke(
+        main, ["simulate", str(folder / "truth.npz"), "-o", str(folder / "seen"), "--sensor", "tof", "--sensor",
+               "keypoints", "--frames", "0:8"],
+    )  # fmt: skip
+    assert told.exit_code == 0, told.output
+    motion = read_motion(folder / "seen" / "truth" / "motion.npz")
+    x = motion.positions(motion.body.landmarks.select(MARKERS))
+    lines = [
+        "PathFileType\t4\t(X/Y/Z)\tfew.trc",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"10\t10\t{len(x)}\t{len(MARKERS)}\tm\t10\t1\t{len(x)}",
+        "Frame#\tTime\t" + "\t\t\t".join(MARKERS) + "\t\t",
+        "\t\t" + "\t".join(f"X{k}\tY{k}\tZ{k}" for k in (1, 2, 3)),
+        "",
+    ]
+    lines += ["\t".join([f"{i + 1}", f"{i / 10:.6f}", *(f"{v:.6f}" for v in f.ravel())]) for i, f in enumerate(x)]
+    (folder / "seen" / "few.trc").write_text("\n".join(lines) + "\n")
+    take = folder / "seen" / "take.toml"
+    take.write_text(take.read_text() + '\n[[markers]]\nfile = "few.trc"\n')
+    return folder / "seen"
+
+
+def test_every_step_holds_what_each_sensor_saw(folder):
+    take = read_take(folder / "take.toml")
+    seen = load_observations(take)
+    source = FrameSource(take, seen)
+    motion = read_motion(folder / "truth" / "motion.npz")
+    sensors = [[f.sensor for f in source.at(i, motion.body)] for i in range(8)]
+    assert all(s == ["tof", "colour", "markers 0"] for s in sensors)
+    assert set(source.accuracy(take)) == {"tof", "colour", "markers 0"}
+
+
+def test_a_take_of_three_kinds_of_sensors_is_fused(folder, tmp_path):
+    """Size and start are found from the depth images alone; what is tracked then is within centimetres."""
+    out = tmp_path / "out"
+    told = CliRunner().invoke(main, ["track", str(folder / "take.toml"), "-o", str(out), "--no-report"])
+    assert told.exit_code == 0, told.output
+    assert "colour" in told.output and "markers 0" in told.output
+    found, truth = read_motion(out / "motion.npz"), read_motion(folder / "truth" / "motion.npz")
+    x, y = (m.positions(m.body.landmarks.select(("neck", *MARKERS))) for m in (found, truth))
+    assert np.median(np.linalg.norm(x - y, axis=-1)) < 0.03
+    assert found.residuals["markers 0"].unit == "m" and found.residuals["colour"].unit == "px"
+    assert (out / "overlays" / "tof.mp4").stat().st_size > 1000 and (out / "montage.png").exists()
+
+
+def test_size_and_background_can_be_left_as_they_are(folder):
+    take = read_take(folder / "take.toml")
+    motion = fuse_take(take, load_observations(take), size=False)
+    assert len(motion) == 8 and np.isfinite(motion.angles).all()
+
+
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ('unit = 0.001', "millimetres|size|unit|none of the first"),
+        ('file = "few.trc"', "no such|does not exist|not there"),
+    ],
+)
+def test_what_is_wrong_is_named(folder, tmp_path, line, match):
+    text = (folder / "take.toml").read_text()
+    broken = {"unit = 0.001": "unit = 1.0", 'file = "few.trc"': 'file = "none.trc"'}[line]
+    path = folder / "broken.toml"
+    path.write_text(text.replace(line, broken))
+    with pytest.raises(KinefitError, match=match):
+        take = read_take(path)
+        fuse_take(take, load_observations(take))
