@@ -1,12 +1,7 @@
-"""Bodies that change their shape with their pose (P1 3): joints that move, surfaces that blend or bulge with an angle.
+"""Bodies in a pose with all that changes with it (P1 3): their skin, joints that move and surfaces that morph.
 
-Every operator is steered by one joint angle, which makes a weight s from 0 (nothing) to 1 (all of it):
-
-    joint motion    the joint, and all beyond it, is moved by exp(s ξ), P1's interpolating motor Mₜ        (P1 3.1)
-    global morph    F = F1 ω + F2 (1 − ω), s = 1 − ω: from the surface at rest to another of its topology  (P1 3.2)
-    local morph     every node is shifted by s r(node) d, r a radial basis function                        (P1 3.3)
-
-Shifts of nodes add up, so several operators may act on one patch. `morphing_cga` has the same as it is printed.
+What a body's operators are is told in `operators`; here they act. The derivative of every node includes what a morph
+adds to it, which P1 holds constant.
 """
 
 from __future__ import annotations
@@ -19,175 +14,185 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body
+from kinefit.bodies.operators import (
+    GlobalMorph,
+    JointMotion,
+    LocalMorph,
+    Operator,
+    SegmentMorph,
+    radial_basis,
+)
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.steering import Steering
-from kinefit.bodies.surfaces.triangles import BodyMesh
+from kinefit.bodies.surfaces import _kernels_skinning as kernels
+from kinefit.bodies.surfaces.skinning import SkinnedMesh
+from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, triangles
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
-from kinefit.geometry.cga import between, line_of, log, screw, twist_coordinates
 
+__all__ = [
+    "GlobalMorph",
+    "JointMotion",
+    "LocalMorph",
+    "MorphedPose",
+    "Morphing",
+    "Operator",
+    "SegmentMorph",
+    "radial_basis",
+]
 
-@dataclass(frozen=True, eq=False)
-class JointMotion:
-    """A joint that moves with an angle (P1 3.1): the shoulder that sinks as the arm does.
-
-    Parameters
-    ----------
-    segment : str, the segment beyond the joint; it and all behind it go along.
-    twist : (6,) ξ = (v, ω) [m, rad] in the root frame at rest; exp(s ξ) moves the joint from its place at rest.
-    steering : Steering
-    """
-
-    segment: str
-    twist: NDArray
-    steering: Steering
-
-    @classmethod
-    def shift(cls, segment: str, by: ArrayLike, steering: Steering) -> JointMotion:
-        """A motion by (3,) [m], without a turn."""
-        return cls(segment, np.concatenate([np.asarray(by, float), np.zeros(3)]), steering)
-
-    @classmethod
-    def between(cls, segment: str, line: ArrayLike, other: ArrayLike, steering: Steering) -> JointMotion:
-        """The shortest motion that takes a hinge's line to another: Plücker lines (6,) in the root frame at rest."""
-        M = between(screw(line_of(line)), screw(line_of(other)))
-        return cls(segment, twist_coordinates(log(M)), steering)
-
-
-@dataclass(frozen=True, eq=False)
-class GlobalMorph:
-    """A second surface of the same topology (P1 3.2): the steering angle blends from the surface at rest to it.
-
-    Parameters
-    ----------
-    target : (V, 3) [m] nodes in the root frame at rest.
-    steering : Steering
-    """
-
-    target: NDArray
-    steering: Steering
-
-    def field(self, x: NDArray, parameters: NDArray | None) -> NDArray:
-        """(V, 3) [m] shifts of the nodes x (V, 3) when all of it acts."""
-        if np.shape(self.target) != x.shape or not np.isfinite(self.target).all():
-            problem = f"a morph to {np.shape(self.target)} nodes of a surface that has {x.shape}, or not finite"
-            raise BodyError(problem, remedy="Both surfaces must have one topology.")
-        return np.asarray(self.target, float) - x
-
-
-@dataclass(frozen=True, eq=False)
-class LocalMorph:
-    """A bulge (P1 3.3): shifts by r d with r = Π exp(−(x − c)² / radius²), from a centre outwards ever less.
-
-    Parameters
-    ----------
-    centre, radii : (n,)
-        In space (n = 3) [m], or in the surface's own parameters, of which the nodes then have n each. An infinite
-        radius leaves a direction out. P1's r_x is the square of a radius.
-    shift : (3,) [m] d, of a node at the centre when all of it acts; any direction.
-    steering : Steering
-    """
-
-    centre: NDArray
-    radii: NDArray
-    shift: NDArray
-    steering: Steering
-
-    def field(self, x: NDArray, parameters: NDArray | None) -> NDArray:
-        """(V, 3) [m] shifts of the nodes x (V, 3), or of those at `parameters` (V, n), when all of it acts."""
-        at = x if parameters is None else parameters
-        return radial_basis(at, self.centre, self.radii)[:, None] * np.asarray(self.shift, float)
-
-
-def radial_basis(x: ArrayLike, centre: ArrayLike, radii: ArrayLike) -> NDArray:
-    """r(x) = Π_i exp(−(x_i − c_i)² / radius_i²) (...) of x (..., n), centre (n,) and radii (n,) (P1 3.3)."""
-    x, c, radius = np.asarray(x, float), np.asarray(centre, float), np.asarray(radii, float)
-    if c.shape != radius.shape or c.shape != x.shape[-1:] or not np.all(radius > 0) or not np.isfinite(c).all():
-        problem = f"a bulge with centre {c} and radii {radius} for nodes of {x.shape[-1]} coordinates"
-        raise BodyError(problem, remedy="Give as many of each, the radii positive.")
-    return np.exp(-np.sum(((x - c) / radius) ** 2, -1))
-
-
-Operator = JointMotion | GlobalMorph | LocalMorph
+_AROUND, _ALONG = 20, 6  # of cylinders, as `body_mesh` takes them
 
 
 class Morphing:
-    """A body with its mesh and the operators that change both.
+    """A body with its skin and the operators that change both.
 
     Parameters
     ----------
     body : Body
-    mesh : BodyMesh, nodes in the root frame at rest, each with its segment.
-    operators : any number of each kind.
+    mesh : nodes in the root frame at rest with their segments; default: the body's skin, or else its surfaces.
+    operators : any number of each kind; default: the body's own.
     parameters : (V, n) of the nodes, where local morphs are given in the surface's own parameters.
+
+    Attributes
+    ----------
+    mesh : what is posed, its `faces`, `segment` and `face_segment`.
+    skin : SkinnedMesh, the same.
 
     Raises
     ------
     BodyError
-        An unknown coordinate or segment; a target of another topology.
+        An unknown coordinate or segment; a target of another topology; a body without surfaces.
     """
 
     def __init__(
-        self, body: Body, mesh: BodyMesh, operators: Sequence[Operator], parameters: NDArray | None = None
+        self,
+        body: Body,
+        mesh: BodyMesh | SkinnedMesh | None = None,
+        operators: Sequence[Operator] | None = None,
+        parameters: NDArray | None = None,
     ) -> None:
-        self.body, self.mesh, self.operators = body, mesh, tuple(operators)
-        for operator in self.operators:
-            if operator.steering.coordinate not in body.tree.coordinates:
-                name = operator.steering.coordinate
-                raise BodyError(choices(f"angle of body '{body.name}' named", name, body.tree.coordinates))
-        self._motions = [(o, body.tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
-        if any(s == 0 for _, s in self._motions):
+        self.body = body
+        self.mesh = mesh or body.skin or body_mesh(body, around=_AROUND, along=_ALONG)
+        self.skin = self.mesh if isinstance(self.mesh, SkinnedMesh) else SkinnedMesh.of_mesh(self.mesh)
+        self.operators = body.morphs if operators is None else tuple(operators)
+        tree, x = body.tree, self.mesh.vertices
+        if self.skin.owners.size and self.skin.owners.max() >= len(tree.segments):
+            problem = f"a skin with segment {self.skin.owners.max()} for a body with {len(tree.segments)}"
+            raise BodyError(problem, remedy="Take the skin of this body.")
+        for o in self.operators:
+            if o.steering.coordinate not in tree.coordinates:
+                name = o.steering.coordinate
+                raise BodyError(choices(f"angle of body '{body.name}' named", name, tree.coordinates))
+        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
+        if any(s == 0 for _, s in motions):
             raise BodyError("the root has no joint that could move", remedy="Name a segment beyond a joint.")
-        morphs = [o for o in self.operators if not isinstance(o, JointMotion)]
-        self._fields = [(o.steering, o.field(mesh.vertices, parameters)) for o in morphs]
+        self._motions: dict[int, list[JointMotion]] = {}
+        for o, s in motions:
+            self._motions.setdefault(s, []).append(o)
+        self._fields: list[tuple[Steering, NDArray]] = []
+        for o in self.operators:
+            if isinstance(o, GlobalMorph):
+                self._fields.append((o.steering, o.field(x, parameters)))
+            elif isinstance(o, SegmentMorph):
+                self._fields.append((o.steering, self._segment_field(o)))
+            elif isinstance(o, LocalMorph):
+                self._fields.append((o.steering, self._share(o) * o.placed(tree).field(x, parameters)))
+        above = np.eye(len(tree.segments), dtype=bool)
+        for s in range(1, len(tree.segments)):
+            above[s] |= above[tree.parents[s]]
+        self._above = above
+
+    @property
+    def is_rigid(self) -> bool:
+        """Every node is owned by one segment, and nothing morphs: `Rows` can say all of it."""
+        return not self.operators and self.skin.owners.shape[1] == 1
+
+    def _share(self, morph: LocalMorph) -> NDArray:
+        """(V, 1) how much of each node belongs to segments that a local morph acts on."""
+        if not morph.on:
+            return np.ones((len(self.skin.nodes), 1))
+        chosen = np.isin(self.skin.owners, [self.body.tree.segment(name) for name in morph.on])
+        return np.sum(self.skin.weights * chosen, 1, keepdims=True)
+
+    def _segment_field(self, morph: SegmentMorph) -> NDArray:
+        """(V, 3) from a segment's surfaces to their second shape; for the mesh of the body's own surfaces."""
+        here, body = self.body.tree.segment(morph.segment), self.body
+        place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
+        meshes = [triangles(s, _AROUND, _ALONG) for s in body.surfaces]
+        if sum(len(v) for v, _ in meshes) != len(self.mesh.vertices) or self.mesh is body.skin:
+            problem = "a segment's surface blends to another, but what is drawn is a skin or a mesh of other points"
+            raise BodyError(problem, place=place, remedy="Take a global morph of all its nodes.")
+        targets = list(morph.surfaces)
+        if len(targets) != sum(s.segment == here for s in body.surfaces):
+            raise BodyError(f"{len(targets)} surfaces as the target of others", place=place, remedy=remedy)
+        out, first = np.zeros_like(self.mesh.vertices), 0
+        for surface, (v, faces) in zip(body.surfaces, meshes):
+            if surface.segment == here:
+                target, other = triangles(targets.pop(0), _AROUND, _ALONG)
+                if target.shape != v.shape or not np.array_equal(other, faces):
+                    raise BodyError("a surface that blends to one of another topology", place=place, remedy=remedy)
+                out[first : first + len(v)] = target - v
+            first += len(v)
+        return out
 
     def _steered(self, steering: Steering, state: BodyState) -> tuple[int, float, float]:
         d = self.body.tree.coordinate(steering.coordinate)
         return (d, *steering.at(float(state.angles[d])))
 
-    def pose(self, state: BodyState) -> MorphedPose:
-        """Frames, screws and nodes of a state."""
+    def _moved(self, state: BodyState) -> tuple[NDArray, NDArray, list[tuple[int, int, NDArray]]]:
+        """Frames (S, 12) and screws (D, 6) with the joints moved, and by how much angles move joints."""
         tree, centre = self.body.tree, state.T_world_root[:3, 3]
         plain, screws = tree.forward(state.T_world_root, state.angles)
-        Ts = se3.transform(plain[:, :9].reshape(-1, 3, 3), plain[:, 9:])
-        screws, moved = screws.copy(), np.broadcast_to(np.eye(4), Ts.shape).copy()
-        to_centre = se3.transform(np.eye(3), -centre)
         drives: list[tuple[int, int, NDArray]] = []
+        if not self._motions:
+            return plain, screws, drives
+        Ts = se3.transform(plain[:, :9].reshape(-1, 3, 3), plain[:, 9:])
+        moved: dict[int, NDArray] = {}  # by segments behind a joint that moves
+        to_centre, back = se3.transform(np.eye(3), -centre), se3.transform(np.eye(3), centre)
         for s in range(1, len(Ts)):
-            p = tree.parents[s]
-            moved[s] = moved[p]
-            for motion, segment in self._motions:
-                if segment == s:
-                    d, weight, slope = self._steered(motion.steering, state)
-                    at = moved[s] @ Ts[p]
+            p = int(tree.parents[s])
+            if p in moved:
+                moved[s] = moved[p]
+            for motion in self._motions.get(s, ()):
+                d, weight, slope = self._steered(motion.steering, state)
+                at = moved.get(s, np.eye(4)) @ Ts[p]
+                if slope:
                     drives.append((6 + d, s, slope * (se3.adjoint(to_centre @ at) @ motion.twist)))
-                    moved[s] = at @ se3.exp(weight * motion.twist) @ se3.inverse(Ts[p])
-            own = np.arange(tree.dof_start[s], tree.dof_start[s + 1])
-            about = to_centre @ moved[s] @ se3.inverse(to_centre)
-            screws[own] = screws[own] @ se3.adjoint(about).T
-        Ts = moved @ Ts
-        frames = np.concatenate([Ts[:, :3, :3].reshape(-1, 9), Ts[:, :3, 3]], 1)
-        nodes = self.mesh.vertices.copy()
-        slopes: dict[int, NDArray] = {}
+                moved[s] = at @ se3.exp(weight * motion.twist) @ se3.inverse(Ts[p])
+            if s in moved:
+                own = slice(tree.dof_start[s], tree.dof_start[s + 1])
+                screws[own] = screws[own] @ se3.adjoint(to_centre @ moved[s] @ back).T
+        frames = plain.copy()
+        for s, motion_of_s in moved.items():
+            T = motion_of_s @ Ts[s]
+            frames[s, :9], frames[s, 9:] = T[:3, :3].ravel(), T[:3, 3]
+        return frames, screws, drives
+
+    def pose(self, state: BodyState) -> MorphedPose:
+        """Frames, screws and nodes of a state."""
+        frames, screws, drives = self._moved(state)
+        shift, slopes = None, {}
         for steering, field in self._fields:
             d, weight, slope = self._steered(steering, state)
-            nodes += weight * field
+            if weight:
+                shift = weight * field if shift is None else shift + weight * field
             if slope:
-                slopes[6 + d] = slopes.get(6 + d, np.zeros_like(field)) + slope * field
-        return MorphedPose(self, state, np.ascontiguousarray(frames), screws, nodes, slopes, tuple(drives))
+                slopes[6 + d] = slopes[6 + d] + slope * field if 6 + d in slopes else slope * field
+        return MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
 
 
 @dataclass(frozen=True, eq=False)
 class MorphedPose:
-    """A morphed body in one state.
+    """A body with its skin in one state.
 
     Parameters
     ----------
     morphing : Morphing
     state : BodyState
     frames : (S, 12) and screws : (D, 6), like those of `KinematicTree.forward`.
-    nodes : (V, 3) [m] of the mesh, morphed, in the root frame at rest.
-    slopes : degree of freedom -> (V, 3) change of the nodes by it.
+    shift : (V, 3) [m] of the nodes at rest, by all morphs; None where nothing acts.
+    slopes : degree of freedom -> (V, 3) change of the nodes at rest by it.
     drives : (degree of freedom, segment, (6,) twist about the root's origin): what moves joints with angles.
     """
 
@@ -195,38 +200,65 @@ class MorphedPose:
     state: BodyState
     frames: NDArray
     screws: NDArray
-    nodes: NDArray
+    shift: NDArray | None
     slopes: dict[int, NDArray]
     drives: tuple[tuple[int, int, NDArray], ...]
+
+    @property
+    def nodes(self) -> NDArray:
+        """(V, 3) [m] of the mesh, morphed, in the root frame at rest."""
+        x = self.morphing.mesh.vertices
+        return x.copy() if self.shift is None else x + self.shift
 
     @cached_property
     def vertices(self) -> NDArray:
         """(V, 3) [m] nodes in the world."""
-        mesh = self.morphing.mesh
-        return BodyMesh(self.nodes, mesh.faces, mesh.segment, mesh.face_segment).posed(self.frames)
+        return self.morphing.skin.posed(self.frames, self.shift)
 
     def segment_jacobian(self, segment: int) -> NDArray:
         """J_s (6, 6 + D), as `KinematicTree.segment_jacobian`, with the joints' motions by their angles."""
-        tree = self.morphing.body.tree
-        out = tree.segment_jacobian(self.screws, segment)
-        above = segment
-        while above > 0:
-            for d, s, twist in self.drives:
-                if s == above:
-                    out[:, d] += twist
-            above = int(tree.parents[above])
+        out = self.morphing.body.tree.segment_jacobian(self.screws, segment)
+        for d, s, twist in self.drives:
+            if self.morphing._above[segment, s]:
+                out[:, d] += twist
+        return out
+
+    def along(self, index: ArrayLike, direction: ArrayLike, share: ArrayLike | None = None) -> NDArray:
+        """n·∂x/∂δ (N, 6 + D) of points of the surface along directions n, the morph's own part included.
+
+        Parameters
+        ----------
+        index : (N,) int, nodes; or (N, C), the nodes that each point lies between.
+        direction : (N, 3) in the world.
+        share : (N, C) of each of these nodes (barycentric coordinates).
+        """
+        skin, tree = self.morphing.skin, self.morphing.body.tree
+        n = np.ascontiguousarray(direction, float)
+        chosen = np.ascontiguousarray(np.asarray(index, np.int64).reshape(len(n), -1))
+        part = np.ones(chosen.shape) if share is None else np.ascontiguousarray(share, float)
+        if part.shape != chosen.shape or n.shape != (len(n), 3):
+            problem = f"points between nodes {chosen.shape} with shares {part.shape} and directions {n.shape}"
+            raise BodyError(problem, remedy="Give (N, C), (N, C) and (N, 3).")
+        if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(skin.nodes):
+            raise BodyError(f"nodes that a surface of {len(skin.nodes)} does not have", remedy="Count from 0.")
+        nodes = skin.nodes if self.shift is None else skin.nodes + self.shift[:, None]
+        drive_dof = np.array([d for d, _, _ in self.drives], np.int64)
+        drive_segment = np.array([s for _, s, _ in self.drives], np.int64)
+        drive_twist = np.array([t for _, _, t in self.drives]).reshape(-1, 6)
+        centre, out = np.ascontiguousarray(self.state.T_world_root[:3, 3]), np.empty((len(n), tree.n_dofs))
+        kernels.moves(
+            nodes, skin.owners, skin.weights, chosen, part, n, centre, self.frames, self.screws, tree.dof_parent,
+            tree.last_dof, drive_dof, drive_segment, drive_twist, self.morphing._above, out,
+        )  # fmt: skip
+        if self.slopes:
+            R = self.frames[:, :9].reshape(-1, 3, 3)
+            back = np.einsum("nck,nckij,ni->ncj", skin.weights[chosen], R[skin.owners[chosen]], n)
+            for d, slope in self.slopes.items():
+                out[:, d] += np.einsum("nc,ncj,ncj->n", part, back, slope[chosen])
         return out
 
     def jacobian(self, index: ArrayLike) -> NDArray:
         """(K, 3, 6 + D) change of the nodes `index` (K,) in the world by δ, the morph's own included."""
-        chosen = np.asarray(index, np.int64)
-        segments, arms = self.morphing.mesh.segment[chosen], self.vertices[chosen] - self.state.T_world_root[:3, 3]
-        out = np.empty((len(chosen), 3, self.morphing.body.tree.n_dofs))
-        for s in np.unique(segments):
-            rows, J = segments == s, self.segment_jacobian(int(s))
-            out[rows] = J[:3] - se3.hat(arms[rows]) @ J[3:]
-            R = self.frames[s, :9].reshape(3, 3)
-            for d, slope in self.slopes.items():
-                out[rows, :, d] += slope[chosen[rows]] @ R.T
-        return out
-
+        chosen = np.repeat(np.asarray(index, np.int64), 3)
+        axes = np.tile(np.eye(3), (len(chosen) // 3, 1))
+        return self.along(chosen, axes).reshape(-1, 3, self.morphing.body.tree.n_dofs)

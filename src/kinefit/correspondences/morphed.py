@@ -1,4 +1,4 @@
-"""Nodes of a morphed surface along directions: what a morph adds to the derivative included (P1 2.4, 3)."""
+"""Points of a body's skin along directions: blended between segments, moved by morphs (P1 2.4, 3)."""
 
 from __future__ import annotations
 
@@ -7,35 +7,49 @@ from numpy.typing import ArrayLike
 
 from kinefit.bodies.morphing import MorphedPose
 from kinefit.errors import ObservationError
-from kinefit.rows import ParameterRows
+from kinefit.rows import DofRows, Rows
 
 
 def morphed_rows(
-    pose: MorphedPose, index: ArrayLike, direction: ArrayLike, residual: ArrayLike, *, sigma: ArrayLike = 0.01
-) -> ParameterRows:
-    """One row a node, r ≈ n·J δ, gathered into one joint row on all degrees of freedom.
+    pose: MorphedPose,
+    index: ArrayLike,
+    direction: ArrayLike,
+    residual: ArrayLike,
+    *,
+    share: ArrayLike | None = None,
+    sigma: ArrayLike = 0.01,
+    group: ArrayLike | None = None,
+) -> Rows | DofRows:
+    """One row a point, r ≈ n·∂x/∂δ δ, with all that a morph adds to the derivative.
 
-    A morph ties a node to angles that move no segment of it, which `Rows` cannot say; so H = Σ w (nJ)ᵀ(nJ) goes in whole.
-    The cost that solvers report for it leaves out what no step can reduce: use it with `gauss_newton`, in a loop that
-    renews the rows.
+    Plain `Rows` where every node has one owner and nothing morphs, which are faster.
 
     Parameters
     ----------
-    pose : MorphedPose
-    index : (K,) int, nodes of the mesh.
+    pose : MorphedPose, of `Morphing(body).pose(state)`.
+    index : (K,) int, nodes of the mesh; or (K, C), the nodes that each point lies between, such as a face's corners.
     direction : (K, 3) unit, in the world.
-    residual : (K,) [m] how much further along it each node should lie; NaN for none.
+    residual : (K,) [m] how much further along it each point should lie; NaN for none.
+    share : (K, C) barycentric coordinates.
     sigma : scalar or (K,) [m]
+    group : (K,) int, default each point by itself; see `Rows`.
     """
-    chosen, n, r = np.asarray(index, np.int64), np.asarray(direction, float), np.asarray(residual, float)
+    n, r = np.asarray(direction, float), np.asarray(residual, float)
+    chosen = np.asarray(index, np.int64)
+    chosen = chosen[:, None] if chosen.ndim == 1 else chosen
     if n.shape != (len(chosen), 3) or r.shape != (len(chosen),):
         problem = f"{len(chosen)} nodes with directions of shape {n.shape} and residuals of shape {r.shape}"
         raise ObservationError(problem, remedy="Give (K, 3) and (K,).")
     deviation = np.broadcast_to(np.asarray(sigma, float), r.shape)
     if not np.all(deviation > 0):
         raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")
+    part = np.ones(chosen.shape) if share is None else np.asarray(share, float)
+    ids = np.arange(len(r)) if group is None else np.asarray(group, np.int64)
     seen = np.isfinite(r) & np.isfinite(n).all(1)
-    J = np.einsum("ki,kij->kj", n[seen], pose.jacobian(chosen[seen])) / deviation[seen, None]
-    H, g = J.T @ J, J.T @ (r[seen] / deviation[seen])
-    step = np.linalg.lstsq(H, g, rcond=1e-14)[0]  # g lies in the range of H, so H δ = g
-    return ParameterRows(np.arange(len(H)), step, H)
+    chosen, n, r, part, ids = chosen[seen], n[seen], r[seen], part[seen], ids[seen]
+    weight = 1.0 / deviation[seen] ** 2
+    skin = pose.morphing.skin
+    if pose.morphing.is_rigid and (skin.owners[chosen, 0] == skin.owners[chosen[:, :1], 0]).all():
+        x = np.einsum("kc,kci->ki", part, pose.vertices[chosen])
+        return Rows.of(skin.owners[chosen[:, 0], 0], x, n, r, weight, ids)
+    return DofRows(pose.along(chosen, n, part), r, weight, ids)

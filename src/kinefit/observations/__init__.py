@@ -5,7 +5,7 @@ one sensor, `frames` what it saw at one time.
 """
 
 from kinefit.observations.depth import CloudVideo, DepthVideo
-from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, Markers, SkeletonMotion
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "MarkerFrame",
     "Markers",
     "PointCloud",
+    "SilhouetteFrame",
     "SkeletonMotion",
 ]

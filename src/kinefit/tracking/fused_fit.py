@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.solvers.equations import Covariance, inverse, joint_std
 from kinefit.solvers.least_squares import gauss_newton
@@ -22,6 +22,7 @@ from kinefit.tracking.evidence import Evidence
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import belief
+from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement
 from kinefit.tracking.surface import Surface
 
 Held = tuple[BodyState, NDArray]
@@ -97,6 +98,9 @@ class FusedFit:
         if isinstance(frame, MarkerFrame):
             return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
+        if isinstance(frame, SilhouetteFrame):
+            sigma = self.accuracy.get(name, s.silhouette)
+            return SilhouetteMeasurement(frame, self.rig[name], surface, surface.posed(state), sigma, s)
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):
             return CloudMeasurement(frame, surface, vertices, sigma, s)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import body_mesh, sample
 from kinefit.correspondences.depth_image import SurfaceSamples
+from kinefit.correspondences.rims import RimFinder
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
@@ -64,6 +67,11 @@ class Surface:
         if camera not in self._canvases:
             self._canvases[camera] = Canvas(small.size)
         return self._canvases[camera].draw_for(small, vertices_world, self.mesh.faces, cull=True).depth
+
+    @cached_property
+    def rims(self) -> RimFinder:
+        """What finds its outline in a camera."""
+        return RimFinder(self.mesh)
 
     def layers(self, camera: Camera) -> Layers:
         """Room to draw it segment by segment."""

@@ -4,6 +4,7 @@ from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.nearest import Nearest, nearest
+from kinefit.bodies.surfaces.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.tables import SurfaceTables
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, triangles
 
@@ -16,6 +17,7 @@ __all__ = [
     "FourierSurface",
     "MeshSurface",
     "Nearest",
+    "SkinnedMesh",
     "Surface",
     "SurfaceTables",
     "TaperedCylinder",

@@ -1,0 +1,112 @@
+"""Compiled outlines: rim points of a mesh in a virtual image, and which points of two outlines belong together.
+
+An outline is told by points (u, v) [px] with unit normals (a, b) that point away from the body.
+"""
+
+from __future__ import annotations
+
+import math
+
+from kinefit._jit import jit
+
+OUTER, INNER = 0, 1
+_REACH = 1.0  # [px] from the rim to the two pixels that tell what is on both sides of it
+
+
+@jit
+def _pixel(v, size):
+    """Nearest pixel, or -1 beside the image."""
+    i = math.floor(v + 0.5)
+    return i if 0 <= i < size else -1
+
+
+@jit
+def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, front, out, place, kind):
+    """Rim points of a mesh that was drawn: how many were written.
+
+    Edges between a face that looks at the camera and one that does not are the rims; points are put on them `spacing`
+    [px] apart. The images of depth and faces tell whether such a point is seen, and what lies behind: nothing (OUTER),
+    or something farther away than `apart` [m] (INNER).
+
+    x (V, 3) [m] in the camera's frame and uv (V, 2) [px] of the vertices; faces (T, 3) with label (T,); edges (E, 2)
+    with the faces on both sides (E, 2), -1 for none; depth, face (H, W) as drawn; near [m] by which the surface just
+    inside of the rim may differ in depth from it; front (T,) int8 room.
+    out (4, N): u, v, a, b; place (N, 2): vertex pair's number and share of its second vertex; kind (N,).
+    """
+    height, width = depth.shape
+    for t in range(len(faces)):
+        i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
+        ahead = x[i, 2] > 0.0 and x[j, 2] > 0.0 and x[k, 2] > 0.0
+        area = (uv[j, 0] - uv[i, 0]) * (uv[k, 1] - uv[i, 1]) - (uv[k, 0] - uv[i, 0]) * (uv[j, 1] - uv[i, 1])
+        front[t] = -1 if not ahead else (1 if area < 0.0 else 0)
+    n, carried, room = 0, 0.5, out.shape[1]
+    for e in range(len(edges)):
+        one, two = sides[e, 0], sides[e, 1]
+        if two < 0:
+            if front[one] != 1:
+                continue
+        elif front[one] < 0 or front[two] < 0 or front[one] == front[two]:
+            continue
+        own = one if front[one] == 1 else two
+        i, j = edges[e, 0], edges[e, 1]
+        du, dv = uv[j, 0] - uv[i, 0], uv[j, 1] - uv[i, 1]
+        length = math.sqrt(du * du + dv * dv)
+        if not (1e-9 < length < 1e6):
+            continue
+        a, b = -dv / length, du / length
+        k = faces[own, 0] + faces[own, 1] + faces[own, 2] - i - j
+        if a * (uv[k, 0] - uv[i, 0]) + b * (uv[k, 1] - uv[i, 1]) > 0.0:
+            a, b = -a, -b
+        carried += length / spacing
+        count = int(carried)
+        carried -= count
+        for s in range(count):
+            if n >= room:
+                return n
+            t = (s + 0.5) / count
+            u, v = uv[i, 0] + t * du, uv[i, 1] + t * dv
+            p, q = _pixel(u - _REACH * a, width), _pixel(v - _REACH * b, height)
+            r, w = _pixel(u + _REACH * a, width), _pixel(v + _REACH * b, height)
+            if p < 0 or q < 0 or r < 0 or w < 0 or face[q, p] < 0:
+                continue
+            z = 1.0 / ((1.0 - t) / x[i, 2] + t / x[j, 2])
+            inside, outside = depth[q, p], depth[w, r]
+            allowed = 3.0 * near if label[face[q, p]] == label[own] else near
+            if inside < z - allowed or inside > z + near:
+                continue
+            if face[w, r] >= 0 and outside < z + apart:
+                continue
+            out[0, n], out[1, n], out[2, n], out[3, n] = u, v, a, b
+            place[n, 0], place[n, 1] = e, t * z / x[j, 2]
+            kind[n] = OUTER if face[w, r] < 0 else INNER
+            n += 1
+    return n
+
+
+@jit
+def match(model, image, reach, cosine, to_image, to_model):
+    """For every point of each outline (4, N), (4, M) the nearest one of the other that looks the same way, else -1.
+
+    reach [px]; cosine of the largest angle between normals. A turned normal counts as farther away: d² (2 - cos).
+    """
+    most = reach * reach
+    best = to_model[1]
+    for k in range(image.shape[1]):
+        best[k], to_model[0, k] = math.inf, -1.0
+    for i in range(model.shape[1]):
+        u, v, a, b = model[0, i], model[1, i], model[2, i], model[3, i]
+        least, chosen = math.inf, -1
+        for k in range(image.shape[1]):
+            du, dv = image[0, k] - u, image[1, k] - v
+            square = du * du + dv * dv
+            if square > most:
+                continue
+            c = a * image[2, k] + b * image[3, k]
+            if c < cosine:
+                continue
+            square *= 2.0 - c
+            if square < least:
+                least, chosen = square, k
+            if square < best[k]:
+                best[k], to_model[0, k] = square, float(i)
+        to_image[i] = chosen

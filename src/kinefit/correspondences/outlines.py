@@ -1,0 +1,99 @@
+"""Outline to outline: rim points of the body towards the contour of its silhouette (P1 4.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences import _kernels
+from kinefit.correspondences import _kernels_outlines as kernels
+from kinefit.correspondences.rims import Rim
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.geometry.lines import line_along
+from kinefit.rows import Rows
+
+
+def outline_pairs(
+    rim: NDArray, image: NDArray, *, reach: float, angle: float = 1.0, both: bool = True
+) -> tuple[NDArray, NDArray]:
+    """Points of two outlines (4, N) and (4, M) that belong together: indices (K,) of the first and of the second.
+
+    Each point of the body's rim gets the nearest point of the image's outline that looks the same way; with `both`,
+    each point of the image's the nearest of the rim too: that draws parts of the body to where the image shows
+    something that nothing explains.
+
+    Parameters
+    ----------
+    reach : float [px] beyond which no points are paired.
+    angle : float [rad] beyond which two normals do not look the same way.
+    """
+    to_image = np.empty(rim.shape[1], np.int64)
+    to_model = np.empty((2, image.shape[1]))
+    kernels.match(rim, image, reach, np.cos(angle), to_image, to_model)
+    first = np.flatnonzero(to_image >= 0)
+    pairs = [(first, to_image[first])]
+    if both:
+        second = np.flatnonzero(to_model[0] >= 0)
+        pairs.append((to_model[0, second].astype(np.int64), second))
+    i, k = (np.concatenate(side) for side in zip(*pairs))
+    return i, k
+
+
+def outline_rows(
+    body: Body,
+    state: BodyState,
+    rim: Rim,
+    vertices_world: NDArray,
+    camera: Camera,
+    image: NDArray,
+    *,
+    sigma: float = 2.0,
+    reach: float = 30.0,
+    angle: float = 1.0,
+    both: bool = True,
+    by: str = "pixels",
+) -> Rows:
+    """Rows that draw the rim of a body onto the outline of its silhouette; see `outline_pairs`.
+
+    By "pixels", one row a pair: the rim point's pixel should lie on the tangent of the outline, so that outlines glide
+    along each other. By "rays", two rows a pair: the rim point should lie on the ray of the outline's point (P1's
+    constraint).
+
+    Parameters
+    ----------
+    rim : Rim of the body at this state in this camera; its inner points are left out.
+    vertices_world : (V, 3) [m] of the mesh at this state.
+    camera : Camera, of the image's size.
+    image : (4, M) outline of the silhouette: u, v [px], normal.
+    sigma : float [px] standard deviation of a pair.
+    reach, angle, both : see `outline_pairs`.
+    """
+    if by not in ("pixels", "rays"):
+        raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')
+    if not sigma > 0:
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+    shown = np.flatnonzero(~rim.inner)
+    i, k = outline_pairs(np.ascontiguousarray(rim.outline[:, shown]), image, reach=reach, angle=angle, both=both)
+    i = shown[i]
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    owner = rim.segment[i]
+    f = frames[owner]
+    x = rim.on(vertices_world)[i] - f[:, 9:]
+    rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), x))
+    u, v, a, b = image[:, k]
+    count = len(i)
+    data, segment, group = _kernels.buffers(2 * count)
+    if by == "rays":
+        rays = line_along(camera.centre_world, camera.ray(np.stack([u, v], axis=1)))
+        focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+        depth = (f[:, 9:] + x) @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+        weight = np.where(np.isfinite(rays).all(axis=1), (focal / (depth * sigma)) ** 2, 0.0)
+        used = _kernels.ray_rows(frames, owner, rest, np.nan_to_num(rays), weight, data, segment, group, 0)
+    else:
+        lines = np.stack([a, b, -(a * u + b * v)], axis=1)
+        at, weight = np.zeros(count, np.int64), np.full(count, 1.0 / sigma**2)
+        packed = camera.packed[None]
+        used = _kernels.image_line_rows(frames, owner, rest, packed, at, lines, weight, data, segment, group, 0)
+    return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])

@@ -1,0 +1,116 @@
+"""A silhouette of one time, made ready once, so that every iteration makes its rows quickly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.correspondences.outlines import outline_pairs, outline_rows
+from kinefit.correspondences.rims import Rim
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.images.silhouette import choose_person, outline
+from kinefit.observations import SilhouetteFrame
+from kinefit.rendering import scaled
+from kinefit.rows import Rows
+from kinefit.tracking.evidence import Evidence
+from kinefit.tracking.fusion_settings import FusionSettings
+from kinefit.tracking.surface import Surface
+
+_AGREES = 3.0  # standard deviations of a rim that agrees
+_SPACING = 3.0  # [px] between points of an outline, in the image in which they are compared
+_LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
+
+
+class SilhouetteMeasurement:
+    """The silhouette in one camera: the body's rim and the image's outline towards each other.
+
+    Parameters
+    ----------
+    frame : SilhouetteFrame
+    camera : Camera
+    surface : Surface of the body
+    vertices : (V, 3) [m]
+        Its mesh where the body is thought to be: of several blobs it tells which are the body's.
+    sigma : float [px] standard deviation of the outline, shape of the body included, in the camera's image.
+
+    Raises
+    ------
+    ObservationError
+        A mask of another size than the camera's.
+    """
+
+    def __init__(
+        self, frame: SilhouetteFrame, camera: Camera, surface: Surface, vertices: NDArray, sigma: float,
+        settings: FusionSettings,
+    ) -> None:  # fmt: skip
+        if frame.size != camera.size:
+            problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
+            raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
+        scale = min(settings.outline / max(camera.size), 1.0)
+        self.sensor, self.camera, self.surface, self._settings = frame.sensor, scaled(camera, scale), surface, settings
+        self.sigma = max(sigma * scale, 0.5)
+        mask = frame.mask
+        if scale < 1.0:
+            mask = cv2.resize(mask, self.camera.size, interpolation=cv2.INTER_AREA)
+        focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
+        z = vertices @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
+        self._per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
+        rim = surface.rims.find(vertices, self.camera, spacing=_SPACING)
+        self.mask = choose_person(mask, self._about(settings.reach * self._per_metre))
+        points = outline(self.mask)
+        self._image = np.ascontiguousarray(points[:, :: max(round(1.3 * _SPACING), 1)])
+        self._first: tuple[NDArray, Rim] | None = (vertices, rim)
+        # Over a patch of the surface the errors of an outline are alike, and every place is told of from both sides.
+        share = min(_SPACING / (settings.patch * self._per_metre), 1.0)
+        self._row_sigma = self.sigma / np.sqrt(share / 2.0)
+
+    def _about(self, reach: float) -> NDArray:
+        """(h, w) bool: as far about the body, as it was drawn last, as it may have moved."""
+        seen = self.surface.rims.drawn(self.camera) >= 0
+        size = 2 * int(np.ceil(reach)) + 1
+        return cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+
+    def rim(self, state: BodyState) -> tuple[NDArray, Rim]:
+        """Vertices in the world and the rim at a state."""
+        vertices = self.surface.posed(state)
+        if self._first is not None and self._first[0] is vertices:
+            return self._first
+        self._first = vertices, self.surface.rims.find(vertices, self.camera, spacing=_SPACING)
+        return self._first
+
+    def rows(self, state: BodyState, bound: float) -> list[Rows]:
+        """Rows at a state, softened at half the bound."""
+        reach = max(bound * self._per_metre, _AGREES * self.sigma, _LEAST)
+        vertices, rim = self.rim(state)
+        rows = outline_rows(
+            self.surface.body, state, rim, vertices, self.camera, self._image, sigma=self._row_sigma, reach=reach,
+            angle=self._settings.angle,
+        )  # fmt: skip
+        square = rows.data[7] * rows.data[6] ** 2 * self._row_sigma**2  # [px²]
+        rows.data[7] /= (1.0 + square / (0.5 * reach) ** 2) ** 2
+        rows.group[:] = -1  # softened already
+        return [rows]
+
+    def evidence(self, state: BodyState) -> Evidence:
+        """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""
+        _, rim = self.rim(state)
+        shown = rim.chosen(~rim.inner)
+        count = len(self.surface.areas)
+        reach = max(_AGREES * self.sigma, _LEAST)
+        i, _ = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle, both=False)
+        agreeing = np.bincount(shown.segment[i], minlength=count)
+        seen = np.bincount(shown.segment, minlength=count)
+        whole = np.maximum(self._outline_of_segments(), 1.0)
+        return Evidence(agreeing / whole, (seen - agreeing) / whole)
+
+    def _outline_of_segments(self) -> NDArray:
+        """(S,) points on the outline of each segment, about, if it were seen alone."""
+        return np.sqrt(np.pi * self.surface.areas) * self._per_metre / _SPACING
+
+    def view(self) -> None:
+        """Outlines do not show where a limb is in space."""
+
+
