@@ -8,7 +8,7 @@ from kinefit.bodies import BodyState, load_body
 from kinefit.bodies import morphing_cga as printed
 from kinefit.bodies.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
 from kinefit.bodies.steering import WEIGHTS, Steering, weight_function
-from kinefit.bodies.surfaces import BodyMesh, body_mesh
+from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, body_mesh
 from kinefit.correspondences.morphed import morphed_rows
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import cga, lines, se3
@@ -22,6 +22,13 @@ def random_mesh(body, count=60):
     segment = np.sort(random.integers(0, len(body.tree.segments), count)).astype(np.int32)
     nodes = random.normal(scale=0.3, size=(count, 3)) + body.tree.rest[segment]
     return BodyMesh(nodes, np.zeros((0, 3), np.int32), segment, np.zeros(0, np.int32))
+
+
+def random_skin(body, count=60):
+    """Nodes without meaning, each blended between three segments that carry it at places of their own."""
+    owners = random.integers(0, len(body.tree.segments), (count, 3))
+    nodes = random.normal(scale=0.3, size=(count, 3, 3)) + body.tree.rest[owners]
+    return SkinnedMesh(nodes, np.zeros((0, 3), int), owners, random.dirichlet(np.ones(3), count))
 
 
 def everything(body, mesh):
@@ -154,8 +161,12 @@ def test_the_chain_is_the_product_of_the_papers_motors(scene):
         np.testing.assert_allclose(cga.matrix(motor), frame, atol=1e-12)
 
 
-def test_derivatives_by_differences(scene):
+@pytest.mark.parametrize("blended", [False, True])
+def test_derivatives_by_differences(scene, blended):
     body, mesh, state, operators = scene
+    if blended:
+        mesh = random_skin(body)
+        operators = everything(body, mesh)
     morphing = Morphing(body, mesh, operators)
     J, h = morphing.pose(state).jacobian(np.arange(len(mesh.vertices))), 1e-6
     assert np.any(np.abs(J[:, :, 6:] - Morphing(body, mesh, []).pose(state).jacobian(range(60))[:, :, 6:]) > 1e-2)
@@ -227,7 +238,7 @@ def steered(**changes):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda b, m: [LocalMorph([0] * 3, [1] * 3, [0] * 3, steered(coordinate="arm"))], "no angle of body 'humanoid'"),
+        (lambda b, m: [LocalMorph([0] * 3, [1] * 3, [0] * 3, steered(coordinate="arm"))], "no angle of body"),
         (lambda b, m: [JointMotion.shift("arm", [0] * 3, steered())], "no segment 'arm'"),
         (lambda b, m: [JointMotion.shift("pelvis", [0] * 3, steered())], "the root has no joint"),
         (lambda b, m: [GlobalMorph(m.vertices[:-1], steered())], "a morph to"),

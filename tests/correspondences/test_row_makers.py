@@ -20,6 +20,9 @@ from tests.oracle import (
 
 import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
+from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
+from kinefit.bodies.steering import Steering
+from kinefit.bodies.surfaces import SkinnedMesh
 from kinefit.correspondences import (
     Bands,
     band_rows,
@@ -30,6 +33,7 @@ from kinefit.correspondences import (
     free_space_rows,
     image_line_rows,
     limit_rows,
+    morphed_rows,
     pixel_rows,
     plane_rows,
     point_rows,
@@ -123,6 +127,7 @@ CASES = {
         lambda state: free_space_rows(s.body, state, *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
     ),
     "surface_rows": lambda s: about_surfaces(s),
+    "morphed_rows": lambda s: on_a_morphed_skin(s),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
     "prediction_rows": lambda s: (
@@ -145,6 +150,29 @@ def about_surfaces(s):
     points = PointSet(tuple(f"{k}" for k in range(3 * count)), owner, random.normal(scale=0.2, size=(3 * count, 3)))
     x = slow_positions(body, s.state, points)
     return lambda state: surface_rows(body, state, x, segment=owner, max_distance=5.0, sigma=0.7, exact=True)
+
+
+def on_a_morphed_skin(s):
+    """Points between three nodes each of a skin that morphs, every node blended between three segments."""
+    random, tree = np.random.default_rng(5), s.body.tree
+    owners = random.integers(0, len(tree.segments), (40, 3))
+    nodes = tree.rest[owners] + random.normal(scale=0.2, size=(40, 3, 3))
+    skin = SkinnedMesh(nodes, np.zeros((0, 3), int), owners, random.dirichlet(np.ones(3), 40))
+    steer = lambda k: Steering(tree.coordinates[k], -20.0, 20.0)
+    operators = [
+        JointMotion(tree.segments[4], random.normal(size=6), steer(1)),
+        LocalMorph(skin.vertices[0], [0.5, 0.5, 0.5], [0.0, 1.0, 2.0], steer(2)),
+    ]
+    morphing, index, share = Morphing(s.body, skin, operators), random.integers(0, 40, (30, 3)), random.random((30, 3))
+    share, n = share / share.sum(1, keepdims=True), random_unit(random, 30)
+    target = np.einsum("nc,nci->ni", share, morphing.pose(s.state).vertices[index]) + random.normal(size=(30, 3))
+
+    def rows(state):
+        pose = morphing.pose(state)
+        away = target - np.einsum("nc,nci->ni", share, pose.vertices[index])
+        return morphed_rows(pose, index, n, np.sum(n * away, axis=1), share=share, sigma=0.7)
+
+    return rows
 
 
 def random_capsules(s):

@@ -138,7 +138,8 @@ class LocalMorph:
         """With its centre in the root frame at rest."""
         if self.segment is None:
             return self
-        return replace(self, centre=np.asarray(self.centre, float) + tree.rest[tree.segment(self.segment)], segment=None)
+        centre = np.asarray(self.centre, float) + tree.rest[tree.segment(self.segment)]
+        return replace(self, centre=centre, segment=None)
 
     def field(self, x: NDArray, parameters: NDArray | None) -> NDArray:
         """(V, 3) [m] shifts of the nodes x (V, 3), or of those at `parameters` (V, n), when all of it acts."""

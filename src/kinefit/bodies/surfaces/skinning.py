@@ -53,7 +53,8 @@ class SkinnedMesh:
         if nodes.ndim != 3 or nodes.shape[2] != 3 or owners.shape != nodes.shape[:2] or weights.shape != owners.shape:
             problem = f"a skin of nodes {nodes.shape}, owners {owners.shape} and weights {weights.shape}"
             raise BodyError(problem, remedy="Give (V, K, 3), (V, K) and (V, K).")
-        if faces.ndim != 2 or faces.shape[1:] != (3,) or faces.size and not 0 <= faces.min() <= faces.max() < len(nodes):
+        known = not faces.size or 0 <= faces.min() <= faces.max() < len(nodes)
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or not known:
             raise BodyError(f"a skin of {len(nodes)} nodes has faces {faces.shape} of others", remedy="Count from 0.")
         if not np.isfinite(nodes).all():
             bad = int(np.flatnonzero(~np.isfinite(nodes).all((1, 2)))[0])
@@ -138,7 +139,7 @@ class SkinnedMesh:
         return out
 
     def stretched(self, old: NDArray, new: NDArray, factors: NDArray) -> SkinnedMesh:
-        """The skin of a body whose segments are stretched by factors (S,), their joints moved from old to new (S, 3)."""
+        """The skin on segments stretched by factors (S,), their joints moved from old to new (S, 3)."""
         k = self.owners
         return SkinnedMesh(new[k] + factors[k][..., None] * (self.nodes - old[k]), self.faces, k, self.weights)
 
