@@ -48,49 +48,44 @@ def outline_rows(
     vertices_world: NDArray,
     camera: Camera,
     image: NDArray,
+    pairs: tuple[NDArray, NDArray],
     *,
     sigma: float = 2.0,
-    reach: float = 30.0,
-    angle: float = 1.0,
-    both: bool = True,
     by: str = "pixels",
 ) -> Rows:
-    """Rows that draw the rim of a body onto the outline of its silhouette; see `outline_pairs`.
+    """Rows that draw the rim of a body onto the outline of its silhouette.
 
     By "pixels", one row a pair: the rim point's pixel should lie on the tangent of the outline, so that outlines glide
     along each other. By "rays", two rows a pair: the rim point should lie on the ray of the outline's point (P1's
-    constraint).
+    constraint). The rows of one pair bear its number as their measurement id.
 
     Parameters
     ----------
-    rim : Rim of the body at this state in this camera; its inner points are left out.
+    rim : Rim of the body at this state in this camera.
     vertices_world : (V, 3) [m] of the mesh at this state.
     camera : Camera, of the image's size.
     image : (4, M) outline of the silhouette: u, v [px], normal.
+    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
     sigma : float [px] standard deviation of a pair.
-    reach, angle, both : see `outline_pairs`.
     """
     if by not in ("pixels", "rays"):
         raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')
     if not sigma > 0:
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
-    shown = np.flatnonzero(~rim.inner)
-    i, k = outline_pairs(np.ascontiguousarray(rim.outline[:, shown]), image, reach=reach, angle=angle, both=both)
-    i = shown[i]
+    i, k = pairs
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    owner = rim.segment[i]
+    owner, points = rim.segment[i], rim.chosen(i).on(vertices_world)
     f = frames[owner]
-    x = rim.on(vertices_world)[i] - f[:, 9:]
-    rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), x))
+    rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), points - f[:, 9:]))
     u, v, a, b = image[:, k]
     count = len(i)
     data, segment, group = _kernels.buffers(2 * count)
     if by == "rays":
         rays = line_along(camera.centre_world, camera.ray(np.stack([u, v], axis=1)))
         focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
-        depth = (f[:, 9:] + x) @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-        weight = np.where(np.isfinite(rays).all(axis=1), (focal / (depth * sigma)) ** 2, 0.0)
-        used = _kernels.ray_rows(frames, owner, rest, np.nan_to_num(rays), weight, data, segment, group, 0)
+        depth = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+        weight = np.where(depth > 0.0, (focal / (depth * sigma)) ** 2, 0.0)
+        used = _kernels.ray_rows(frames, owner, rest, rays, weight, data, segment, group, 0)
     else:
         lines = np.stack([a, b, -(a * u + b * v)], axis=1)
         at, weight = np.zeros(count, np.int64), np.full(count, 1.0 / sigma**2)

@@ -51,20 +51,21 @@ class SilhouetteMeasurement:
             raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
         scale = min(settings.outline / max(camera.size), 1.0)
         self.sensor, self.camera, self.surface, self._settings = frame.sensor, scaled(camera, scale), surface, settings
+        #: [px] standard deviation in the image in which outlines are compared
         self.sigma = max(sigma * scale, 0.5)
         mask = frame.mask
         if scale < 1.0:
             mask = cv2.resize(mask, self.camera.size, interpolation=cv2.INTER_AREA)
         focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
         z = vertices @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
-        self._per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
+        self.pixels_per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
         rim = surface.rims.find(vertices, self.camera, spacing=_SPACING)
-        self.mask = choose_person(mask, self._about(settings.reach * self._per_metre))
+        self.mask = choose_person(mask, self._about(settings.reach * self.pixels_per_metre))
         points = outline(self.mask)
         self._image = np.ascontiguousarray(points[:, :: max(round(1.3 * _SPACING), 1)])
         self._first: tuple[NDArray, Rim] | None = (vertices, rim)
         # Over a patch of the surface the errors of an outline are alike, and every place is told of from both sides.
-        share = min(_SPACING / (settings.patch * self._per_metre), 1.0)
+        share = min(_SPACING / (settings.patch * self.pixels_per_metre), 1.0)
         self._row_sigma = self.sigma / np.sqrt(share / 2.0)
 
     def _about(self, reach: float) -> NDArray:
@@ -83,16 +84,22 @@ class SilhouetteMeasurement:
 
     def rows(self, state: BodyState, bound: float) -> list[Rows]:
         """Rows at a state, softened at half the bound."""
-        reach = max(bound * self._per_metre, _AGREES * self.sigma, _LEAST)
+        return [self.linked(state, bound)[0]]
+
+    def linked(self, state: BodyState, bound: float) -> tuple[Rows, Rim]:
+        """The rows at a state, and the point of the rim that each is about."""
+        reach = max(bound * self.pixels_per_metre, _AGREES * self.sigma, _LEAST)
         vertices, rim = self.rim(state)
+        shown = rim.chosen(~rim.inner)
+        pairs = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle)
         rows = outline_rows(
-            self.surface.body, state, rim, vertices, self.camera, self._image, sigma=self._row_sigma, reach=reach,
-            angle=self._settings.angle,
-        )  # fmt: skip
+            self.surface.body, state, shown, vertices, self.camera, self._image, pairs, sigma=self._row_sigma
+        )
         square = rows.data[7] * rows.data[6] ** 2 * self._row_sigma**2  # [px²]
         rows.data[7] /= (1.0 + square / (0.5 * reach) ** 2) ** 2
+        points = shown.chosen(pairs[0][rows.group])
         rows.group[:] = -1  # softened already
-        return [rows]
+        return rows, points
 
     def evidence(self, state: BodyState) -> Evidence:
         """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""
@@ -108,7 +115,7 @@ class SilhouetteMeasurement:
 
     def _outline_of_segments(self) -> NDArray:
         """(S,) points on the outline of each segment, about, if it were seen alone."""
-        return np.sqrt(np.pi * self.surface.areas) * self._per_metre / _SPACING
+        return np.sqrt(np.pi * self.surface.areas) * self.pixels_per_metre / _SPACING
 
     def view(self) -> None:
         """Outlines do not show where a limb is in space."""
