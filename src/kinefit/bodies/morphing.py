@@ -172,7 +172,8 @@ class Morphing:
     def pose(self, state: BodyState) -> MorphedPose:
         """Frames, screws and nodes of a state."""
         frames, screws, drives = self._moved(state)
-        shift, slopes = None, {}
+        shift: NDArray | None = None
+        slopes: dict[int, NDArray] = {}
         for steering, field in self._fields:
             d, weight, slope = self._steered(steering, state)
             if weight:
