@@ -7,6 +7,7 @@ one sensor, `frames` what it saw at one time.
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, Markers, SkeletonMotion
+from kinefit.observations.silhouettes import SilhouetteVideo
 
 __all__ = [
     "MEDIAPIPE_33",
@@ -21,5 +22,6 @@ __all__ = [
     "Markers",
     "PointCloud",
     "SilhouetteFrame",
+    "SilhouetteVideo",
     "SkeletonMotion",
 ]

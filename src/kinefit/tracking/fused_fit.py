@@ -71,7 +71,7 @@ class FusedFit:
     body : Body, with surfaces where depth is to be used.
     rig : Rig
     rate : float [Hz] of the frames
-    accuracy : {sensor: standard deviation}, [m] or [px]; others have those of the settings.
+    accuracy : {sensor: standard deviation}, [m] or [px], "silhouette CAMERA" for silhouettes; others have the settings'.
     settings : FusionSettings
     backgrounds : {depth camera: Background}, added to when one is seen first; None for one that is to have none.
     """
@@ -99,7 +99,7 @@ class FusedFit:
             return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
         if isinstance(frame, SilhouetteFrame):
-            sigma = self.accuracy.get(name, s.silhouette)
+            sigma = self.accuracy.get(f"silhouette {name}", s.silhouette)
             return SilhouetteMeasurement(frame, self.rig[name], surface, surface.posed(state), sigma, s)
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):

@@ -39,7 +39,8 @@ class FusionTracker:
     body : Body, with surfaces where depth is to be used.
     rig : Rig of all cameras, depth cameras among them.
     rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
-    accuracy : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
+    accuracy : {sensor: standard deviation}
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
     up : (3,) upwards in the world, for a start with no pose given.
     on_body : depth cameras whose images show nothing but the body: no background is learnt.
 
