@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.figures import figure
+from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, conformal
 from kinefit.geometry import cga, lines, se3
 from kinefit.geometry.cga import e, exp, point, twist, versor
 from kinefit.geometry.cga_pose import point_line
@@ -36,6 +37,14 @@ def run() -> None:
     apart = cga.twist_coordinates(motors * joint * ~motors)
     apart -= (se3.adjoint(T) @ cga.twist_coordinates(joint)[..., None])[..., 0]
     figure("cga_joint_moved", float(np.abs(apart).max()), "m, rad", "<= 1e-12")
+    curve, surface = FourierCurve.of(random.normal(size=(51, 3))), FourierSurface.of(random.normal(size=(21, 17, 3)))
+    u, v = random.random((2, 200))
+    for name, fast, printed in (
+        ("curve", curve.at(u), conformal(curve, u)),
+        ("surface", surface.at(u, v), conformal(surface, u, v)),
+    ):
+        gap = np.moveaxis(printed.values, 0, -1) - fast
+        figure(f"cga_fourier_{name}", float(np.abs(gap).max()), "m", "<= 1e-10")
 
 
 def least_ms(work: Callable[[], object]) -> float:

@@ -83,3 +83,10 @@ def test_a_live_source(capsys):
     assert error < 0.015
     assert tracker.dropped == tracker.late == 0
     assert capsys.readouterr().out.count("quality") == 8
+
+
+def test_a_morph_of_ones_own(tmp_path):
+    errors = example("05_own_morph").main(tmp_path / "arm.png")
+    assert errors["morphing"] < 0.6
+    assert errors["rigid"] > 3 * errors["morphing"]
+    assert (tmp_path / "arm.png").stat().st_size > 1000

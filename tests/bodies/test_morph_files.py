@@ -102,7 +102,7 @@ def test_what_is_written_reads_as_the_same():
     body = parse_body(OWN)
     text = format_morphs(body.morphs, body.tree)
     other = parse_body(f'[body]\nname = "again"\nbase = "humanoid"\nmirror = true\n{without_images(text)}')
-    state = dict(arm_add_r=-70, arm_flex_r=50, elbow_flex_r=80, arm_add_l=-30, elbow_flex_l=100)
+    state = {"arm_add_r": -70, "arm_flex_r": 50, "elbow_flex_r": 80, "arm_add_l": -30, "elbow_flex_l": 100}
     assert len(other.morphs) == len(body.morphs)
     np.testing.assert_allclose(posed(other, **state).vertices, posed(body, **state).vertices, atol=1e-9)
 
@@ -172,7 +172,7 @@ def test_morphs_are_stretched_with_their_body():
     """A body twice as large in all its lengths moves twice as far."""
     body = parse_body(OWN)
     large = body.scaled(np.full(len(body.scale_groups), 2.0))
-    angles = dict(arm_add_r=-80, arm_flex_r=40, elbow_flex_r=60)
+    angles = {"arm_add_r": -80, "arm_flex_r": 40, "elbow_flex_r": 60}
     np.testing.assert_allclose(posed(large, **angles).vertices, 2.0 * posed(body, **angles).vertices, atol=1e-12)
     target = GlobalMorph(body_mesh(body).vertices, Steering("arm_add_r"))
     with pytest.raises(BodyError, match="nodes given one by one"):

@@ -33,6 +33,7 @@ from kinefit.correspondences import (
     free_space_rows,
     image_line_rows,
     limit_rows,
+    morphed_outline_rows,
     morphed_rows,
     pixel_rows,
     plane_rows,
@@ -45,6 +46,7 @@ from kinefit.correspondences import (
 from kinefit.correspondences.collisions import CollisionPairs
 from kinefit.correspondences.depth_image import SurfaceSamples
 from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.rims import Rim
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
@@ -128,6 +130,7 @@ CASES = {
     ),
     "surface_rows": lambda s: about_surfaces(s),
     "morphed_rows": lambda s: on_a_morphed_skin(s),
+    "morphed_outline_rows": lambda s: outlines_of_a_morphed_skin(s),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
     "prediction_rows": lambda s: (
@@ -152,8 +155,8 @@ def about_surfaces(s):
     return lambda state: surface_rows(body, state, x, segment=owner, max_distance=5.0, sigma=0.7, exact=True)
 
 
-def on_a_morphed_skin(s):
-    """Points between three nodes each of a skin that morphs, every node blended between three segments."""
+def morphed_skin(s):
+    """A skin that morphs, every node blended between three segments."""
     random, tree = np.random.default_rng(5), s.body.tree
     owners = random.integers(0, len(tree.segments), (40, 3))
     nodes = tree.rest[owners] + random.normal(scale=0.2, size=(40, 3, 3))
@@ -163,7 +166,24 @@ def on_a_morphed_skin(s):
         JointMotion(tree.segments[4], random.normal(size=6), steer(1)),
         LocalMorph(skin.vertices[0], [0.5, 0.5, 0.5], [0.0, 1.0, 2.0], steer(2)),
     ]
-    morphing, index, share = Morphing(s.body, skin, operators), random.integers(0, 40, (30, 3)), random.random((30, 3))
+    return Morphing(s.body, skin, operators)
+
+
+def outlines_of_a_morphed_skin(s):
+    """Points on edges of a skin that morphs, seen by one camera, towards tangents of an outline."""
+    random, morphing, camera = np.random.default_rng(6), morphed_skin(s), s.rig.cameras[1]
+    none = np.zeros(30, int)
+    rim = Rim(np.zeros((4, 30)), random.integers(0, 40, (30, 2)), random.random(30), none, none > 0)
+    uv = camera.project(rim.on(morphing.pose(s.state).vertices)) + random.normal(scale=20, size=(30, 2))
+    turn, numbers = random.uniform(0, 2 * np.pi, 30), np.arange(30)
+    image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
+    return lambda state: morphed_outline_rows(morphing.pose(state), rim, camera, image, (numbers, numbers), sigma=3.0)
+
+
+def on_a_morphed_skin(s):
+    """Points between three nodes each of a skin that morphs."""
+    random, morphing = np.random.default_rng(5), morphed_skin(s)
+    index, share = random.integers(0, 40, (30, 3)), random.random((30, 3))
     share, n = share / share.sum(1, keepdims=True), random_unit(random, 30)
     target = np.einsum("nc,nci->ni", share, morphing.pose(s.state).vertices[index]) + random.normal(size=(30, 3))
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.morphing import MorphedPose
+from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
 from kinefit.rows import DofRows, Rows
 
 
@@ -53,3 +55,36 @@ def morphed_rows(
         x = np.einsum("kc,kci->ki", part, pose.vertices[chosen])
         return Rows.of(skin.owners[chosen[:, 0], 0], x, n, r, weight, ids)
     return DofRows(pose.along(chosen, n, part), r, weight, ids)
+
+
+def morphed_outline_rows(
+    pose: MorphedPose,
+    rim: Rim,
+    camera: Camera,
+    image: NDArray,
+    pairs: tuple[NDArray, NDArray],
+    *,
+    sigma: float = 2.0,
+) -> Rows | DofRows:
+    """As `outline_rows` by pixels, of a skin that is blended or morphs.
+
+    Parameters
+    ----------
+    pose : MorphedPose
+    rim : Rim of `pose.vertices` in this camera.
+    image : (4, M) outline of the silhouette: u, v [px], normal.
+    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
+    sigma : float [px] standard deviation of a pair.
+    """
+    if not sigma > 0:
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+    i, k = pairs
+    chosen = rim.chosen(i)
+    u, v, a, b = image[:, k]
+    pixel, J = camera.project_with_jacobian(chosen.on(pose.vertices))
+    slope = a[:, None] * J[:, 0] + b[:, None] * J[:, 1]
+    size = np.maximum(np.linalg.norm(slope, axis=1), 1e-12)  # [px/m]
+    away = (a * (u - pixel[:, 0]) + b * (v - pixel[:, 1])) / size
+    share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
+    n = slope / size[:, None]
+    return morphed_rows(pose, chosen.vertices, n, away, share=share, sigma=sigma / size)
