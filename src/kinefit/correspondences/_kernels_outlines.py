@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_camera import CX, CY, DIST, FX, FY, MODEL, ROT, SKEW, TRANS, project_jacobian
 
 OUTER, INNER = 0, 1
 _REACH = 1.0  # [px] from the rim to the two pixels that tell what is on both sides of it
@@ -18,6 +19,36 @@ def _pixel(v, size):
     """Nearest pixel, or -1 beside the image."""
     i = math.floor(v + 0.5)
     return i if 0 <= i < size else -1
+
+
+@jit
+def seen(camera, vertices, x, uv):
+    """Vertices (V, 3) [m] of the world in a camera (packed): pixels uv (V, 2), and x (V, 3) [m], where a pinhole with
+    the same lens but no distortion would see them in the same pixel and depth. Those that no ray reaches lie at z = 0.
+    """
+    c = camera
+    bent = c[MODEL] != 0.0 or c[SKEW] != 0.0
+    for k in range(8):
+        bent = bent or c[DIST + k] != 0.0
+    if not bent:
+        for i in range(len(vertices)):
+            a, b, d = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+            x[i, 0] = c[ROT] * a + c[ROT + 1] * b + c[ROT + 2] * d + c[TRANS]
+            x[i, 1] = c[ROT + 3] * a + c[ROT + 4] * b + c[ROT + 5] * d + c[TRANS + 1]
+            z = c[ROT + 6] * a + c[ROT + 7] * b + c[ROT + 8] * d + c[TRANS + 2]
+            x[i, 2] = z
+            inverse = 1.0 / (z if z > 1e-9 else 1e-9)
+            uv[i, 0], uv[i, 1] = c[FX] * x[i, 0] * inverse + c[CX], c[FY] * x[i, 1] * inverse + c[CY]
+        return
+    for i in range(len(vertices)):
+        a, b, d = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        z = c[ROT + 6] * a + c[ROT + 7] * b + c[ROT + 8] * d + c[TRANS + 2]
+        ok, u, v, _, _, _, _, _, _ = project_jacobian(c, a, b, d)
+        z = z if ok else 0.0
+        u = u if ok else c[CX]
+        v = v if ok else c[CY]
+        uv[i, 0], uv[i, 1] = u, v
+        x[i, 0], x[i, 1], x[i, 2] = (u - c[CX]) / c[FX] * z, (v - c[CY]) / c[FY] * z, z
 
 
 @jit

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.correspondences import _kernels_outlines as kernels
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, in_camera
+from kinefit.rendering import Canvas
 
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
@@ -98,10 +98,9 @@ class RimFinder:
     def find(self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0) -> Rim:
         """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world."""
         canvas = self._canvases.setdefault(camera.size, Canvas(camera.size))
-        x, K = in_camera(camera, vertices_world), camera.matrix
+        x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
+        kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
         drawn = canvas.draw(x, self.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
-        inverse = 1.0 / np.where(np.abs(x[:, 2]) > 1e-9, x[:, 2], 1e-9)
-        uv = np.stack([K[0, 0] * x[:, 0] * inverse + K[0, 2], K[1, 1] * x[:, 1] * inverse + K[1, 2]], axis=1)
         edges, sides = self._edges
         n = kernels.rims(
             x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _NEAR, _APART,

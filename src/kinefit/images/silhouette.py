@@ -68,9 +68,9 @@ def choose_person(mask: ArrayLike, near: ArrayLike | None = None, *, share: floa
         `share` lies there are its, in one piece or several. Without it, or where no blob does, the largest one.
     """
     image = _mask(mask)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((image > 0).astype(np.uint8), connectivity=8)
-    if count <= 2:
+    if len(cv2.findContours(image, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]) <= 1:
         return image
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((image > 0).astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     area[0] = 0.0
     mine = np.zeros(count, bool)

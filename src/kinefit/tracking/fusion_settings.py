@@ -35,7 +35,8 @@ class FusionSettings:
     depth, pixel, marker, silhouette : float [m], [px], [m], [px]
         Standard deviation of a sensor that none is given for.
     outline : int [px]
-        Longer side of the image in which silhouettes are compared: at 480 a pixel is 7 mm of a person who fills it.
+        Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
+        and the room about. Outlines are told to parts of a pixel.
     angle : float [rad]
         Largest angle between normals of two outlines of which points are paired.
     background : float [s]
@@ -79,7 +80,7 @@ class FusionSettings:
     pixel: float = 4.0
     marker: float = 0.005
     silhouette: float = 4.0
-    outline: int = 480
+    outline: int = 320
     angle: float = 1.0
     background: float = 0.5
     through: float = 3.0

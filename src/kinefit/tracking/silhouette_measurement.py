@@ -20,7 +20,7 @@ from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.surface import Surface
 
 _AGREES = 3.0  # standard deviations of a rim that agrees
-_SPACING = 3.0  # [px] between points of an outline, in the image in which they are compared
+_SPACING = 2.0  # [px] between points of an outline, in the image in which they are compared
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
 
 
@@ -49,7 +49,7 @@ class SilhouetteMeasurement:
         if frame.size != camera.size:
             problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
             raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
-        scale = min(settings.outline / max(camera.size), 1.0)
+        scale = 1.0 / max(round(max(camera.size) / settings.outline), 1)
         self.sensor, self.camera, self.surface, self._settings = frame.sensor, scaled(camera, scale), surface, settings
         #: [px] standard deviation in the image in which outlines are compared
         self.sigma = max(sigma * scale, 0.5)
