@@ -35,6 +35,7 @@ from kinefit.correspondences import (
     limit_rows,
     morphed_outline_rows,
     morphed_rows,
+    outline_rows,
     pixel_rows,
     plane_rows,
     point_rows,
@@ -131,6 +132,7 @@ CASES = {
     "surface_rows": lambda s: about_surfaces(s),
     "morphed_rows": lambda s: on_a_morphed_skin(s),
     "morphed_outline_rows": lambda s: outlines_of_a_morphed_skin(s),
+    "outline_rows": lambda s: outlines_of_random_edges(s),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
     "prediction_rows": lambda s: (
@@ -178,6 +180,24 @@ def outlines_of_a_morphed_skin(s):
     turn, numbers = random.uniform(0, 2 * np.pi, 30), np.arange(30)
     image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
     return lambda state: morphed_outline_rows(morphing.pose(state), rim, camera, image, (numbers, numbers), sigma=3.0)
+
+
+def outlines_of_random_edges(s):
+    """Points on edges of every segment, seen by one camera, towards tangents of an outline."""
+    random, tree, camera = np.random.default_rng(6), s.body.tree, s.rig.cameras[1]
+    owner = np.repeat(np.arange(len(tree.segments)), 4)
+    count = len(owner)
+    rest = tree.rest[owner].repeat(2, axis=0) + random.normal(scale=0.2, size=(2 * count, 3))
+
+    def vertices(state):
+        f = tree.forward(state.T_world_root, state.angles)[0][owner.repeat(2)]
+        return np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), rest) + f[:, 9:]
+
+    rim = Rim(np.zeros((4, count)), np.arange(2 * count).reshape(-1, 2), random.random(count), owner, owner < 0)
+    uv = camera.project(rim.on(vertices(s.state))) + random.normal(scale=20, size=(count, 2))
+    turn, numbers = random.uniform(0, 2 * np.pi, count), np.arange(count)
+    image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
+    return lambda state: outline_rows(s.body, state, rim, vertices(state), camera, image, (numbers, numbers), sigma=3.0)
 
 
 def on_a_morphed_skin(s):

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 
 _FLOOR = 3.0  # [grey levels] least noise of a camera: rounding and compression
+_BLUR = 1.0  # [px] of the smoothing: more of it lets outlines grow
 _SHARE = 0.002  # of the image, holes and specks smaller than that are filled and dropped
 
 
@@ -101,4 +102,4 @@ def _colour(image: ArrayLike) -> NDArray:
 
 def _smooth(picture: NDArray) -> NDArray:
     """As float32, with the noise of single pixels taken off."""
-    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), 1.5))
+    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _BLUR))

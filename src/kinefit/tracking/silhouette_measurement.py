@@ -20,6 +20,7 @@ from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.surface import Surface
 
 _AGREES = 3.0  # standard deviations of a rim that agrees
+_LIMB = 0.04  # [m] radius of a forearm: an outline farther off is another part's, however poor the masks are
 _SPACING = 2.0  # [px] between points of an outline, in the image in which they are compared
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
 
@@ -106,7 +107,7 @@ class SilhouetteMeasurement:
         _, rim = self.rim(state)
         shown = rim.chosen(~rim.inner)
         count = len(self.surface.areas)
-        reach = max(_AGREES * self.sigma, _LEAST)
+        reach = max(min(_AGREES * self.sigma, _LIMB * self.pixels_per_metre), _LEAST)
         i, _ = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle, both=False)
         agreeing = np.bincount(shown.segment[i], minlength=count)
         seen = np.bincount(shown.segment, minlength=count)

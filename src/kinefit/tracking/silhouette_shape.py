@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.bodies.surfaces import Surface, TaperedCylinder, body_mesh
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
@@ -176,7 +176,7 @@ class _Linearised:
         self.larger = []
         for k in range(len(values)):
             other = family.at(values + _STEP * np.eye(len(values))[k])
-            self.larger.append((other.tree, Drawn(other, 1).mesh))
+            self.larger.append((other.tree, body_mesh(other)))
 
     def equations(self, poses: Sequence[BodyState], bound: float) -> tuple[NDArray, NDArray, float, int]:
         """H (Kn + P, Kn + P) and g of all poses, then the shape; Σ of squared distances [px²] and their number."""

@@ -24,6 +24,7 @@ from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.silhouette_shape import CylinderFamily, ShapeFit, fit_silhouettes
 from kinefit.tracking.subject import Progress
 
+_SIDE = 1000  # [px] of a picture that its background is taken from: larger ones are made smaller by a whole number
 _LEARNT = 30  # pictures of a video from which its background is learnt
 _TRIED = 100  # steps that are tracked to find the person's shape ...
 _POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
@@ -59,9 +60,8 @@ class _Scene:
 
     def __init__(self, video: Path, plate: Path | None, size: tuple[int, int], frame: ImageFrame) -> None:
         self.video, self._file, self._size, self._frame = Video(video), plate, size, frame
-        if plate is not None and self.plate.size != self.video.size:
-            problem = f"the background has {self.plate.size} px, the video {self.video.size}"
-            raise ObservationError(problem, file=plate, remedy="Take it with the same camera and settings.")
+        if plate is not None:
+            assert self.plate  # told now where it does not fit
 
     @cached_property
     def plate(self) -> BackgroundPlate:
@@ -69,12 +69,22 @@ class _Scene:
             picture = cv2.imread(str(self._file), cv2.IMREAD_COLOR)
             if picture is None:
                 raise FileError("not a picture, or damaged", file=self._file, remedy="Give a PNG or JPEG.")
-            return BackgroundPlate(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+            if picture.shape[1::-1] != self.video.size:
+                problem = f"the background has {picture.shape[1::-1]} px, the video {self.video.size}"
+                raise ObservationError(problem, file=self._file, remedy="Take it with the same camera and settings.")
+            return BackgroundPlate(self._smaller(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))
         chosen = np.unique(np.linspace(0, len(self.video) - 1, _LEARNT).astype(int))
-        return BackgroundPlate.of(self.video.read(int(i)) for i in chosen)
+        return BackgroundPlate.of(self._smaller(self.video.read(int(i))) for i in chosen)
+
+    def _smaller(self, picture: NDArray) -> NDArray:
+        by = -(-max(self.video.size) // _SIDE)
+        size = self.video.size[0] // by, self.video.size[1] // by
+        return picture if by == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def mask(self, i: int) -> NDArray:
-        return in_calibration(self.plate.mask(self.video.read(i)), self._size, self._frame)
+        mask = self.plate.mask(self._smaller(self.video.read(i)))
+        mask = cv2.resize(mask, self.video.size, interpolation=cv2.INTER_LINEAR)
+        return in_calibration(mask, self._size, self._frame)
 
 
 @dataclass(frozen=True, eq=False)
