@@ -11,6 +11,7 @@ import numpy as np
 
 from kinefit.bodies.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
 from kinefit.bodies.steering import Steering
+from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
 from kinefit.bodies.surfaces.obj import UNITS, read_obj
 from kinefit.bodies.tree import KinematicTree
@@ -195,7 +196,7 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
 def _surfaces(morph: SegmentMorph) -> str:
     out = []
     for c in morph.surfaces:
-        if not hasattr(c, "radii"):
+        if not isinstance(c, TaperedCylinder):
             remedy = "Name its OBJ file in the body file."
             raise BodyError("a morph to a mesh has no place in a body file", remedy=remedy)
         side = f", side = {_numbers(c.side)}" if c.side is not None else ""
