@@ -70,9 +70,12 @@ class RimFinder:
     Parameters
     ----------
     mesh : its faces (T, 3), outward counter-clockwise, with their segments (T,); the vertices come with every call.
+    like : RimFinder of the same mesh, whose tables are shared: finders that work side by side need room each.
     """
 
-    def __init__(self, mesh: Triangles) -> None:
+    def __init__(self, mesh: Triangles, like: RimFinder | None = None) -> None:
+        if like is not None:
+            self.__dict__["_edges"] = like._edges
         self.faces = np.ascontiguousarray(mesh.faces, np.int32)
         self.face_segment = np.ascontiguousarray(mesh.face_segment, np.int64)
         self._front = np.empty(len(self.faces), np.int8)

@@ -28,6 +28,17 @@ def outline(mask: ArrayLike, *, level: float = _HALF) -> NDArray:
     return out[:, :n].copy()
 
 
+def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
+    """(H, W) uint8, 255 where a picture (H, W, 3) has a colour between low and high (3,), without single pixels."""
+    pixels, low, high = np.asarray(image), np.asarray(low, float), np.asarray(high, float)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or low.shape != (3,) or high.shape != (3,):
+        problem = f"an image {pixels.shape} of {pixels.dtype} with thresholds {low.shape} and {high.shape}"
+        raise ObservationError(problem, remedy="Give (height, width, 3) of uint8, and three numbers each.")
+    if not np.all(low <= high):
+        raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower ones first.")
+    return np.asarray(cv2.morphologyEx(cv2.inRange(pixels, low, high), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
+
+
 def colour_silhouette(
     image: ArrayLike, low: ArrayLike, high: ArrayLike, *, smooth: float = 1.0
 ) -> tuple[NDArray, NDArray]:
@@ -44,14 +55,7 @@ def colour_silhouette(
     mask : (H, W) uint8, 0 or 255.
     contour : (H, W) bool, pixels of the body at which the Laplace operator of the smoothed mask changes its sign.
     """
-    pixels, low, high = np.asarray(image), np.asarray(low, float), np.asarray(high, float)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or low.shape != (3,) or high.shape != (3,):
-        problem = f"an image {pixels.shape} of {pixels.dtype} with thresholds {low.shape} and {high.shape}"
-        raise ObservationError(problem, remedy="Give (height, width, 3) of uint8, and three numbers each.")
-    if not np.all(low <= high):
-        raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower ones first.")
-    mask = cv2.inRange(pixels, low, high)
-    mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    mask = colour_mask(image, low, high)
     curved = cv2.Laplacian(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), smooth), cv2.CV_32F, ksize=3)
     beside = cv2.dilate((curved > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return mask, (mask > 0) & (curved < 0) & beside

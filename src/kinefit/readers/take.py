@@ -122,7 +122,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$.")
         place = place.rstrip("`")
-        listed = ", ".join(map(repr, _options(place.rpartition(".")[2])))
+        listed = ", ".join(map(repr, _options(place)))
         remedy = f"There are: {listed}." if listed and "enum" in problem else None
         raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
     head = content.take
@@ -150,9 +150,11 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     return make
 
 
-def _options(key: str) -> tuple[Any, ...]:
-    """What may be written for a key, where it is one of a few."""
-    for entry in (_Head, CameraEntry, KeypointsEntry, SilhouetteEntry):
+def _options(place: str) -> tuple[Any, ...]:
+    """What may be written at a place such as "camera[0].image", where it is one of a few."""
+    table, _, key = place.rpartition(".")
+    entries = {"camera": CameraEntry, "keypoints": KeypointsEntry, "silhouette": SilhouetteEntry, "take": _Head}
+    for entry in [entries[table.partition("[")[0]]] if table.partition("[")[0] in entries else []:
         if key in _fields(entry):
             hint = get_type_hints(entry)[key]
             literals = [hint, *get_args(hint)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +24,10 @@ from kinefit.tracking.evidence import Evidence
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import belief
-from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement
+from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement, outline_camera
 from kinefit.tracking.surface import Surface
 
+_In, _Out = TypeVar("_In"), TypeVar("_Out")
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it."""
 
@@ -83,13 +86,27 @@ class FusedFit:
         self.body, self.rig, self.rate, self.accuracy, self.settings = body, rig, rate, accuracy, settings
         self.surface = Surface(body, settings.samples) if body.surfaces else None
         self._backgrounds = backgrounds
+        self._pool: ThreadPoolExecutor | None = None
         self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
         self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
         self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
 
     def measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
         """What the sensors saw, ready to make rows about a state."""
-        return [self._measurement(frame, state) for frame in frames]
+        if self.surface is not None and any(isinstance(frame, SilhouetteFrame) for frame in frames):
+            self.surface.posed(state)
+            for frame in frames:  # room for each, before they are looked at side by side
+                if isinstance(frame, SilhouetteFrame):
+                    self.surface.rims(outline_camera(self.rig[frame.sensor], self.settings))
+        return self._each(lambda frame: self._measurement(frame, state), frames)
+
+    def _each(self, do: Callable[[_In], _Out], what: Sequence[_In]) -> list[_Out]:
+        """Several silhouettes side by side, on two cores, as most of it runs compiled; else one after the other."""
+        if sum(isinstance(w, SilhouetteFrame | SilhouetteMeasurement) for w in what) < 2:
+            return [do(w) for w in what]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(2)
+        return list(self._pool.map(do, what))
 
     def _measurement(self, frame: Frame, state: BodyState) -> Measurement:
         s, name = self.settings, frame.sensor
@@ -110,7 +127,10 @@ class FusedFit:
     def _rows(
         self, state: BodyState, held: Held | None, measurements: Sequence[Measurement], bound: float
     ) -> list[AnyRows]:
-        parts: list[AnyRows] = [rows for m in measurements for rows in m.rows(state, bound)]
+        if self.surface is not None:
+            self.surface.posed(state)
+        told = self._each(lambda m: m.rows(state, bound), measurements)
+        parts: list[AnyRows] = [rows for several in told for rows in several]
         if held is not None:
             parts.append(belief(state, *held))
         usual = self.body.tree.usual
@@ -140,11 +160,13 @@ class FusedFit:
         result = FusionResult(time, state, std, joints, told.quality, told.lost, told.hidden, iterations)
         return result, posterior
 
-    def judged(self, state: BodyState, measurements: Iterable[Measurement]) -> Evidence:
+    def judged(self, state: BodyState, measurements: Sequence[Measurement]) -> Evidence:
         """What measurements say of each segment."""
         told = Evidence.none(len(self.body.tree.segments))
-        for m in measurements:
-            told = told + m.evidence(state)
+        if self.surface is not None:
+            self.surface.posed(state)
+        for one in self._each(lambda m: m.evidence(state), measurements):
+            told = told + one
         return told
 
     def background(self, camera: Camera) -> Background | None:

@@ -25,6 +25,11 @@ _SPACING = 2.0  # [px] between points of an outline, in the image in which they 
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
 
 
+def outline_camera(camera: Camera, settings: FusionSettings) -> Camera:
+    """The camera with an image in which outlines are compared, a whole number of times smaller than its own."""
+    return scaled(camera, 1.0 / max(round(max(camera.size) / settings.outline), 1))
+
+
 class SilhouetteMeasurement:
     """The silhouette in one camera: the body's rim and the image's outline towards each other.
 
@@ -50,8 +55,9 @@ class SilhouetteMeasurement:
         if frame.size != camera.size:
             problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
             raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
-        scale = 1.0 / max(round(max(camera.size) / settings.outline), 1)
-        self.sensor, self.camera, self.surface, self._settings = frame.sensor, scaled(camera, scale), surface, settings
+        self.camera = outline_camera(camera, settings)
+        self.sensor, self.surface, self._settings = frame.sensor, surface, settings
+        scale = self.camera.size[0] / camera.size[0]
         #: [px] standard deviation in the image in which outlines are compared
         self.sigma = max(sigma * scale, 0.5)
         mask = frame.mask
@@ -60,7 +66,7 @@ class SilhouetteMeasurement:
         focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
         z = vertices @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
         self.pixels_per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
-        rim = surface.rims.find(vertices, self.camera, spacing=_SPACING)
+        rim = surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING)
         self.mask = choose_person(mask, self._about(settings.reach * self.pixels_per_metre))
         points = outline(self.mask)
         self._image = np.ascontiguousarray(points[:, :: max(round(1.3 * _SPACING), 1)])
@@ -71,7 +77,7 @@ class SilhouetteMeasurement:
 
     def _about(self, reach: float) -> NDArray:
         """(h, w) bool: as far about the body, as it was drawn last, as it may have moved."""
-        seen = self.surface.rims.drawn(self.camera) >= 0
+        seen = self.surface.rims(self.camera).drawn(self.camera) >= 0
         size = 2 * int(np.ceil(reach)) + 1
         return cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
@@ -80,7 +86,7 @@ class SilhouetteMeasurement:
         vertices = self.surface.posed(state)
         if self._first is not None and self._first[0] is vertices:
             return self._first
-        self._first = vertices, self.surface.rims.find(vertices, self.camera, spacing=_SPACING)
+        self._first = vertices, self.surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING)
         return self._first
 
     def rows(self, state: BodyState, bound: float) -> list[Rows]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,6 +51,7 @@ class Surface:
         self.judged: BodyState | None = None
         self._posed: tuple[BodyState, NDArray] | None = None
         self._canvases: dict[Camera, Canvas] = {}
+        self._rims: dict[Camera, RimFinder] = {}
         self._layers: dict[Camera, Layers] = {}
 
     def posed(self, state: BodyState) -> NDArray:
@@ -68,10 +67,11 @@ class Surface:
             self._canvases[camera] = Canvas(small.size)
         return self._canvases[camera].draw_for(small, vertices_world, self.mesh.faces, cull=True).depth
 
-    @cached_property
-    def rims(self) -> RimFinder:
-        """What finds its outline in a camera."""
-        return RimFinder(self.mesh)
+    def rims(self, camera: Camera) -> RimFinder:
+        """What finds its outline in a camera, with room for this camera alone."""
+        if camera not in self._rims:
+            self._rims[camera] = RimFinder(self.mesh, next(iter(self._rims.values()), None))
+        return self._rims[camera]
 
     def layers(self, camera: Camera) -> Layers:
         """Room to draw it segment by segment."""
