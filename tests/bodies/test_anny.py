@@ -105,7 +105,7 @@ def test_derivatives_by_shape_parameters(model):
 def test_a_family_is_centred_on_its_usual_body(model):
     usual = model.phenotype(gender=0.2)
     family = AnnyFamily(model, usual)
-    assert len(family.names) == len(family.std) == 6 + len(model.body().scale_groups)
+    assert len(family.names) == len(family.std) == 5 + len(model.body().scale_groups)
     np.testing.assert_allclose(family.at(np.zeros(len(family.names))).skin.vertices, model.body(usual).skin.vertices)
     taller = np.zeros(len(family.names))
     taller[family.names.index("thigh")] = np.log(1.1)

@@ -27,6 +27,7 @@ NAMES = tuple(FACTORS)
 """Shape parameters, each from 0 to 1: female, old, strong, heavy, tall, of uncommon proportions."""
 
 USUAL = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5])  # age: 0 a child, 0.5 young, 1 old
+_FITTED = tuple(name for name in NAMES if name != "age")
 _STEP = 1e-4  # of a shape parameter, for derivatives
 _OWNERS = 6  # most segments that blend one node; at a shoulder
 _MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -239,10 +240,12 @@ _DOWN = np.array([0.0, -1.0, 0.0])
 class AnnyFamily:
     """Anny bodies about a usual one, with the lengths of all segments free too: what a shape fit wants.
 
+    Age stays: a body grows fast up to youth and hardly any more from there on, which no derivative there tells.
+
     Parameters
     ----------
     model : AnnyModel
-    usual : (6,) shape parameters at zero.
+    usual : (6,) shape parameters at zero, kept within 0.05 and 0.95.
     lengths : bool, whether segments may differ from those of the shape, too.
     """
 
@@ -252,21 +255,27 @@ class AnnyFamily:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """(P,) shape parameters, then scale groups."""
-        return (*NAMES, *(self.model._base.scale_groups if self.lengths else ()))
+        """(P,) shape parameters but for the age, then scale groups."""
+        return (*_FITTED, *(self.model._base.scale_groups if self.lengths else ()))
 
     @cached_property
     def std(self) -> NDArray:
         """(P,) standard deviation of each: a quarter of a parameter's range, 3 % of a length."""
-        return np.array([0.25] * len(NAMES) + [0.03] * (len(self.names) - len(NAMES)))
+        return np.array([0.25] * len(_FITTED) + [0.03] * (len(self.names) - len(_FITTED)))
 
     def at(self, values: NDArray) -> Body:
-        """The body with parameters (P,), those of the shape kept within 0 and 1; lengths as logarithms."""
+        """The body with parameters (P,): those of the shape as logits over 4, so that none leaves 0 to 1; lengths as logs.
+
+        About one half, a tenth more here is a tenth more of the shape parameter.
+        """
         v = np.asarray(values, float)
         if v.shape != (len(self.names),):
             raise BodyError(f"{v.shape} parameters of an Anny body", remedy=f"Give {len(self.names)}.")
-        body = self.model.body(np.clip(self.usual + v[: len(NAMES)], 0.0, 1.0))
-        return body.scaled(np.exp(v[len(NAMES) :])) if self.lengths else body
+        shape, own = np.array(self.usual, float), [NAMES.index(name) for name in _FITTED]
+        usual = np.clip(shape[own], 0.05, 0.95)
+        shape[own] = 1.0 / (1.0 + (1.0 / usual - 1.0) * np.exp(-4.0 * v[: len(own)]))
+        body = self.model.body(shape)
+        return body.scaled(np.exp(v[len(own) :])) if self.lengths else body
 
 
 def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
