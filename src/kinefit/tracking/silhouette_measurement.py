@@ -120,6 +120,13 @@ class SilhouetteMeasurement:
         whole = np.maximum(self._outline_of_segments(), 1.0)
         return Evidence(agreeing / whole, (seen - agreeing) / whole)
 
+    def overlap(self, state: BodyState) -> float:
+        """Intersection over union of the body's own silhouette at a state and the image's, 0..1."""
+        self._first = None
+        self.rim(state)
+        body, image = self.surface.rims(self.camera).drawn(self.camera) >= 0, self.mask > 127
+        return float((body & image).sum() / max((body | image).sum(), 1))
+
     def _outline_of_segments(self) -> NDArray:
         """(S,) points on the outline of each segment, about, if it were seen alone."""
         return np.sqrt(np.pi * self.surface.areas) * self.pixels_per_metre / _SPACING
