@@ -1,4 +1,4 @@
-"""A toy car on a turntable, tracked rigidly by its silhouettes alone (P1 2.4): a free-form surface of Fourier series."""
+"""A toy car on a turntable, tracked rigidly by silhouettes alone: a free-form surface of Fourier series (P1 2.4)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def car() -> Body:
     middle = np.array([x.mean(), y.mean()])
     half = 0.5 * LENGTH
     grid = np.stack([
-        half * (middle[0] + shrink * (x[:, None] - middle[0])), half * 0.6 * (middle[1] + shrink * (y[:, None] - middle[1])),
+        half * (middle[0] + shrink * (x[:, None] - middle[0])),
+        half * 0.6 * (middle[1] + shrink * (y[:, None] - middle[1])),
         half * 0.42 * across * roof[:, None],
     ], axis=-1)  # fmt: skip
     surface = FourierSurface.of(grid, closed=(True, False), orders=(16, 12))
@@ -50,7 +51,8 @@ def car() -> Body:
     )
     corners = PointSet(("front", "back", "left", "right"), np.zeros(4, int), half * np.array(
         [(1.0, 0.2, 0), (-1.0, 0.2, 0), (0, 0.2, -0.42), (0, 0.2, 0.42)]))  # fmt: skip
-    return Body("car", tree, ("free",), ("whole",), np.zeros(1, int), corners, surfaces=(MeshSurface(0, vertices, faces),))
+    mesh = MeshSurface(0, vertices, faces)
+    return Body("car", tree, ("free",), ("whole",), np.zeros(1, int), corners, surfaces=(mesh,))
 
 
 def placed(turn: float) -> BodyState:

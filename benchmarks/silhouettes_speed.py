@@ -37,7 +37,8 @@ context = moderngl.create_standalone_context(backend="egl")
 near, far = 0.05, 100.0
 P = np.array([[2*fx/w, 0, 2*(cx+.5)/w-1, 0], [0, 2*fy/h, 2*(cy+.5)/h-1, 0],
               [0, 0, (far+near)/(far-near), -2*far*near/(far-near)], [0, 0, 1, 0]], "f4")
-program = context.program(vertex_shader="#version 330\\nin vec3 p; uniform mat4 P; void main() {gl_Position = P*vec4(p,1);}",
+program = context.program(
+  vertex_shader="#version 330\\nin vec3 p; uniform mat4 P; void main() {gl_Position = P*vec4(p,1);}",
   fragment_shader="#version 330\\nout int o; void main() {o = gl_PrimitiveID;}")
 program["P"].write(P.T.tobytes())
 buffer = context.buffer(x[0].tobytes())

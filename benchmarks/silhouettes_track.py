@@ -66,8 +66,10 @@ def run() -> None:
     """Print the overlap of the fitted body and the given masks."""
     folder = data("video_balancing_4cam")
     goals = {
-        "masks as given: mean IoU of 400 images": ">= 0.88", "masks as given: frames tracked": "== 100",
-        "own masks from plates: mean IoU of 400 images": ">= 0.88", "camera held out: mean IoU of its images": ">= 0.85",
+        "masks as given: mean IoU of 400 images": ">= 0.88",
+        "masks as given: frames tracked": "== 100",
+        "own masks from plates: mean IoU of 400 images": ">= 0.88",
+        "camera held out: mean IoU of its images": ">= 0.85",
     }
     if folder is None:
         for name, goal in goals.items():

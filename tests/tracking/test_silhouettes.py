@@ -57,8 +57,8 @@ def at(body, **degrees):
 def posture(body, i):
     """One step of a movement of arms and a leg: two degrees a step."""
     return at(
-        body, arm_flex_r=20 + 2 * i, arm_add_r=-40, elbow_flex_r=40 + 2 * i, arm_add_l=-60 - i, hip_flexion_l=20 + 2 * i,
-        knee_angle_l=30 + 2 * i,
+        body, arm_flex_r=20 + 2 * i, arm_add_r=-40, elbow_flex_r=40 + 2 * i, arm_add_l=-60 - i,
+        hip_flexion_l=20 + 2 * i, knee_angle_l=30 + 2 * i,
     )  # fmt: skip
 
 

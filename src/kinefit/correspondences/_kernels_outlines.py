@@ -23,8 +23,10 @@ def _pixel(v, size):
 
 @jit
 def seen(camera, vertices, x, uv):
-    """Vertices (V, 3) [m] of the world in a camera (packed): pixels uv (V, 2), and x (V, 3) [m], where a pinhole with
-    the same lens but no distortion would see them in the same pixel and depth. Those that no ray reaches lie at z = 0.
+    """Vertices (V, 3) [m] of the world in a camera (packed): pixels uv (V, 2), and x (V, 3) [m].
+
+    x is where a pinhole with the same lens but no distortion would see them in the same pixel and depth; those that no
+    ray reaches lie at z = 0.
     """
     c = camera
     bent = c[MODEL] != 0.0 or c[SKEW] != 0.0
@@ -89,7 +91,7 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, f
         if a * (uv[k, 0] - uv[i, 0]) + b * (uv[k, 1] - uv[i, 1]) > 0.0:
             a, b = -a, -b
         carried += length / spacing
-        count = int(carried)
+        count = math.floor(carried)
         carried -= count
         for s in range(count):
             if n >= room:

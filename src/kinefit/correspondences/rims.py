@@ -25,8 +25,15 @@ _APART = 0.03  # [m] depth behind a rim from which it is the outline of one part
 class Triangles(Protocol):
     """A mesh whose faces have segments."""
 
-    faces: NDArray
-    face_segment: NDArray
+    @property
+    def faces(self) -> NDArray:
+        """(T, 3) int."""
+        ...
+
+    @property
+    def face_segment(self) -> NDArray:
+        """(T,) int."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +99,8 @@ class RimFinder:
         pairs, owner = np.sort(ends, axis=1)[order], owner[order]
         first = np.flatnonzero(np.any(np.diff(pairs, axis=0, prepend=-1), axis=1))
         second = np.append(first[1:], len(pairs)) - 1  # a third face on one edge is beyond what a surface has
-        return np.ascontiguousarray(pairs[first]), np.stack([owner[first], np.where(second > first, owner[second], -1)], 1)
+        other = np.where(second > first, owner[second], -1)
+        return np.ascontiguousarray(pairs[first]), np.stack([owner[first], other], axis=1)
 
     def drawn(self, camera: Camera) -> NDArray:
         """(H, W) int32 triangle of every pixel of a camera of this size, -1 for none, as it was drawn last."""

@@ -30,7 +30,8 @@ def crossings(image, level, out):
                 top, low = (j - 1 if j > 0 else 0), (m + 1 if m + 1 < height else m)
                 if way == 0:
                     a = float(image[j, k]) - float(image[j, i])
-                    b = 0.25 * (float(image[low, i]) + float(image[low, k]) - float(image[top, i]) - float(image[top, k]))
+                    b = float(image[low, i]) + float(image[low, k]) - float(image[top, i]) - float(image[top, k])
+                    b *= 0.25
                 else:
                     b = float(image[m, i]) - float(image[j, i])
                     a = float(image[j, right]) + float(image[m, right]) - float(image[j, left]) - float(image[m, left])

@@ -85,7 +85,7 @@ def cleaned(mask: NDArray, *, share: float = _SHARE) -> NDArray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
     out = cv2.morphologyEx(cv2.morphologyEx(mask, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel)
     for value in (255, 0):
-        count, labels, stats, _ = cv2.connectedComponentsWithStats((out == value).astype(np.uint8), connectivity=4)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats((out == value).astype(np.uint8), connectivity=4)
         small = stats[:, cv2.CC_STAT_AREA] < least
         small[0] = False
         out[small[labels]] = 255 - value

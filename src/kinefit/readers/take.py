@@ -153,13 +153,14 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
 def _options(place: str) -> tuple[Any, ...]:
     """What may be written at a place such as "camera[0].image", where it is one of a few."""
     table, _, key = place.rpartition(".")
-    entries = {"camera": CameraEntry, "keypoints": KeypointsEntry, "silhouette": SilhouetteEntry, "take": _Head}
-    for entry in [entries[table.partition("[")[0]]] if table.partition("[")[0] in entries else []:
-        if key in _fields(entry):
-            hint = get_type_hints(entry)[key]
-            literals = [hint, *get_args(hint)]
-            return next((get_args(literal) for literal in literals if get_origin(literal) is Literal), ())
-    return ()
+    entries: dict[str, type[msgspec.Struct]] = {
+        "camera": CameraEntry, "keypoints": KeypointsEntry, "silhouette": SilhouetteEntry, "take": _Head,
+    }  # fmt: skip
+    entry = entries.get(table.partition("[")[0])
+    if entry is None or key not in _fields(entry):
+        return ()
+    hint = get_type_hints(entry)[key]
+    return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:
@@ -270,11 +271,12 @@ def _check_names(take: Take) -> None:
         if sensors.count(name) > 1:
             kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
             raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
-    for kind, source in [*(("keypoints", k) for k in take.keypoints), *(("silhouette", s) for s in take.silhouettes)]:
-        if source.camera not in names:
+    named = [("keypoints", k.camera) for k in take.keypoints] + [("silhouette", s.camera) for s in take.silhouettes]
+    for kind, camera in named:
+        if camera not in names:
             raise TakeError(
-                choices("camera", source.camera, names), file=take.path, place=f"{kind} of camera {source.camera}",
-                remedy=f'Add [[camera]] with name = "{source.camera}", or correct the name.',
+                choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
+                remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
     if take.cameras and take.calibration is None:
         raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')

@@ -5,8 +5,9 @@
 3. Each point of it is paired with the nearest contour point (ICP), which stands for a ray of projection.
 4. The motor of the pose and the joint angles follow from (M X M̃) × L = 0 for all pairs at once; until nothing moves.
 
-The tracker (`FusionTracker` with `SilhouetteFrame`) beside it lets outlines glide along each other, looks which way they
-face, pairs in both directions, weighs outliers down, predicts, judges every segment, and fits any other sensor along.
+The tracker (`FusionTracker` with `SilhouetteFrame`) beside it lets outlines glide along each other, looks which way
+they face, pairs in both directions, weighs outliers down, predicts, judges every segment, and fits any other sensor
+along.
 """
 
 from __future__ import annotations
@@ -85,8 +86,9 @@ def pose_from_contours(
     """
     mesh = body_mesh(body) if mesh is None else mesh
     finder = RimFinder(mesh) if finder is None else finder
-    error = np.nan
-    for cycle in range(1, cycles + 1):
+    error, done = np.nan, 0
+    while done < cycles:
+        done += 1
         vertices = mesh.posed(body.tree.forward(state.T_world_root, state.angles)[0])
         parts = [_rows(body, state, rig[name], points, vertices, finder, reach) for name, points in contours.items()]
         rows = Rows.concat(*parts)
@@ -97,7 +99,7 @@ def pose_from_contours(
         state = step.state
         if step.norm < tolerance:
             break
-    return PaperFit(state, error, cycle)
+    return PaperFit(state, error, done)
 
 
 def _rows(

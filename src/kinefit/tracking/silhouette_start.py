@@ -34,6 +34,7 @@ class Level(NamedTuple):
 
 
 LEVELS = (Level(40, 0.8, 0.4, 1.5), Level(80, 0.5, 0.2, 1.4), Level(160, 0.3, 0.1, 1.2), Level(320, 0.15, 0.03, 1.0))
+_GAIN = 0.01  # of overlap that a coarser start must add: what outlines of one pose differ by from level to level
 _PATIENCE = 3  # times as many iterations in each level as a frame of a sequence gets
 
 
@@ -82,7 +83,7 @@ def coarse_to_fine(
             now = result.state
         last = [m for m in fits[-1].measurements(frames, now) if isinstance(m, SilhouetteMeasurement)]
         overlap = float(np.mean([m.overlap(now) for m in last]))
-        if best is None or overlap > best.overlap:
+        if best is None or overlap > best.overlap + _GAIN:
             best = FarFit(result, overlap)
     assert best is not None
     return best

@@ -137,6 +137,5 @@ def shaped_by_silhouettes(
 
 
 def _spread(steps: list[int], count: int) -> list[int]:
-    chosen = np.unique(np.linspace(0, len(steps) - 1, count).astype(int)) if steps else []
-    return [steps[int(k)] for k in chosen]
+    return [steps[k] for k in dict.fromkeys(np.linspace(0, len(steps) - 1, count).astype(int))] if steps else []
 

@@ -23,8 +23,8 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file; `smooth` and `contacts` as in `track`.
 
-    A take with depth, stereo or silhouettes is fused frame by frame from all of its sensors (`fuse_take`), any other is fitted to
-    the keypoints of its cameras.
+    A take with depth, stereo or silhouettes is fused frame by frame from all of its sensors (`fuse_take`), any
+    other is fitted to the keypoints of its cameras.
 
     Returns the motion and what the sensors saw (for overlays).
 
