@@ -264,7 +264,7 @@ class AnnyFamily:
         return np.array([0.25] * len(_FITTED) + [0.03] * (len(self.names) - len(_FITTED)))
 
     def at(self, values: NDArray) -> Body:
-        """The body with parameters (P,): those of the shape as logits over 4, so that none leaves 0 to 1; lengths as logs.
+        """The body with parameters (P,): those of the shape as logits over 4, so none leaves 0 to 1; lengths as logs.
 
         About one half, a tenth more here is a tenth more of the shape parameter.
         """

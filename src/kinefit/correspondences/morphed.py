@@ -80,11 +80,21 @@ def morphed_outline_rows(
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
     i, k = pairs
     chosen = rim.chosen(i)
-    u, v, a, b = image[:, k]
-    pixel, J = camera.project_with_jacobian(chosen.on(pose.vertices))
-    slope = a[:, None] * J[:, 0] + b[:, None] * J[:, 1]
-    size = np.maximum(np.linalg.norm(slope, axis=1), 1e-12)  # [px/m]
-    away = (a * (u - pixel[:, 0]) + b * (v - pixel[:, 1])) / size
+    n, away, size = toward_tangents(chosen.on(pose.vertices), camera, image[:, k])
     share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
-    n = slope / size[:, None]
     return morphed_rows(pose, chosen.vertices, n, away, share=share, sigma=sigma / size)
+
+
+def toward_tangents(x_world: NDArray, camera: Camera, image: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Which way points (N, 3) [m] must move for their pixels to lie on the tangents of an outline (4, N).
+
+    Returns
+    -------
+    direction : (N, 3) unit, in the world, along which the pixel moves fastest across the tangent.
+    residual : (N,) [m] how far; size : (N,) [px/m] how fast.
+    """
+    u, v, a, b = image
+    pixel, J = camera.project_with_jacobian(x_world)
+    slope = a[:, None] * J[:, 0] + b[:, None] * J[:, 1]
+    size = np.maximum(np.linalg.norm(slope, axis=1), 1e-12)
+    return slope / size[:, None], (a * (u - pixel[:, 0]) + b * (v - pixel[:, 1])) / size, size

@@ -27,7 +27,9 @@ from kinefit.tracking.prediction import belief
 from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement, outline_camera
 from kinefit.tracking.surface import Surface
 
-_In, _Out = TypeVar("_In"), TypeVar("_Out")
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
+
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it."""
 
@@ -74,7 +76,8 @@ class FusedFit:
     body : Body, with surfaces where depth is to be used.
     rig : Rig
     rate : float [Hz] of the frames
-    accuracy : {sensor: standard deviation}, [m] or [px], "silhouette CAMERA" for silhouettes; others have the settings'.
+    accuracy : {sensor: standard deviation}, [m] or [px], "silhouette CAMERA" for silhouettes;
+        others have those of the settings.
     settings : FusionSettings
     backgrounds : {depth camera: Background}, added to when one is seen first; None for one that is to have none.
     """
@@ -94,7 +97,7 @@ class FusedFit:
     def measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
         """What the sensors saw, ready to make rows about a state."""
         if self.surface is not None and any(isinstance(frame, SilhouetteFrame) for frame in frames):
-            self.surface.posed(state)
+            self.surface.pose(state)
             for frame in frames:  # room for each, before they are looked at side by side
                 if isinstance(frame, SilhouetteFrame):
                     self.surface.rims(outline_camera(self.rig[frame.sensor], self.settings))
@@ -117,7 +120,7 @@ class FusedFit:
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
         if isinstance(frame, SilhouetteFrame):
             sigma = self.accuracy.get(f"silhouette {name}", s.silhouette)
-            return SilhouetteMeasurement(frame, self.rig[name], surface, surface.posed(state), sigma, s)
+            return SilhouetteMeasurement(frame, self.rig[name], surface, surface.pose(state).vertices, sigma, s)
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):
             return CloudMeasurement(frame, surface, vertices, sigma, s)
@@ -128,6 +131,7 @@ class FusedFit:
         self, state: BodyState, held: Held | None, measurements: Sequence[Measurement], bound: float
     ) -> list[AnyRows]:
         if self.surface is not None:
+            self.surface.pose(state)
             self.surface.posed(state)
         told = self._each(lambda m: m.rows(state, bound), measurements)
         parts: list[AnyRows] = [rows for several in told for rows in several]
@@ -164,6 +168,7 @@ class FusedFit:
         """What measurements say of each segment."""
         told = Evidence.none(len(self.body.tree.segments))
         if self.surface is not None:
+            self.surface.pose(state)
             self.surface.posed(state)
         for one in self._each(lambda m: m.evidence(state), measurements):
             told = told + one

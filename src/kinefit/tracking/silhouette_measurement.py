@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.correspondences.morphed import morphed_outline_rows
 from kinefit.correspondences.outlines import outline_pairs, outline_rows
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
@@ -14,7 +15,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import choose_person, outline
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import scaled
-from kinefit.rows import Rows
+from kinefit.rows import DofRows, Rows
 from kinefit.tracking.evidence import Evidence
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.surface import Surface
@@ -83,30 +84,35 @@ class SilhouetteMeasurement:
 
     def rim(self, state: BodyState) -> tuple[NDArray, Rim]:
         """Vertices in the world and the rim at a state."""
-        vertices = self.surface.posed(state)
+        vertices = self.surface.pose(state).vertices
         if self._first is not None and self._first[0] is vertices:
             return self._first
         self._first = vertices, self.surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING)
         return self._first
 
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows | DofRows]:
         """Rows at a state, softened at half the bound."""
         return [self.linked(state, bound)[0]]
 
-    def linked(self, state: BodyState, bound: float) -> tuple[Rows, Rim]:
-        """The rows at a state, and the point of the rim that each is about."""
+    def linked(self, state: BodyState, bound: float) -> tuple[Rows | DofRows, Rim, NDArray]:
+        """The rows at a state, the point of the rim that each is about, and that of the outline (4, N)."""
         reach = max(bound * self.pixels_per_metre, _AGREES * self.sigma, _LEAST)
         vertices, rim = self.rim(state)
         shown = rim.chosen(~rim.inner)
         pairs = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle)
-        rows = outline_rows(
-            self.surface.body, state, shown, vertices, self.camera, self._image, pairs, sigma=self._row_sigma
-        )
-        square = rows.data[7] * rows.data[6] ** 2 * self._row_sigma**2  # [px²]
-        rows.data[7] /= (1.0 + square / (0.5 * reach) ** 2) ** 2
+        rows: Rows | DofRows
+        if self.surface.morphing.is_rigid:
+            body, camera = self.surface.body, self.camera
+            rows = outline_rows(body, state, shown, vertices, camera, self._image, pairs, sigma=self._row_sigma)
+        else:
+            pose = self.surface.pose(state)
+            rows = morphed_outline_rows(pose, shown, self.camera, self._image, pairs, sigma=self._row_sigma)
+        square = rows.weight * rows.residual**2 * self._row_sigma**2  # [px²]
+        rows.weight[:] = rows.weight / (1.0 + square / (0.5 * reach) ** 2) ** 2
         points = shown.chosen(pairs[0][rows.group])
+        tangents = self._image[:, pairs[1][rows.group]]
         rows.group[:] = -1  # softened already
-        return rows, points
+        return rows, points, tangents
 
     def evidence(self, state: BodyState) -> Evidence:
         """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""

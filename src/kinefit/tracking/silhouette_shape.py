@@ -15,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import Surface, TaperedCylinder, body_mesh
+from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.correspondences.morphed import toward_tangents
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
-from kinefit.rows import Rows
+from kinefit.rows import DofRows, Rows
 from kinefit.solvers.least_squares import bounds_of
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement
@@ -89,10 +91,11 @@ class CylinderFamily:
 def _shaped(surface: Surface, size: NDArray) -> Surface:
     if not isinstance(surface, TaperedCylinder):
         return surface
-    radii, a = np.exp(size[:4].reshape(2, 2)) * surface.radii, surface.axes[0]
+    (a0, b0), (a1, b1) = (np.exp(size[:4].reshape(2, 2)) * surface.radii).tolist()
+    a = surface.axes[0]
     start, end = (np.add(at, 0.1 * shift * a) for at, shift in zip((surface.start, surface.end), size[4:]))
     return replace(
-        surface, start=tuple(start.tolist()), end=tuple(end.tolist()), radii=tuple(map(tuple, radii.tolist())),
+        surface, start=tuple(start.tolist()), end=tuple(end.tolist()), radii=((a0, b0), (a1, b1)),
         side=tuple(a.tolist()),
     )  # fmt: skip
 
@@ -150,8 +153,8 @@ def fit_silhouettes(
     for k in range(iterations + 1):
         bound = _BOUNDS[min(k, len(_BOUNDS) - 1)]
         body = family.at(values)
-        problem = _Linearised(family, values, body, rig, frames, sigma, settings)
-        H, g, square, count = problem.equations(poses, bound)
+        here = _Linearised(family, values, body, rig, frames, sigma, settings)
+        H, g, square, count = here.equations(poses, bound)
         residual = float(np.sqrt(square / max(count, 1)))
         before = residual if k == 0 else before
         if k == iterations:
@@ -176,7 +179,7 @@ class _Linearised:
         self.larger = []
         for k in range(len(values)):
             other = family.at(values + _STEP * np.eye(len(values))[k])
-            self.larger.append((other.tree, body_mesh(other)))
+            self.larger.append(Morphing(other))
 
     def equations(self, poses: Sequence[BodyState], bound: float) -> tuple[NDArray, NDArray, float, int]:
         """H (Kn + P, Kn + P) and g of all poses, then the shape; Σ of squared distances [px²] and their number."""
@@ -186,19 +189,20 @@ class _Linearised:
         square, count = 0.0, 0
         held = np.isfinite(tree.spread)
         for i, (state, several) in enumerate(zip(poses, self.frames)):
-            world = self.surface.posed(state)
-            moves = [mesh.posed(t.forward(state.T_world_root, state.angles)[0]) for t, mesh in self.larger]
+            world = self.surface.pose(state).vertices
+            moves = [other.pose(state).vertices for other in self.larger]
             own = np.concatenate([np.arange(i * n, (i + 1) * n), np.arange(K * n, K * n + P)])
             for frame in several:
                 seen = SilhouetteMeasurement(
                     frame, self.rig[frame.sensor], self.surface, world, self.sigma, self.settings
                 )
-                rows, points = seen.linked(state, bound)
+                rows, points, tangents = seen.linked(state, bound)
+                x = points.on(world)
+                direction = rows.direction if isinstance(rows, Rows) else toward_tangents(x, seen.camera, tangents)[0]
                 A = np.empty((len(rows), n + P))
                 A[:, :n] = _pose_columns(self.body, state, rows)
                 for k, moved in enumerate(moves):
-                    shift = points.on(moved) - rows.point
-                    A[:, n + k] = np.einsum("ij,ij->i", rows.direction, shift) / _STEP
+                    A[:, n + k] = np.einsum("ij,ij->i", direction, points.on(moved) - x) / _STEP
                 w = rows.weight
                 H[np.ix_(own, own)] += A.T @ (w[:, None] * A)
                 g[own] += A.T @ (w * rows.residual)
@@ -214,8 +218,10 @@ class _Linearised:
         return H, g, square, count
 
 
-def _pose_columns(body: Body, state: BodyState, rows: Rows) -> NDArray:
+def _pose_columns(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
     """(N, 6 + D) how far each point moves along its direction with every degree of freedom."""
+    if isinstance(rows, DofRows):
+        return rows.jacobian
     _, screws = body.tree.forward(state.T_world_root, state.angles)
     a = np.concatenate([rows.direction, np.cross(rows.point - state.T_world_root[:3, 3], rows.direction)], axis=1)
     out = np.empty((len(rows), body.tree.n_dofs))
