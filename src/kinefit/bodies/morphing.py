@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.body import Body
+from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.operators import (
     GlobalMorph,
     JointMotion,
@@ -107,6 +107,11 @@ class Morphing:
     def is_rigid(self) -> bool:
         """Every node is owned by one segment, and nothing morphs: `Rows` can say all of it."""
         return not self.operators and self.skin.owners.shape[1] == 1
+
+    @property
+    def moves_joints(self) -> bool:
+        """Some joint moves with an angle, so that frames are not those of the tree alone."""
+        return bool(self._motions)
 
     def _share(self, morph: LocalMorph) -> NDArray:
         """(V, 1) how much of each node belongs to segments that a local morph acts on."""
@@ -204,6 +209,12 @@ class MorphedPose:
     shift: NDArray | None
     slopes: dict[int, NDArray]
     drives: tuple[tuple[int, int, NDArray], ...]
+
+    def positions(self, points: PointSet) -> NDArray:
+        """(K, 3) [m] points of segments in the world, on joints that move."""
+        f = self.frames[points.segments]
+        x = self.morphing.body.points_rest(points)
+        return np.asarray((f[:, :9].reshape(-1, 3, 3) @ x[:, :, None])[..., 0] + f[:, 9:])
 
     @property
     def nodes(self) -> NDArray:

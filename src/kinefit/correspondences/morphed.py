@@ -57,6 +57,17 @@ def morphed_rows(
     return DofRows(pose.along(chosen, n, part), r, weight, ids)
 
 
+def on_moved_joints(pose: MorphedPose, rows: Rows) -> DofRows:
+    """Rows of points on segments, made with `pose.frames`, with the derivative that moving joints have."""
+    arm = rows.point - pose.state.T_world_root[:3, 3]
+    a = np.concatenate([rows.direction, np.cross(arm, rows.direction)], axis=1)
+    J = np.empty((len(rows), pose.morphing.body.tree.n_dofs))
+    for s in np.unique(rows.segment):
+        of = rows.segment == s
+        J[of] = a[of] @ pose.segment_jacobian(int(s))
+    return DofRows(J, rows.residual, rows.weight, rows.group)
+
+
 def morphed_outline_rows(
     pose: MorphedPose,
     rim: Rim,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.rows import AnyRows, ParameterRows
@@ -88,6 +89,8 @@ class FusedFit:
     ) -> None:  # fmt: skip
         self.body, self.rig, self.rate, self.accuracy, self.settings = body, rig, rate, accuracy, settings
         self.surface = Surface(body, settings.samples) if body.surfaces else None
+        morphing = self.surface.morphing if self.surface is not None else None
+        self._moving = morphing if morphing is not None and morphing.moves_joints else None
         self._backgrounds = backgrounds
         self._pool: ThreadPoolExecutor | None = None
         self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
@@ -114,13 +117,16 @@ class FusedFit:
     def _measurement(self, frame: Frame, state: BodyState) -> Measurement:
         s, name = self.settings, frame.sensor
         if isinstance(frame, KeypointFrame):
-            return KeypointMeasurement(frame, self.body, self.rig, self.accuracy.get(name, s.pixel))
+            return KeypointMeasurement(frame, self.body, self.rig, self.accuracy.get(name, s.pixel), self._moving)
         if isinstance(frame, MarkerFrame):
-            return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
+            return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker), self._moving)
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
         if isinstance(frame, SilhouetteFrame):
             sigma = self.accuracy.get(f"silhouette {name}", s.silhouette)
             return SilhouetteMeasurement(frame, self.rig[name], surface, surface.pose(state).vertices, sigma, s)
+        if self._moving:
+            problem = f"depth does not know of joints that move with angles, as those of body '{self.body.name}' do"
+            raise BodyError(problem, remedy="Take the body without morphs: replace(body, morphs=()), or without depth.")
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):
             return CloudMeasurement(frame, surface, vertices, sigma, s)
