@@ -15,6 +15,7 @@ from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
 from kinefit.bodies.surfaces.files import surfaces_of
+from kinefit.bodies.surfaces.skin_files import skin_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
 
@@ -87,6 +88,7 @@ def parse_body(text: str, source: str = "body") -> Body:
         ),
         aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
         stature=record.body.stature or 0.0,
+        skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(with_images(record.morph, _left) if mirror else record.morph, tree, source),
     )
 

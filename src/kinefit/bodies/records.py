@@ -6,6 +6,7 @@ import msgspec
 
 from kinefit.bodies.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
+from kinefit.bodies.surfaces.skin_files import SkinRecord
 
 Vector = tuple[float, float, float]
 
@@ -67,6 +68,7 @@ class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True)
     body: HeadRecord
     segment: list[SegmentRecord] = []
     morph: list[MorphRecord] = []
+    skin: SkinRecord | None = None
     landmarks: dict[str, PointRecord] = {}
     keypoints: dict[str, dict[str, str]] = {}
     markers: dict[str, MarkerSetRecord] = {}
@@ -86,6 +88,7 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
         body=head,
         segment=segments + list(mine.values()),
         morph=base.morph + own.morph,
+        skin=own.skin or base.skin,
         landmarks=base.landmarks | own.landmarks,
         keypoints=base.keypoints | own.keypoints,
         markers=base.markers | own.markers,

@@ -163,3 +163,64 @@ def test_catalogue_bodies_are_closed_meshes():
         mesh = body_mesh(load_body(name))
         edges = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, 1)], 2).reshape(-1, 2), 1)
         assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
+def written(folder, body, x, faces, weights, unit="mm"):
+    """A body file with a skin beside it."""
+    lines = [f"v {a} {b} {c}" for a, b, c in 1000 * x] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    (folder / "skin.obj").write_text("\n".join(lines))
+    rows = [f"{v + 1},{body.tree.segments[s]},{weights[v, s]}" for v, s in zip(*np.nonzero(weights))]
+    (folder / "skin.csv").write_text("\n".join(["vertex,segment,weight", *rows]))
+    skin = f'[skin]\nmesh = "skin.obj"\nweights = "skin.csv"\nunit = "{unit}"\n'
+    (folder / "arm.toml").write_text(f'[body]\nname = "skinned"\nbase = "arm"\n{skin}')
+    return folder / "arm.toml"
+
+
+def test_a_body_file_may_have_a_skin(arm, tmp_path):
+    x, faces, weights = tube(arm, "upperarm_r", "forearm_r")
+    body, state = load_body(written(tmp_path, arm, x, faces, weights)), state_of(arm, "random")
+    np.testing.assert_allclose(
+        Morphing(body).pose(state).vertices, Morphing(arm).pose(state).vertices, atol=1e-9
+    )
+    text = (tmp_path / "skin.csv").read_text().splitlines()
+    owners = [line.rpartition(",")[0] for line in text if line.endswith(",1.0")]
+    assert owners
+    (tmp_path / "skin.csv").write_text("\n".join(line.removesuffix(",1.0") for line in text))  # joint lists
+    np.testing.assert_array_equal(load_body(tmp_path / "arm.toml").skin.weights, body.skin.weights)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("2,upperarm_r,1.0", "2,upperarm_r,0.5", r"skin.csv, skin: weights of 1 nodes.*node 1"),
+        ("2,upperarm_r,1.0", "2,upper,1.0", r"skin.csv, skin, line 3: no segment 'upper'"),
+        ("2,upperarm_r,1.0", "1,upperarm_r,1.0", r"line 3: vertex 1 of 74 twice"),
+        ("2,upperarm_r,1.0", "200,upperarm_r,1.0", r"line 3: vertex 200 of 74 is not there"),
+        ("2,upperarm_r,1.0", "two,upperarm_r", r"line 3: not a weight: 'two,upperarm_r'"),
+        ("2,upperarm_r,1.0", "", r"weights of 1 nodes"),
+    ],
+)
+def test_bad_weights_of_a_file_are_told(arm, tmp_path, old, new, message):
+    path = written(tmp_path, arm, *tube(arm, "upperarm_r", "forearm_r"))
+    text = (tmp_path / "skin.csv").read_text()
+    assert old in text
+    (tmp_path / "skin.csv").write_text(text.replace(old, new, 1))
+    with pytest.raises(BodyError, match=message):
+        load_body(path)
+
+
+def test_bad_skins_of_a_file_are_told(arm, tmp_path):
+    x, faces, weights = tube(arm, "upperarm_r", "forearm_r")
+    for shape, unit, message in (
+        (flipped(faces), "mm", "skin.obj, skin: .*opposite ways"),
+        (faces[:-8], "mm", "skin.obj, skin: .*hole"),
+        (faces, "inch", "no unit 'inch'"),
+        (faces, "m", "m long.*unit"),
+    ):
+        path = written(tmp_path, arm, x, shape, weights, unit)
+        with pytest.raises(BodyError, match=message):
+            load_body(path)
+    path = written(tmp_path, arm, x, faces, weights)
+    (tmp_path / "skin.csv").unlink()
+    with pytest.raises(BodyError, match="cannot read the weights"):
+        load_body(path)
