@@ -9,6 +9,7 @@ PARTS = {
     "silhouettes_cga": "conformal geometric algebra",
     "silhouettes_morphing": "a morphing shoulder, rendered",
     "silhouettes_track": "the real trial by silhouettes alone",
+    "silhouettes_anny": "the real trial on a realistic skin of the person's shape",
     "silhouettes_speed": "time a frame; the renderer beside others",
     "silhouettes_basin": "from how far off a pose is found, with and without coarse to fine",
     "silhouettes_car": "a car on a turntable",
