@@ -9,8 +9,9 @@ from kinefit.bodies import BodyState, load_body, parse_body
 from kinefit.bodies.morph_files import format_morphs
 from kinefit.bodies.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
 from kinefit.bodies.parts import without_part
+from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.steering import Steering
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.surfaces import SkinnedMesh, body_mesh
 from kinefit.errors import BodyError
 
 OWN = """
@@ -219,6 +220,34 @@ def change(old, new):
 def test_bad_morphs_are_told(text, message):
     with pytest.raises(BodyError, match=message):
         parse_body(text, "own.toml")
+
+
+def test_arrays_hold_morphs_and_skins_exactly():
+    """What a motion file keeps of a body."""
+    body = parse_body(OWN)
+    mesh, steering = body_mesh(body), Steering("arm_rot_l", 0.0, 1.0, lambda t: np.cos(np.pi * t / 2))
+    body = replace(body, morphs=(*body.morphs, GlobalMorph(mesh.vertices + 0.01, steering)))
+    back = body_from_arrays(body_to_arrays(body))
+    turned = {"arm_add_r": -70, "arm_flex_r": 50, "elbow_flex_r": 80, "arm_add_l": -30, "arm_rot_l": 20}
+    np.testing.assert_allclose(posed(back, **turned).vertices, posed(body, **turned).vertices, atol=1e-7)
+    skinned = replace(body, skin=SkinnedMesh.of_mesh(mesh), morphs=())
+    again = body_from_arrays(body_to_arrays(skinned))
+    np.testing.assert_array_equal(posed(again, **turned).vertices, posed(skinned, **turned).vertices)
+    assert body_from_arrays(body_to_arrays(replace(body, morphs=()))).skin is None
+
+
+def test_spoilt_arrays_are_told():
+    body = replace(parse_body(OWN), skin=SkinnedMesh.of_mesh(body_mesh(load_body("humanoid"))))
+    arrays = body_to_arrays(body)
+    for change, message in (
+        ({"morphs/0/kind": np.array("joints")}, "unknown kind 'joints'"),
+        ({"morphs/0/span": np.zeros(3)}, "arrays of morph 0"),
+        ({"skin/owners": arrays["skin/owners"] + 50}, "names something that is not there"),
+        ({"skin/faces": None}, "no array 'skin/faces'"),
+    ):
+        spoilt = {key: array for key, array in (arrays | change).items() if array is not None}
+        with pytest.raises(BodyError, match=message):
+            body_from_arrays(spoilt)
 
 
 def test_bases_do_not_go_round(tmp_path):

@@ -18,6 +18,7 @@ radians:
     surfaces/radii (C, 2, 2)                           half axes at both ends [m]
     surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
     aliases/CONVENTION (N, 2)                          pairs: segment, name there
+    morphs/..., skin/...                               see `serial_morphs`
 
 Names that are part of a key are percent-encoded.
 """
@@ -31,6 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.serial_morphs import (
+    morphs_from_arrays,
+    morphs_to_arrays,
+    skin_from_arrays,
+    skin_to_arrays,
+)
 from kinefit.bodies.surfaces import MeshSurface, Surface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
@@ -52,6 +59,7 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
         "segment_scale": np.array(body.segment_scale, np.int64),
     }
     out |= _surfaces_to_arrays(body.surfaces)
+    out |= morphs_to_arrays(body.morphs, _surfaces_to_arrays) | skin_to_arrays(body.skin)
     out |= {name: np.array(getattr(tree, name)) for name in _TREE}
     out |= _points_to_arrays("landmarks", body.landmarks)
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
@@ -101,6 +109,8 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
             if key.startswith("aliases/")
         },
         stature=float(_array(arrays, "stature", ())),
+        morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
+        skin=skin_from_arrays(arrays, n_segments),
     )
 
 

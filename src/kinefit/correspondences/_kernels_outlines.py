@@ -54,7 +54,20 @@ def seen(camera, vertices, x, uv):
 
 
 @jit
-def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, front, out, place, kind):
+def shift(a, b, most):
+    """Largest difference of any coordinate of points (N, 2), or the first one found beyond `most`."""
+    largest = 0.0
+    for i in range(len(a)):
+        u, v = abs(a[i, 0] - b[i, 0]), abs(a[i, 1] - b[i, 1])
+        largest = u if u > largest else largest
+        largest = v if v > largest else largest
+        if largest > most:
+            return largest
+    return largest
+
+
+@jit
+def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, inner, front, out, place, kind):
     """Rim points of a mesh that was drawn: how many were written.
 
     Edges between a face that looks at the camera and one that does not are the rims; points are put on them `spacing`
@@ -63,15 +76,22 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, f
 
     x (V, 3) [m] in the camera's frame and uv (V, 2) [px] of the vertices; faces (T, 3) with label (T,); edges (E, 2)
     with the faces on both sides (E, 2), -1 for none; depth, face (H, W) as drawn; near [m] by which the surface just
-    inside of the rim may differ in depth from it; front (T,) int8 room.
+    inside of the rim may differ in depth from it; inner: whether INNER points are wanted; front (T,) int8 room.
     out (4, N): u, v, a, b; place (N, 2): vertex pair's number and share of its second vertex; kind (N,).
     """
     height, width = depth.shape
+    nearest = math.inf
+    for i in range(len(x)):
+        nearest = x[i, 2] if x[i, 2] < nearest else nearest
     for t in range(len(faces)):
         i, j, k = faces[t, 0], faces[t, 1], faces[t, 2]
-        ahead = x[i, 2] > 0.0 and x[j, 2] > 0.0 and x[k, 2] > 0.0
-        area = (uv[j, 0] - uv[i, 0]) * (uv[k, 1] - uv[i, 1]) - (uv[k, 0] - uv[i, 0]) * (uv[j, 1] - uv[i, 1])
-        front[t] = -1 if not ahead else (1 if area < 0.0 else 0)
+        u, v = uv[i, 0], uv[i, 1]
+        area = (uv[j, 0] - u) * (uv[k, 1] - v) - (uv[k, 0] - u) * (uv[j, 1] - v)
+        front[t] = 1 if area < 0.0 else 0
+    if nearest <= 0.0:
+        for t in range(len(faces)):
+            if x[faces[t, 0], 2] <= 0.0 or x[faces[t, 1], 2] <= 0.0 or x[faces[t, 2], 2] <= 0.0:
+                front[t] = -1
     n, carried, room = 0, 0.5, out.shape[1]
     for e in range(len(edges)):
         one, two = sides[e, 0], sides[e, 1]
@@ -107,7 +127,7 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, f
             allowed = 3.0 * near if label[face[q, p]] == label[own] else near
             if inside < z - allowed or inside > z + near:
                 continue
-            if face[w, r] >= 0 and outside < z + apart:
+            if face[w, r] >= 0 and (not inner or outside < z + apart):
                 continue
             out[0, n], out[1, n], out[2, n], out[3, n] = u, v, a, b
             place[n, 0], place[n, 1] = e, t * z / x[j, 2]

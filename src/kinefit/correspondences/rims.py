@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.correspondences import _kernels_outlines as kernels
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas
+from kinefit.rendering import Canvas, Raster
 
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
@@ -89,6 +89,7 @@ class RimFinder:
         self._out, self._place = np.empty((4, _ROOM)), np.empty((_ROOM, 2))
         self._kind = np.empty(_ROOM, np.int8)
         self._canvases: dict[tuple[int, int], Canvas] = {}
+        self._last: tuple[Camera, NDArray, Raster] | None = None
 
     @cached_property
     def _edges(self) -> tuple[NDArray, NDArray]:
@@ -106,16 +107,30 @@ class RimFinder:
         """(H, W) int32 triangle of every pixel of a camera of this size, -1 for none, as it was drawn last."""
         return self._canvases[camera.size].face
 
-    def find(self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0) -> Rim:
-        """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world."""
-        canvas = self._canvases.setdefault(camera.size, Canvas(camera.size))
+    def find(
+        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0
+    ) -> Rim:
+        """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world.
+
+        Parameters
+        ----------
+        inner : whether outlines of one part before another are wanted, which silhouettes do not show.
+        stale : float [px]
+            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn.
+        """
         x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
-        drawn = canvas.draw(x, self.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
+        last = self._last
+        if last is not None and last[0] is camera and stale > 0.0 and kernels.shift(uv, last[1], stale) <= stale:
+            drawn = last[2]
+        else:
+            canvas = self._canvases.setdefault(camera.size, Canvas(camera.size))
+            drawn = canvas.draw(x, self.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
+            self._last = camera, uv, drawn
         edges, sides = self._edges
         n = kernels.rims(
             x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _NEAR, _APART,
-            self._front, self._out, self._place, self._kind,
+            inner, self._front, self._out, self._place, self._kind,
         )  # fmt: skip
         number = self._place[:n, 0].astype(np.int64)
         own = np.where(self._front[sides[number, 0]] == 1, sides[number, 0], sides[number, 1])

@@ -21,6 +21,7 @@ from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.surface import Surface
 
 _AGREES = 3.0  # standard deviations of a rim that agrees
+_STALE = 0.5  # [px] by which a body may have moved in the virtual image: half of how far beside its rim it is looked at
 _LIMB = 0.04  # [m] radius of a forearm: an outline farther off is another part's, however poor the masks are
 _SPACING = 2.0  # [px] between points of an outline, in the image in which they are compared
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
@@ -67,7 +68,7 @@ class SilhouetteMeasurement:
         focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
         z = vertices @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
         self.pixels_per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
-        rim = surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING)
+        rim = surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING, inner=False)
         self.mask = choose_person(mask, self._about(settings.reach * self.pixels_per_metre))
         points = outline(self.mask)
         self._image = np.ascontiguousarray(points[:, :: max(round(1.3 * _SPACING), 1)])
@@ -82,12 +83,14 @@ class SilhouetteMeasurement:
         size = 2 * int(np.ceil(reach)) + 1
         return cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
 
-    def rim(self, state: BodyState) -> tuple[NDArray, Rim]:
-        """Vertices in the world and the rim at a state."""
+    def rim(self, state: BodyState, stale: float = _STALE) -> tuple[NDArray, Rim]:
+        """Vertices in the world and the rim at a state, without its inner points."""
         vertices = self.surface.pose(state).vertices
         if self._first is not None and self._first[0] is vertices:
             return self._first
-        self._first = vertices, self.surface.rims(self.camera).find(vertices, self.camera, spacing=_SPACING)
+        finder = self.surface.rims(self.camera)
+        rim = finder.find(vertices, self.camera, spacing=_SPACING, inner=False, stale=stale)
+        self._first = vertices, rim
         return self._first
 
     def rows(self, state: BodyState, bound: float) -> list[Rows | DofRows]:
@@ -97,8 +100,7 @@ class SilhouetteMeasurement:
     def linked(self, state: BodyState, bound: float) -> tuple[Rows | DofRows, Rim, NDArray]:
         """The rows at a state, the point of the rim that each is about, and that of the outline (4, N)."""
         reach = max(bound * self.pixels_per_metre, _AGREES * self.sigma, _LEAST)
-        vertices, rim = self.rim(state)
-        shown = rim.chosen(~rim.inner)
+        vertices, shown = self.rim(state)
         pairs = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle)
         rows: Rows | DofRows
         if self.surface.morphing.is_rigid:
@@ -116,8 +118,7 @@ class SilhouetteMeasurement:
 
     def evidence(self, state: BodyState) -> Evidence:
         """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""
-        _, rim = self.rim(state)
-        shown = rim.chosen(~rim.inner)
+        _, shown = self.rim(state)
         count = len(self.surface.areas)
         reach = max(min(_AGREES * self.sigma, _LIMB * self.pixels_per_metre), _LEAST)
         i, _ = outline_pairs(shown.outline, self._image, reach=reach, angle=self._settings.angle, both=False)
@@ -129,7 +130,7 @@ class SilhouetteMeasurement:
     def overlap(self, state: BodyState) -> float:
         """Intersection over union of the body's own silhouette at a state and the image's, 0..1."""
         self._first = None
-        self.rim(state)
+        self.rim(state, stale=0.0)
         body, image = self.surface.rims(self.camera).drawn(self.camera) >= 0, self.mask > 127
         return float((body & image).sum() / max((body | image).sum(), 1))
 
