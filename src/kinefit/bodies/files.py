@@ -14,6 +14,7 @@ import numpy as np
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
+from kinefit.bodies.serial import saved_body
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skin_files import skin_of
 from kinefit.bodies.tree import KinematicTree
@@ -26,13 +27,15 @@ _CHOOSE = "Use one of these, or add it."
 
 
 def load_body(name_or_file: str | Path) -> Body:
-    """Body from the catalogue ("humanoid", "humanoid10", "arm") or from a TOML file.
+    """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
 
     Raises
     ------
     BodyError
         Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a name twice: with file, place, remedy.
     """
+    if Path(name_or_file).suffix == ".npz":
+        return saved_body(name_or_file)
     return parse_body(*_text(name_or_file))
 
 

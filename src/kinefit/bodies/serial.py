@@ -25,7 +25,11 @@ Names that are part of a key are percent-encoded.
 
 from __future__ import annotations
 
+import tempfile
+import zipfile
 from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -112,6 +116,45 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
         morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
         skin=skin_from_arrays(arrays, n_segments),
     )
+
+
+def save_body(body: Body, path: str | PathLike[str]) -> None:
+    """Write a body, skin and morphs included, to an `.npz` file that `load_body` and takes read.
+
+    Raises
+    ------
+    BodyError
+        A name that does not end in .npz, or a file that cannot be written; then an older one stays.
+    """
+    target = Path(path)
+    if target.suffix != ".npz":
+        raise BodyError("a body is saved as .npz", file=path, remedy=f"Call it {target.stem}.npz.")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".writing-") as folder:
+            np.savez_compressed(Path(folder) / target.name, **body_to_arrays(body))  # type: ignore[arg-type]
+            (Path(folder) / target.name).replace(target)
+    except OSError as error:
+        remedy = "Name a folder that you may change, with room in it."
+        raise BodyError(f"cannot write the body ({error.strerror or error})", file=path, remedy=remedy) from error
+
+
+def saved_body(path: str | PathLike[str]) -> Body:
+    """The body that `save_body` wrote.
+
+    Raises
+    ------
+    BodyError
+        A file that cannot be read, or does not hold a body.
+    """
+    remedy = "Give a file written by save_body, or a body file in TOML."
+    try:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return body_from_arrays({key: arrays[key] for key in arrays.files})
+    except BodyError as error:
+        raise BodyError(error.problem, file=path, remedy=error.remedy or remedy) from error
+    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise BodyError(f"cannot read the body ({error})", file=path, remedy=remedy) from error
 
 
 def text_array(names: object) -> NDArray:

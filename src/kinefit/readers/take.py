@@ -126,7 +126,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         remedy = f"There are: {listed}." if listed and "enum" in problem else None
         raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
     head = content.take
-    body = str(folder / head.body) if head.body.endswith(".toml") else head.body
+    body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
         path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
@@ -314,7 +314,7 @@ def _check_files(take: Take) -> None:
     named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
     named += [("[take] subject", take.subject), ("[take] start", take.start)]
     named += [("markers", entry.file) for entry in take.markers]
-    named += [("[take] body", Path(take.body) if take.body.endswith(".toml") else None)]
+    named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:
