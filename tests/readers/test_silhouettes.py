@@ -10,6 +10,7 @@ from kinefit.readers.load import load_observations
 from kinefit.readers.silhouettes import read_silhouettes
 from kinefit.readers.take import read_take
 from kinefit.tracking.silhouette_take import silhouettes_of
+from kinefit.tracking.take import track_take
 
 
 def write_masks(folder, size=(64, 48), count=3, value=255):
@@ -86,6 +87,12 @@ def test_a_take_with_silhouettes_alone(tmp_path):
     assert (seen.rate, seen.frames, len(seen.silhouettes)) == (30.0, (0, 3), 1)
     (video,) = silhouettes_of(told, seen)
     assert video.frame(0).mask[20, 12] == 255
+
+
+def test_silhouettes_with_nothing_to_begin_with_are_refused(tmp_path):
+    write_masks(tmp_path / "m")
+    with pytest.raises(TakeError, match="begin"):
+        track_take(take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\n'))
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,22 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.errors import ObservationError
+from kinefit.exporters import write_motion
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.silhouette_shape import CylinderFamily, fit_silhouettes
+from kinefit.tracking.take import track_take
 
 
 def ring(count=4, size=(320, 240), f=260.0, away=3.0):
@@ -190,3 +194,44 @@ def test_a_family_of_cylinders_starts_from_the_body_and_keeps_both_sides_alike(b
     left = [s.radii for (n, _), s in by.items() if n == "forearm_l"]
     right = [s.radii for (n, _), s in by.items() if n == "forearm_r"]
     np.testing.assert_allclose(left, right)
+
+
+def calibration(camera):
+    """A camera in the words of a calibration file."""
+    T = camera.T_camera_world
+    return (
+        f'[{camera.name}]\nname = "{camera.name}"\nsize = {[float(n) for n in camera.size]}\n'
+        f"matrix = {camera.matrix.tolist()}\ndistortions = [0.0, 0.0, 0.0, 0.0]\n"
+        f"rotation = {cv2.Rodrigues(T[:3, :3])[0].ravel().tolist()}\n"
+        f"translation = {T[:3, 3].tolist()}\nfisheye = false\n"
+    )
+
+
+def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
+    """A take whose only sensor are silhouettes, from the body and pose that `start` tells."""
+    truth = [posture(body, i) for i in range(6)]
+    for camera in rig:
+        folder = tmp_path / camera.name
+        folder.mkdir()
+        for i, state in enumerate(truth):
+            cv2.imwrite(str(folder / f"{i}.png"), silhouettes(body, state, [camera], 0.0)[0].mask)
+    (tmp_path / "rig.toml").write_text("".join(map(calibration, rig)))
+    count = len(body.tree.segments)
+    write_motion(
+        Motion(
+            body=body, rate=30.0, times=np.zeros(1), Ts_world_root=truth[0].T_world_root[None],
+            angles=truth[0].angles[None], dof_std=np.zeros((1, body.tree.n_dofs)), joint_std=np.zeros((1, count, 3)),
+            quality=np.ones(1), segment_quality=np.ones((1, count)),
+        ),
+        tmp_path / "motion.npz",
+    )  # fmt: skip
+    text = '[take]\nrate = 30.0\nup = "y"\nstart = "motion.npz"\n[calibration]\nfile = "rig.toml"\nunit = "m"\n'
+    for camera in rig:
+        text += f'[[camera]]\nname = "{camera.name}"\n'
+        text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\naccuracy = 2.0\n'
+    (tmp_path / "take.toml").write_text(text)
+    motion, seen = track_take(tmp_path / "take.toml")
+    assert len(motion) == 6 and len(seen.silhouettes) == 4
+    last = BodyState(motion.Ts_world_root[-1], motion.angles[-1])
+    assert np.linalg.norm(joints(motion.body, last) - joints(body, truth[-1]), axis=1).mean() < 0.02
+    assert "thigh start a" in motion.provenance["shape"]

@@ -32,6 +32,7 @@ from kinefit.tracking.surface import Surface as Drawn
 LENGTH, GIRTH, OFFSET = 0.03, 0.2, 0.015
 _BOUNDS = (0.08, 0.05, 0.03)  # [m] of correspondences, coarse to fine; the last for all further iterations
 _STEP = 1e-3  # of a parameter, from which derivatives are taken
+_ANEW = (0, 3)  # iterations in which derivatives are found anew: they change by as little as the logarithms do
 _FAR = 0.15  # most that a parameter changes in one iteration
 
 
@@ -153,7 +154,9 @@ def fit_silhouettes(
     for k in range(iterations + 1):
         bound = _BOUNDS[min(k, len(_BOUNDS) - 1)]
         body = family.at(values)
-        here = _Linearised(family, values, body, rig, frames, sigma, settings)
+        if k in _ANEW:
+            growth = _Growth(family, values)
+        here = _Linearised(family, values, body, growth, rig, frames, sigma, settings)
         H, g, square, count = here.equations(poses, bound)
         residual = float(np.sqrt(square / max(count, 1)))
         before = residual if k == 0 else before
@@ -167,19 +170,28 @@ def fit_silhouettes(
     return ShapeFit(body, tuple(poses), family.names, values, std, residual, before)
 
 
+class _Growth:
+    """How vertices move with every parameter, from bodies that differ in it a little."""
+
+    def __init__(self, family: BodyFamily, values: NDArray) -> None:
+        self._usual = Morphing(family.at(values))
+        self._larger = [Morphing(family.at(values + step)) for step in _STEP * np.eye(len(values))]
+
+    def at(self, state: BodyState) -> NDArray:
+        """(P, V, 3) [m] a unit of each parameter, in the world."""
+        usual = self._usual.pose(state).vertices
+        return np.stack([(other.pose(state).vertices - usual) / _STEP for other in self._larger])
+
+
 class _Linearised:
     """The problem about one set of shape parameters."""
 
     def __init__(
-        self, family: BodyFamily, values: NDArray, body: Body, rig: Rig, frames: Sequence[Sequence[SilhouetteFrame]],
-        sigma: float, settings: FusionSettings,
+        self, family: BodyFamily, values: NDArray, body: Body, growth: _Growth, rig: Rig,
+        frames: Sequence[Sequence[SilhouetteFrame]], sigma: float, settings: FusionSettings,
     ) -> None:  # fmt: skip
         self.family, self.values, self.body, self.rig, self.frames = family, values, body, rig, frames
-        self.sigma, self.settings, self.surface = sigma, settings, Drawn(body, 1)
-        self.larger = []
-        for k in range(len(values)):
-            other = family.at(values + _STEP * np.eye(len(values))[k])
-            self.larger.append(Morphing(other))
+        self.growth, self.sigma, self.settings, self.surface = growth, sigma, settings, Drawn(body, 1)
 
     def equations(self, poses: Sequence[BodyState], bound: float) -> tuple[NDArray, NDArray, float, int]:
         """H (Kn + P, Kn + P) and g of all poses, then the shape; Σ of squared distances [px²] and their number."""
@@ -190,7 +202,7 @@ class _Linearised:
         held = np.isfinite(tree.spread)
         for i, (state, several) in enumerate(zip(poses, self.frames)):
             world = self.surface.pose(state).vertices
-            moves = [other.pose(state).vertices for other in self.larger]
+            moves = self.growth.at(state)
             own = np.concatenate([np.arange(i * n, (i + 1) * n), np.arange(K * n, K * n + P)])
             for frame in several:
                 seen = SilhouetteMeasurement(
@@ -201,8 +213,9 @@ class _Linearised:
                 direction = rows.direction if isinstance(rows, Rows) else toward_tangents(x, seen.camera, tangents)[0]
                 A = np.empty((len(rows), n + P))
                 A[:, :n] = _pose_columns(self.body, state, rows)
-                for k, moved in enumerate(moves):
-                    A[:, n + k] = np.einsum("ij,ij->i", direction, points.on(moved) - x) / _STEP
+                one, two, share = points.vertices[:, 0], points.vertices[:, 1], points.share[:, None]
+                shifts = (1.0 - share) * moves[:, one] + share * moves[:, two]
+                A[:, n:] = np.einsum("ij,kij->ik", direction, shifts)
                 w = rows.weight
                 H[np.ix_(own, own)] += A.T @ (w[:, None] * A)
                 g[own] += A.T @ (w * rows.residual)
