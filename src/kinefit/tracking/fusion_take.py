@@ -61,6 +61,11 @@ def fuse_take(
     KinefitError
         What the sensors' readers and the tracker raise.
     """
+    if take.silhouettes and not (take.start or take.keypoints or take.markers or take.depth or take.stereo):
+        raise TakeError(
+            "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
+            remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
+        )  # fmt: skip
     source = FrameSource(take, seen)
     up = np.array(UP_AXES[take.up])
     found = Sized(load_body(take.body)) if take.start is None else _started(take)
