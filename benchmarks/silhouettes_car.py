@@ -17,15 +17,17 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_settings import FusionSettings
+from kinefit.tracking.silhouette_start import Level, coarse_to_fine
 
 FRAMES = 120  # three degrees a frame
 LENGTH = 0.3  # [m]
+OFF, TRIALS = (10, 20, 30, 40, 60), 6  # [deg] from which the car is found, and how often that is tried
 # Reach of a correspondence in the size of a car, not of a person.
 SETTINGS = FusionSettings(search=False, outline=640, far=0.03, near=0.005, patch=0.01, reach=0.05, iterations=12)
 
 
-def car() -> Body:
-    """One segment that moves freely, with a car's free-form surface about 30 cm long; z is across."""
+def surface() -> FourierSurface:
+    """A car's free-form surface about 30 cm long; z is across."""
     profile = np.array([
         (-1, 0.12), (-0.97, 0.42), (-0.72, 0.5), (-0.5, 0.86), (-0.1, 0.95), (0.18, 0.88), (0.42, 0.55), (0.85, 0.44),
         (1, 0.28), (1, 0.1), (0.5, 0.08), (0, 0.08), (-0.5, 0.08),
@@ -43,8 +45,13 @@ def car() -> Body:
         half * 0.6 * (middle[1] + shrink * (y[:, None] - middle[1])),
         half * 0.42 * across * roof[:, None],
     ], axis=-1)  # fmt: skip
-    surface = FourierSurface.of(grid, closed=(True, False), orders=(16, 12))
-    vertices, faces = surface.triangles((128, 48))
+    return FourierSurface.of(grid, closed=(True, False), orders=(16, 12))
+
+
+def car(shape: FourierSurface) -> Body:
+    """One segment that moves freely, with a free-form surface."""
+    half = 0.5 * LENGTH
+    vertices, faces = shape.triangles((128, 48))
     none = np.zeros(0)
     tree = KinematicTree(
         ("car",), np.array([-1]), np.zeros((1, 3)), (), none, np.zeros((0, 3)), none, none, none, none, none
@@ -66,7 +73,8 @@ def placed(turn: float) -> BodyState:
 
 def run() -> None:
     """Print how far the car is off over a whole turn."""
-    body = car()
+    whole = surface()
+    body = car(whole)
     middle = np.array([0.0, 0.05, 0.0])
     views = [("front", (0.0, 0.45, 0.9)), ("side", (0.85, 0.35, 0.4))]
     rig = Rig(tuple(looking(name, np.array(eye), middle, (640, 480), 900.0) for name, eye in views))
@@ -86,6 +94,36 @@ def run() -> None:
           f"{max(turns[3:]):.2f} degrees, {max(shifts[3:]):.2f} mm")  # fmt: skip
     figure("car on a turntable: angle off, mean over 360 degrees", float(np.mean(turns)), "deg", "<= 1")
     figure("car on a turntable: place off, mean over 360 degrees", float(np.mean(shifts)), "mm", "<= 2")
+    _basin(whole, rig, accuracy)
+
+
+def _basin(whole: FourierSurface, rig: Rig, accuracy: dict[str, float]) -> None:
+    """From how far turned the car is found: the whole surface alone, and from low frequencies to all of them."""
+    fine = Level(640, 0.03, 0.005, 1.0)
+    levels = (Level(80, 0.12, 0.04, 1.4), Level(160, 0.06, 0.02, 1.2), fine)
+    bodies = [car(whole.low_pass(*orders)) for orders in ((2, 2), (5, 4))] + [car(whole)]
+    kinds = {
+        "finest level alone": ([fine], bodies[-1:]),
+        "image coarse to fine": (levels, bodies[-1:] * 3),
+        "Fourier coarse to fine": ([level._replace(side=640) for level in levels], bodies),
+        "image and Fourier coarse to fine": (levels, bodies),
+    }
+    share = {kind: np.zeros(len(OFF)) for kind in kinds}
+    for k, off in enumerate(OFF):
+        rng = np.random.default_rng(k)
+        for turn in rng.uniform(0, 2 * np.pi, TRIALS):
+            seen = [_seen(bodies[-1], placed(turn), rig, name, 0) for name in rig.names]
+            start = placed(turn + np.radians(off) * rng.choice([-1, 1]))
+            for kind, (steps, shapes) in kinds.items():
+                found = coarse_to_fine(
+                    shapes[-1], rig, seen, start, accuracy=accuracy, levels=steps, smooth=shapes, settings=SETTINGS
+                ).result.state
+                R = found.T_world_root[:3, :3].T @ placed(turn).T_world_root[:3, :3]
+                share[kind][k] += (np.trace(R) > 1 + 2 * np.cos(np.radians(2.0))) / TRIALS
+        print(f"# turned by {off} degrees: " + ", ".join(f"{kind} {100 * s[k]:.0f} %" for kind, s in share.items()))
+    alone = share["finest level alone"]
+    for name, more in list(share.items())[1:]:
+        figure(f"car: starts found that {name} adds", 100 * float((more - alone).mean()), "%", ">= 10")
 
 
 def _seen(body: Body, state: BodyState, rig: Rig, name: str, i: int) -> SilhouetteFrame:

@@ -17,6 +17,7 @@ from kinefit.rendering import render_body
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.silhouette_shape import CylinderFamily, fit_silhouettes
+from kinefit.tracking.silhouette_start import LEVELS, coarse_to_fine
 from kinefit.tracking.take import track_take
 
 
@@ -235,3 +236,23 @@ def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
     last = BodyState(motion.Ts_world_root[-1], motion.angles[-1])
     assert np.linalg.norm(joints(motion.body, last) - joints(body, truth[-1]), axis=1).mean() < 0.02
     assert "thigh start a" in motion.provenance["shape"]
+
+
+def test_coarse_to_fine_finds_what_the_finest_level_does_not():
+    body, rig = load_body("humanoid10"), ring()
+    truth = BodyState(at(body).T_world_root, body.tree.usual)
+    seen = silhouettes(body, truth, rig, 0.0)
+    swing = np.where(np.arange(len(body.tree.usual)) % 2, 1.0, -1.0)
+    far = np.clip(truth.angles + np.radians(30.0) * swing, body.tree.lower, body.tree.upper)
+    start = BodyState(truth.T_world_root, far)
+    accuracy = {f"silhouette {name}": 1.0 for name in rig.names}
+    alone = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=LEVELS[-1:])
+    found = coarse_to_fine(body, rig, seen, start, accuracy=accuracy)
+    assert found.overlap > alone.overlap and found.overlap > 0.9
+    away = [np.linalg.norm(joints(body, f.result.state) - joints(body, truth), axis=1).mean() for f in (alone, found)]
+    assert away[1] < 0.5 * away[0]
+    for wrong in ({"levels": ()}, {"smooth": [body]}):
+        with pytest.raises(ObservationError):
+            coarse_to_fine(body, rig, seen, start, **wrong)
+    with pytest.raises(ObservationError):
+        coarse_to_fine(body, rig, [], start)

@@ -48,7 +48,7 @@ class FarFit(NamedTuple):
 def coarse_to_fine(
     body: Body, rig: Rig, frames: Sequence[SilhouetteFrame], state: BodyState, *,
     accuracy: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
-    settings: FusionSettings | None = None,
+    smooth: Sequence[Body] = (), settings: FusionSettings | None = None,
 ) -> FarFit:  # fmt: skip
     """Fit silhouettes of one time from a pose that may be tens of degrees off in every joint.
 
@@ -59,22 +59,26 @@ def coarse_to_fine(
     ----------
     accuracy : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
     levels : the last one alone is what the tracker does from frame to frame.
+    smooth : the body for each level, such as low-pass approximations of a free-form surface (P1 2.4); default: as it is.
 
     Raises
     ------
     ObservationError
-        No silhouettes, or no levels.
+        No silhouettes, or no levels, or another number of bodies.
     """
     if not frames or not levels:
         raise ObservationError("no silhouettes to fit, or no levels", remedy="Give those of one camera or more.")
+    bodies = tuple(smooth) or (body,) * len(levels)
+    if len(bodies) != len(levels):
+        raise ObservationError(f"{len(bodies)} bodies for {len(levels)} levels", remedy="Give one body for each.")
     settings = settings or FusionSettings()
     fits = []
-    for level in levels:
+    for own_body, level in zip(bodies, levels):
         steps = settings.iterations * _PATIENCE
         own = replace(
             settings, outline=level.side, far=level.far, near=level.near, angle=level.angle, iterations=steps
         )
-        fits.append(FusedFit(body, rig, 1.0, dict(accuracy or {}), own, {}))
+        fits.append(FusedFit(own_body, rig, 1.0, dict(accuracy or {}), own, {}))
     best: FarFit | None = None
     for first in range(len(levels) - 1, -1, -1):
         now = state
