@@ -59,7 +59,7 @@ def coarse_to_fine(
     ----------
     accuracy : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
     levels : the last one alone is what the tracker does from frame to frame.
-    smooth : the body for each level, such as low-pass approximations of a free-form surface (P1 2.4); default: as it is.
+    smooth : the body for each level, such as low-pass approximations of a surface (P1 2.4); default: as it is.
 
     Raises
     ------
