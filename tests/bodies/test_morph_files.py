@@ -1,6 +1,7 @@
 """Morphs in body files: read, mirrored, written and read again; bodies told as a change of others."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -187,6 +188,12 @@ def test_a_part_goes_with_its_morphs():
     kinds = [type(m) for m in body.morphs if m.steering.coordinate.endswith("_r")]
     assert kinds == [JointMotion, LocalMorph] and sum(isinstance(m, SegmentMorph) for m in body.morphs) == 1
     Morphing(body).pose(body.usual_state())
+
+
+def test_the_docs_example_is_a_body():
+    text = (Path(__file__).parents[2] / "docs" / "morphing.md").read_text("utf-8")
+    example = next(block for block in text.split("```toml\n")[1:]).partition("```")[0]
+    assert [type(m) for m in parse_body(example).morphs] == [LocalMorph, JointMotion]
 
 
 def change(old, new):
