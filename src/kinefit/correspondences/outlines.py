@@ -73,22 +73,21 @@ def outline_rows(
     if not sigma > 0:
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
     i, k = pairs
+    count = len(i)
+    data, segment, group = _kernels.buffers(2 * count)
+    if by == "pixels":
+        used = kernels.tangent_rows(
+            camera.packed, np.ascontiguousarray(vertices_world), rim.vertices, rim.share, rim.segment, image, i, k,
+            1.0 / sigma**2, data, segment, group,
+        )  # fmt: skip
+        return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     owner, points = rim.segment[i], rim.chosen(i).on(vertices_world)
     f = frames[owner]
     rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), points - f[:, 9:]))
-    u, v, a, b = image[:, k]
-    count = len(i)
-    data, segment, group = _kernels.buffers(2 * count)
-    if by == "rays":
-        rays = line_along(camera.centre_world, camera.ray(np.stack([u, v], axis=1)))
-        focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
-        depth = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-        weight = np.where(depth > 0.0, (focal / (depth * sigma)) ** 2, 0.0)
-        used = _kernels.ray_rows(frames, owner, rest, rays, weight, data, segment, group, 0)
-    else:
-        lines = np.stack([a, b, -(a * u + b * v)], axis=1)
-        at, weight = np.zeros(count, np.int64), np.full(count, 1.0 / sigma**2)
-        packed = camera.packed[None]
-        used = _kernels.image_line_rows(frames, owner, rest, packed, at, lines, weight, data, segment, group, 0)
+    rays = line_along(camera.centre_world, camera.ray(image[:2, k].T))
+    focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    depth = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    weight = np.where(depth > 0.0, (focal / (depth * sigma)) ** 2, 0.0)
+    used = _kernels.ray_rows(frames, owner, rest, rays, weight, data, segment, group, 0)
     return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])
