@@ -78,7 +78,8 @@ print(1e3 * best / 5)
 def run() -> None:
     """Print the time of a frame and of one drawing."""
     body = of_meshes(load_body("humanoid"), 36, 9)
-    print(f"# {len(body_mesh(body).faces)} triangles, 640 x 480, image processing included; processor time of all threads")
+    triangles = len(body_mesh(body).faces)
+    print(f"# {triangles} triangles, 640 x 480, image processing included; processor time of all threads")
     rig = ring(4)
     pictures = _pictures(body, rig)
     for count, goal in ((4, "<= 20"), (1, "<= 8")):
