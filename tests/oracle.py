@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rows import PairRows, ParameterRows
+from kinefit.rows import DofRows, PairRows, ParameterRows
 
 STATES = ("random", "identity", "near identity", "near pi")
 
@@ -110,6 +110,8 @@ def central_differences(function, body, state, step=1e-6):
 
 def design(rows, body, state):
     """(N, 6 + D) a J of each row: how fast its point moves along its direction."""
+    if isinstance(rows, DofRows):
+        return rows.jacobian
     if isinstance(rows, ParameterRows):
         return np.eye(body.tree.n_dofs)[rows.index]
     if isinstance(rows, PairRows):

@@ -98,3 +98,10 @@ def test_markers_without_names(tmp_path, capsys):
     assert np.nanmedian(motion.residuals["markers"].norms) < 0.004
     assert "look at" not in capsys.readouterr().out
     assert {"labelled.c3d", "body.osim", "motion.mot"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_a_morph_of_ones_own(tmp_path):
+    errors = example("06_own_morph").main(tmp_path / "arm.png")
+    assert errors["morphing"] < 0.6
+    assert errors["rigid"] > 3 * errors["morphing"]
+    assert (tmp_path / "arm.png").stat().st_size > 1000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.rows import PairRows, ParameterRows, Rows, sort_out
+from kinefit.rows import DofRows, PairRows, ParameterRows, Rows, sort_out
 
 
 def some_rows(count, seed=0, group=None):
@@ -63,12 +63,20 @@ def test_joining_nothing():
 
 def test_rows_are_sorted_out_by_kind():
     rows, pairs, parameters = some_rows(2), some_pairs(), ParameterRows(np.array([6]), np.ones(1), np.ones(1))
-    for given in ([rows, pairs, parameters, rows], iter([pairs, rows, rows, parameters])):
-        r, p, q = sort_out(given)
-        assert len(r) == 4 and p == [pairs] and q == [parameters]
+    dense = DofRows(np.ones((2, 9)), np.ones(2), np.ones(2), np.arange(2))
+    for given in ([rows, pairs, dense, parameters, rows], iter([pairs, rows, rows, parameters, dense])):
+        r, p, q, d = sort_out(given)
+        assert len(r) == 4 and p == [pairs] and q == [parameters] and d == [dense]
     assert sort_out(rows)[0] is rows and sort_out([rows])[0] is rows
     assert sort_out(pairs)[1] == [pairs] and len(sort_out(pairs)[0]) == 0
     assert sort_out(parameters)[2] == [parameters]
+
+
+def test_rows_on_degrees_of_freedom_must_fit_together():
+    with pytest.raises(ObservationError, match=r"jacobian of DofRows has shape \(3, 9\).*Give \(2, 9\)"):
+        DofRows(np.ones((3, 9)), np.ones(2), np.ones(2), np.arange(2))
+    with pytest.raises(ObservationError, match="not finite"):
+        DofRows(np.full((2, 9), np.nan), np.ones(2), np.ones(2), np.arange(2))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

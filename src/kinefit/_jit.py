@@ -38,6 +38,6 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel (numba, cached, arrays in and arrays out)."""
     before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, _CACHE
     try:
-        return numba.njit(cache=True, fastmath=_FAST, error_model="numpy")(function)
+        return numba.njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")(function)
     finally:
         numba.config.CACHE_DIR = before

@@ -75,6 +75,11 @@ class Canvas:
         self._depth, self._face = np.empty((height, width), np.float32), np.empty((height, width), np.int32)
         self._room = np.empty((6, 0))
 
+    @property
+    def face(self) -> NDArray:
+        """(H, W) int32, the triangles drawn last."""
+        return self._face
+
     def draw(
         self, vertices_camera: ArrayLike, faces: ArrayLike, fx: float, fy: float, cx: float, cy: float, *,
         near: float = NEAR, cull: bool = False, labels: NDArray | None = None,

@@ -174,15 +174,47 @@ class ParameterRows:
         return len(self.residual)
 
 
-AnyRows = Rows | PairRows | ParameterRows
+@dataclass(frozen=True, eq=False)
+class DofRows:
+    """Rows whose point moves with any degrees of freedom: skinned between segments, shifted by a morph. r ≈ J δ.
+
+    Parameters
+    ----------
+    jacobian : (N, 6 + D) how far each point moves along its direction, by every degree of freedom.
+    residual : (N,) [m] how much further along it each point should lie.
+    weight : (N,) [1/m²]
+    group : (N,) int
+        As of `Rows`.
+    """
+
+    jacobian: NDArray
+    residual: NDArray
+    weight: NDArray
+    group: NDArray
+
+    def __post_init__(self) -> None:
+        number, size = (float, (None,)), np.shape(self.jacobian)[1:]
+        _as_kernels_take_them(
+            self, residual=number, jacobian=(float, (None, *size)), weight=number, group=(np.int64, (None,))
+        )
+        _check("rows", self.jacobian, self.residual, self.weight)
+
+    def __len__(self) -> int:
+        return len(self.residual)
 
 
-def sort_out(parts: AnyRows | Iterable[AnyRows]) -> tuple[Rows, list[PairRows], list[ParameterRows]]:
+AnyRows = Rows | PairRows | ParameterRows | DofRows
+
+
+def sort_out(
+    parts: AnyRows | Iterable[AnyRows],
+) -> tuple[Rows, list[PairRows], list[ParameterRows], list[DofRows]]:
     """What row makers gave, by kind."""
-    given: Sequence[AnyRows] = [parts] if isinstance(parts, Rows | PairRows | ParameterRows) else list(parts)
+    given: Sequence[AnyRows] = [parts] if isinstance(parts, AnyRows) else list(parts)
     rows = [p for p in given if isinstance(p, Rows)]
     return (
         rows[0] if len(rows) == 1 else Rows.concat(*rows),
         [p for p in given if isinstance(p, PairRows)],
         [p for p in given if isinstance(p, ParameterRows)],
+        [p for p in given if isinstance(p, DofRows)],
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from kinefit.bodies import catalogue, files, load_body
+from kinefit.bodies import catalogue, load_body, records
 from kinefit.bodies.files import JOINT_TYPES
 from kinefit.cli._results import NAMES
 from kinefit.exporters import tables
@@ -42,8 +42,9 @@ def rows(text):
         (TAKE, "## `[take]`", takes._Head), (TAKE, "## `[calibration]`", takes.CalibrationEntry),
         (TAKE, "## `[[camera]]`", takes.CameraEntry), (TAKE, "## `[[keypoints]]`", takes.KeypointsEntry),
         (TAKE, "## `[[markers]]`", takes.MarkersEntry), (TAKE, "## `[[depth]]`", takes.DepthEntry),
-        (TAKE, "## `[[stereo]]`", takes.StereoEntry), (BODIES, "## `[body]`", files._Head),
-        (BODIES, "## `[[segment]]`", files._Segment), (BODIES, "### `joint`", files._Joint),
+        (TAKE, "## `[[stereo]]`", takes.StereoEntry), (TAKE, "## `[[silhouette]]`", takes.SilhouetteEntry),
+        (BODIES, "## `[body]`", records.HeadRecord),
+        (BODIES, "## `[[segment]]`", records.SegmentRecord), (BODIES, "### `joint`", records.JointRecord),
     ],
 )  # fmt: skip
 def test_every_key_is_there_with_its_default(page, heading, record):

@@ -20,6 +20,9 @@ from tests.oracle import (
 
 import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
+from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
+from kinefit.bodies.steering import Steering
+from kinefit.bodies.surfaces import SkinnedMesh
 from kinefit.correspondences import (
     Bands,
     band_rows,
@@ -30,6 +33,9 @@ from kinefit.correspondences import (
     free_space_rows,
     image_line_rows,
     limit_rows,
+    morphed_outline_rows,
+    morphed_rows,
+    outline_rows,
     pixel_rows,
     plane_rows,
     point_rows,
@@ -41,6 +47,7 @@ from kinefit.correspondences import (
 from kinefit.correspondences.collisions import CollisionPairs
 from kinefit.correspondences.depth_image import SurfaceSamples
 from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.rims import Rim
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig
@@ -123,6 +130,9 @@ CASES = {
         lambda state: free_space_rows(s.body, state, *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
     ),
     "surface_rows": lambda s: about_surfaces(s),
+    "morphed_rows": lambda s: on_a_morphed_skin(s),
+    "morphed_outline_rows": lambda s: outlines_of_a_morphed_skin(s),
+    "outline_rows": lambda s: outlines_of_random_edges(s),
     "limit_rows": lambda s: lambda state: limit_rows(beyond_limits(s), state, sigma=0.3),
     "prior_rows": lambda s: lambda state: prior_rows(s.body, state, mean=0.2, sigma=prior_sigma(s)),
     "prediction_rows": lambda s: (
@@ -145,6 +155,64 @@ def about_surfaces(s):
     points = PointSet(tuple(f"{k}" for k in range(3 * count)), owner, random.normal(scale=0.2, size=(3 * count, 3)))
     x = slow_positions(body, s.state, points)
     return lambda state: surface_rows(body, state, x, segment=owner, max_distance=5.0, sigma=0.7, exact=True)
+
+
+def morphed_skin(s):
+    """A skin that morphs, every node blended between three segments."""
+    random, tree = np.random.default_rng(5), s.body.tree
+    owners = random.integers(0, len(tree.segments), (40, 3))
+    nodes = tree.rest[owners] + random.normal(scale=0.2, size=(40, 3, 3))
+    skin = SkinnedMesh(nodes, np.zeros((0, 3), int), owners, random.dirichlet(np.ones(3), 40))
+    steer = lambda k: Steering(tree.coordinates[k], -20.0, 20.0)
+    operators = [
+        JointMotion(tree.segments[4], random.normal(size=6), steer(1)),
+        LocalMorph(skin.vertices[0], [0.5, 0.5, 0.5], [0.0, 1.0, 2.0], steer(2)),
+    ]
+    return Morphing(s.body, skin, operators)
+
+
+def outlines_of_a_morphed_skin(s):
+    """Points on edges of a skin that morphs, seen by one camera, towards tangents of an outline."""
+    random, morphing, camera = np.random.default_rng(6), morphed_skin(s), s.rig.cameras[1]
+    none = np.zeros(30, int)
+    rim = Rim(np.zeros((4, 30)), random.integers(0, 40, (30, 2)), random.random(30), none, none > 0)
+    uv = camera.project(rim.on(morphing.pose(s.state).vertices)) + random.normal(scale=20, size=(30, 2))
+    turn, numbers = random.uniform(0, 2 * np.pi, 30), np.arange(30)
+    image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
+    return lambda state: morphed_outline_rows(morphing.pose(state), rim, camera, image, (numbers, numbers), sigma=3.0)
+
+
+def outlines_of_random_edges(s):
+    """Points on edges of every segment, seen by one camera, towards tangents of an outline."""
+    random, tree, camera = np.random.default_rng(6), s.body.tree, s.rig.cameras[1]
+    owner = np.repeat(np.arange(len(tree.segments)), 4)
+    count = len(owner)
+    rest = tree.rest[owner].repeat(2, axis=0) + random.normal(scale=0.2, size=(2 * count, 3))
+
+    def vertices(state):
+        f = tree.forward(state.T_world_root, state.angles)[0][owner.repeat(2)]
+        return np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), rest) + f[:, 9:]
+
+    rim = Rim(np.zeros((4, count)), np.arange(2 * count).reshape(-1, 2), random.random(count), owner, owner < 0)
+    uv = camera.project(rim.on(vertices(s.state))) + random.normal(scale=20, size=(count, 2))
+    turn, numbers = random.uniform(0, 2 * np.pi, count), np.arange(count)
+    image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
+    return lambda state: outline_rows(s.body, state, rim, vertices(state), camera, image, (numbers, numbers), sigma=3.0)
+
+
+def on_a_morphed_skin(s):
+    """Points between three nodes each of a skin that morphs."""
+    random, morphing = np.random.default_rng(5), morphed_skin(s)
+    index, share = random.integers(0, 40, (30, 3)), random.random((30, 3))
+    share, n = share / share.sum(1, keepdims=True), random_unit(random, 30)
+    target = np.einsum("nc,nci->ni", share, morphing.pose(s.state).vertices[index]) + random.normal(size=(30, 3))
+
+    def rows(state):
+        pose = morphing.pose(state)
+        away = target - np.einsum("nc,nci->ni", share, pose.vertices[index])
+        return morphed_rows(pose, index, n, np.sum(n * away, axis=1), share=share, sigma=0.7)
+
+    return rows
 
 
 def random_capsules(s):

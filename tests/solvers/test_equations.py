@@ -20,7 +20,7 @@ from kinefit.bodies import KinematicTree, load_body
 from kinefit.correspondences import coincidence_rows, point_rows, prior_rows
 from kinefit.errors import KinefitError
 from kinefit.geometry import se3
-from kinefit.rows import PairRows, ParameterRows, Rows
+from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -55,6 +55,14 @@ def random_parameters(body, count=15, seed=2):
     return ParameterRows(index, random.normal(size=count), random.uniform(1, 9, count))
 
 
+def random_dense(body, count=40, seed=4):
+    random = np.random.default_rng(seed)
+    residual = random.normal(size=count) * 10 ** random.uniform(-2, 1.5, count)
+    group = np.repeat(np.arange(count), 2)[:count]
+    group[::7] = -1
+    return DofRows(random.normal(size=(count, body.tree.n_dofs)), residual, random.uniform(0.2, 2, count), group)
+
+
 def robust_factors(rows, loss):
     """(N,) factors and Σ ρ: adjacent rows with one id, and not -1, share a factor."""
     factor, cost, i = np.ones(len(rows)), 0.0, 0
@@ -85,7 +93,9 @@ def dense(parts, body, state, loss=SQUARED):
     for rows in parts:
         J = design(rows, body, state)
         factor, part = (
-            robust_factors(rows, loss) if isinstance(rows, Rows) else (1.0, np.sum(rows.weight * rows.residual**2))
+            robust_factors(rows, loss)
+            if isinstance(rows, Rows | DofRows)
+            else (1.0, np.sum(rows.weight * rows.residual**2))
         )
         w = rows.weight * factor
         H, g, cost = H + J.T @ (w[:, None] * J), g + J.T @ (w * rows.residual), cost + part
@@ -125,6 +135,7 @@ def test_rows_of_every_kind_together(body):
         random_rows(body, state),
         random_pairs(body, state),
         random_parameters(body),
+        random_dense(body),
         random_rows(body, state, 40, 5),
     ]
     found = normal_equations(body, state, parts, loss=huber())
@@ -171,6 +182,7 @@ def test_rows_of_another_body_are_refused():
         Rows.of([far], here, [[1.0, 0, 0]], [1.0], 1.0),
         PairRows([[0, far]], here, here, [[1.0, 0, 0]], [1.0], [1.0]),
         ParameterRows([far], [1.0], [1.0]),
+        DofRows(np.ones((1, body.tree.n_dofs + 1)), [1.0], [1.0], [0]),
     ):
         with pytest.raises(KinefitError):
             normal_equations(body, state, rows)

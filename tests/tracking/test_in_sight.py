@@ -78,7 +78,7 @@ def test_a_wrist_that_is_seen_speaks_against_a_body_that_hides_it(confidence, ag
     uv = CAMERA.project(BODY.positions(away, WRISTS))
     frame = KeypointFrame("depth", 0.0, WRISTS.names, uv, np.full(2, confidence))
     alone = KeypointMeasurement(frame, BODY, Rig((CAMERA,)), 4.0)
-    both = KeypointMeasurement(frame, BODY, Rig((CAMERA,)), 4.0, (drawn(), CAMERA, SIGMA))
+    both = KeypointMeasurement(frame, BODY, Rig((CAMERA,)), 4.0, depth=(drawn(), CAMERA, SIGMA))
     assert np.allclose(alone.square(away), 0.0)
     assert np.isinf(both.square(away)[1]) == against
     lost = both.evidence(away).lost[WRISTS.segments[1]]

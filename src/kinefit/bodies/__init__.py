@@ -2,6 +2,7 @@
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import catalogue, load_body, parse_body
+from kinefit.bodies.serial import save_body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
@@ -16,4 +17,5 @@ __all__ = [
     "catalogue",
     "load_body",
     "parse_body",
+    "save_body",
 ]

@@ -9,8 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.operators import Operator
 from kinefit.bodies.state import BodyState
-from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.surfaces.tables import SurfaceTables, tables
 from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
 from kinefit.errors import BodyError, choices
@@ -69,6 +70,8 @@ class Body:
     surfaces : tapered elliptical cylinders and meshes; a segment may have several, or none.
     aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name there.
     stature : float [m] of the body as it stands.
+    morphs : what changes with its angles; `Morphing` lets them act.
+    skin : SkinnedMesh, a surface over all segments; depth and drawings go by `surfaces`.
     """
 
     name: str
@@ -82,6 +85,8 @@ class Body:
     surfaces: tuple[Surface, ...] = ()
     aliases: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     stature: float = 0.0
+    morphs: tuple[Operator, ...] = ()
+    skin: SkinnedMesh | None = None
 
     @property
     def dof_names(self) -> tuple[str, ...]:
@@ -137,14 +142,17 @@ class Body:
                 remedy=f"One for each of: {', '.join(self.scale_groups)}.",
             )
         per_segment = factors[self.segment_scale]
-        parents = np.maximum(self.tree.parents, 0)
+        old, parents = self.tree, np.maximum(self.tree.parents, 0)
+        tree = old.with_offsets(old.offsets * per_segment[parents][:, None])
         stretched = replace(
             self,
-            tree=self.tree.with_offsets(self.tree.offsets * per_segment[parents][:, None]),
+            tree=tree,
             landmarks=_stretch(self.landmarks, per_segment),
             keypoint_sets={name: _stretch(s, per_segment) for name, s in self.keypoint_sets.items()},
             marker_sets={name: _stretch(s, per_segment) for name, s in self.marker_sets.items()},
             surfaces=tuple(surface.scaled(float(per_segment[surface.segment])) for surface in self.surfaces),
+            morphs=tuple(morph.stretched(old, tree, per_segment) for morph in self.morphs),
+            skin=self.skin and self.skin.stretched(old.rest, tree.rest, per_segment),
         )
         return replace(stretched, stature=self.stature * stretched._extent() / max(self._extent(), 1e-9))
 

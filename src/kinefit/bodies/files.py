@@ -12,7 +12,11 @@ import msgspec
 import numpy as np
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
+from kinefit.bodies.morph_files import morphs_of, with_images
+from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
+from kinefit.bodies.serial import saved_body
+from kinefit.bodies.surfaces.files import surfaces_of
+from kinefit.bodies.surfaces.skin_files import skin_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
 
@@ -20,82 +24,38 @@ JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball"
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
 _CHOOSE = "Use one of these, or add it."
-Vector = tuple[float, float, float]
-
-
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class _Joint(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    name: str
-    type: str
-    at: Vector = (0.0, 0.0, 0.0)
-    axes: list[str | Vector] = []
-    coordinates: list[str] = []
-    range: list[tuple[float, float]] = []
-    usual: list[float] = []
-    spread: list[float] = []
-
-
-class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    name: str
-    joint: _Joint
-    parent: str | None = None
-    scale: str | None = None
-    surface: SurfaceRecord | list[SurfaceRecord] | None = None
-    names: dict[str, str] = {}
-
-
-class _Point(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    segment: str
-    at: Vector
-
-
-class _Head(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    name: str
-    stature: float = 0.0
-    mirror: bool = False
-
-
-class _MarkerSet(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    points: list[str] = []
-    placed: dict[str, _Point] = {}
-
-
-class _File(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    body: _Head
-    segment: list[_Segment]
-    landmarks: dict[str, _Point] = {}
-    keypoints: dict[str, dict[str, str]] = {}
-    markers: dict[str, _MarkerSet] = {}
 
 
 def load_body(name_or_file: str | Path) -> Body:
-    """Body from the catalogue ("humanoid", "humanoid10", "arm") or from a TOML file.
+    """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
 
     Raises
     ------
     BodyError
         Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a name twice: with file, place, remedy.
     """
+    if Path(name_or_file).suffix == ".npz":
+        return saved_body(name_or_file)
+    return parse_body(*_text(name_or_file))
+
+
+def _text(name_or_file: str | Path) -> tuple[str, str]:
+    """Text of a body file, and how it is named in messages."""
     path = Path(name_or_file)
     if path.suffix == ".toml":
         try:
-            text, source = path.read_text(encoding="utf-8"), str(path)
+            return path.read_text(encoding="utf-8"), str(path)
         except (OSError, UnicodeDecodeError) as error:
             remedy = "Give the path of a text file (UTF-8) in TOML."
             raise BodyError(f"cannot read the body file ({error})", file=path, remedy=remedy) from error
     else:
-        folder = resources.files("kinefit.bodies") / "catalogue"
-        entry, source = folder / f"{name_or_file}.toml", f"catalogue body {name_or_file}"
+        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
         if not entry.is_file():
             raise BodyError(
                 choices("body in the catalogue named", str(name_or_file), catalogue()),
                 remedy="A body file of your own is given by its path, ending in .toml.",
             )
-        text = entry.read_text(encoding="utf-8")
-    return parse_body(text, source)
+        return entry.read_text(encoding="utf-8"), f"catalogue body {name_or_file}"
 
 
 def catalogue() -> tuple[str, ...]:
@@ -106,8 +66,40 @@ def catalogue() -> tuple[str, ...]:
 
 def parse_body(text: str, source: str = "body") -> Body:
     """Body from TOML text; `source` names it in messages."""
+    record = _record(text, source)
+    mirror = bool(record.body.mirror)
+    segments = _in_order(_mirrored(record.segment) if mirror else list(record.segment), source)
+    points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
+    if mirror:
+        mirrored = {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
+        points |= {n: p for n, p in mirrored.items() if n not in points}
+    groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
+    index = {s.name: i for i, s in enumerate(segments)}
+    landmarks, tree = _points(points, index, source), _tree(segments, index, source)
+    return Body(
+        name=record.body.name,
+        tree=tree,
+        joints=tuple(s.joint.name for s in segments),
+        scale_groups=groups,
+        segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
+        landmarks=landmarks,
+        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
+        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
+        surfaces=tuple(
+            surface for s in segments
+            for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
+        ),
+        aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
+        stature=record.body.stature or 0.0,
+        skin=skin_of(record.skin, tree, source),
+        morphs=morphs_of(with_images(record.morph, _left) if mirror else record.morph, tree, source),
+    )
+
+
+def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
+    """The record of a body file, with what its base says."""
     try:
-        record = msgspec.convert(tomllib.loads(text), _File)
+        record = msgspec.convert(tomllib.loads(text), FileRecord)
     except tomllib.TOMLDecodeError as error:
         raise BodyError(
             f"not valid TOML ({error})", file=source, remedy="Correct it there; see https://toml.io."
@@ -120,30 +112,17 @@ def parse_body(text: str, source: str = "body") -> Body:
             place=place.strip(".`") or None,
             remedy="See docs/bodies.md for its keys.",
         ) from error
-    segments = _in_order(_mirrored(record.segment) if record.body.mirror else list(record.segment), source)
-    points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
-    if record.body.mirror:
-        mirrored = {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
-        points |= {n: p for n, p in mirrored.items() if n not in points}
-    groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
-    index = {s.name: i for i, s in enumerate(segments)}
-    landmarks = _points(points, index, source)
-    return Body(
-        name=record.body.name,
-        tree=_tree(segments, index, source),
-        joints=tuple(s.joint.name for s in segments),
-        scale_groups=groups,
-        segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
-        landmarks=landmarks,
-        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
-        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
-        surfaces=tuple(
-            surface for s in segments
-            for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
-        ),
-        aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
-        stature=record.body.stature,
-    )
+    base = record.body.base
+    if base is None:
+        return record
+    if base in above:
+        problem = f"bases that go round in a circle: {', '.join((*above, base))}"
+        raise BodyError(problem, file=source, place="body.base", remedy="Leave one out.")
+    try:
+        below, file = _text(base if not base.endswith(".toml") else Path(source).parent / base)
+    except BodyError as error:
+        raise BodyError(error.problem, file=source, place="body.base", remedy=error.remedy) from error
+    return merged(_record(below, file, (*above, base)), record)
 
 
 def _left(name: str) -> str:
@@ -154,7 +133,7 @@ def _left(name: str) -> str:
     return name.replace("Right", "Left")
 
 
-def _mirrored(segments: list[_Segment]) -> list[_Segment]:
+def _mirrored(segments: list[SegmentRecord]) -> list[SegmentRecord]:
     out = []
     for s in segments:
         out.append(s)
@@ -178,7 +157,7 @@ def _mirrored(segments: list[_Segment]) -> list[_Segment]:
     return out
 
 
-def _axes(joint: _Joint) -> tuple[list[str | Vector], list[bool]]:
+def _axes(joint: JointRecord) -> tuple[list[str | Vector], list[bool]]:
     """Axes of a joint, and which of them it slides along."""
     if joint.type == "free":
         return list(joint.axes) or ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
@@ -193,7 +172,7 @@ def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
     return (x, y, -z) if slides else (-x, -y, z)
 
 
-def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
+def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
     """Depth first from the root, so that parents come before children and limbs stay together."""
     names = [s.name for s in segments]
     for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
@@ -214,7 +193,7 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
         if s.parent is not None and s.parent not in names:
             place = f"parent of segment {s.name}"
             raise BodyError(choices("segment", s.parent, names), file=source, place=place, remedy=_CHOOSE)
-    out: list[_Segment] = []
+    out: list[SegmentRecord] = []
     stack = [roots[0]]
     while stack:
         s = stack.pop()
@@ -228,7 +207,7 @@ def _in_order(segments: list[_Segment], source: str) -> list[_Segment]:
     return out
 
 
-def _tree(segments: list[_Segment], index: dict[str, int], source: str) -> KinematicTree:
+def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
     names: list[str] = []
     rows: list[tuple[int, Any, bool, float, float, float, float]] = []
     for i, s in enumerate(segments):
@@ -329,7 +308,7 @@ def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: s
     return PointSet(tuple(entries), chosen.segments, chosen.points)
 
 
-def _markers(entry: _MarkerSet, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
+def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
     on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
     placed = _points({n: (p.segment, p.at) for n, p in entry.placed.items()}, index, source, f"{place}.")
     twice = sorted(entry.placed.keys() & set(entry.points))
@@ -343,5 +322,5 @@ def _markers(entry: _MarkerSet, landmarks: PointSet, index: dict[str, int], plac
     )
 
 
-def _conventions(segments: list[_Segment]) -> tuple[str, ...]:
+def _conventions(segments: list[SegmentRecord]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(c for s in segments for c in s.names))

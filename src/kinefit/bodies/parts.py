@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, Surface
 from kinefit.bodies.tree import KinematicTree
@@ -103,9 +104,11 @@ def without_part(body: Body, name: str) -> Body:
     Raises
     ------
     BodyError
-        A name that is not there, the root, or a segment that others hang on.
+        A name that is not there, the root, a segment that others hang on, or a body with a skin.
     """
     tree = body.tree
+    if body.skin is not None:
+        raise BodyError("a body with a skin keeps its parts", place=f"part {name}", remedy="Leave out the skin first.")
     gone = tree.segment(name)
     if gone == 0:
         raise BodyError(f"'{name}' is the root", place=f"part {name}", remedy="Every body has one; track another body.")
@@ -126,6 +129,7 @@ def without_part(body: Body, name: str) -> Body:
         marker_sets={n: _left(p, gone) for n, p in body.marker_sets.items()},
         surfaces=tuple(replace(s, segment=s.segment - (s.segment > gone)) for s in body.surfaces if s.segment != gone),
         aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
+        morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == gone)),
     )
 
 
@@ -174,6 +178,11 @@ def carry_dofs(values: NDArray, old: Body, new: Body, *, missing: float = 0.0) -
         raise BodyError(problem, remedy="Give one for each of the old body's.")
     known = dict(zip(old.dof_names, values))
     return np.array([known.get(name, missing) for name in new.dof_names], float)
+
+
+def _is_about(morph: Operator, segment: str, coordinates: tuple[str, ...], own: NDArray) -> bool:
+    """Whether a morph is of a segment, or steered by one of its own coordinates."""
+    return getattr(morph, "segment", None) == segment or own[coordinates.index(morph.steering.coordinate)]
 
 
 def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:

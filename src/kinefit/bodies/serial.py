@@ -18,19 +18,30 @@ radians:
     surfaces/radii (C, 2, 2)                           half axes at both ends [m]
     surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
     aliases/CONVENTION (N, 2)                          pairs: segment, name there
+    morphs/..., skin/...                               see `serial_morphs`
 
 Names that are part of a key are percent-encoded.
 """
 
 from __future__ import annotations
 
+import tempfile
+import zipfile
 from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
 from urllib.parse import quote, unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.serial_morphs import (
+    morphs_from_arrays,
+    morphs_to_arrays,
+    skin_from_arrays,
+    skin_to_arrays,
+)
 from kinefit.bodies.surfaces import MeshSurface, Surface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
@@ -52,6 +63,7 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
         "segment_scale": np.array(body.segment_scale, np.int64),
     }
     out |= _surfaces_to_arrays(body.surfaces)
+    out |= morphs_to_arrays(body.morphs, _surfaces_to_arrays) | skin_to_arrays(body.skin)
     out |= {name: np.array(getattr(tree, name)) for name in _TREE}
     out |= _points_to_arrays("landmarks", body.landmarks)
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
@@ -101,7 +113,48 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
             if key.startswith("aliases/")
         },
         stature=float(_array(arrays, "stature", ())),
+        morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
+        skin=skin_from_arrays(arrays, n_segments),
     )
+
+
+def save_body(body: Body, path: str | PathLike[str]) -> None:
+    """Write a body, skin and morphs included, to an `.npz` file that `load_body` and takes read.
+
+    Raises
+    ------
+    BodyError
+        A name that does not end in .npz, or a file that cannot be written; then an older one stays.
+    """
+    target = Path(path)
+    if target.suffix != ".npz":
+        raise BodyError("a body is saved as .npz", file=path, remedy=f"Call it {target.stem}.npz.")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".writing-") as folder:
+            np.savez_compressed(Path(folder) / target.name, **body_to_arrays(body))  # type: ignore[arg-type]
+            (Path(folder) / target.name).replace(target)
+    except OSError as error:
+        remedy = "Name a folder that you may change, with room in it."
+        raise BodyError(f"cannot write the body ({error.strerror or error})", file=path, remedy=remedy) from error
+
+
+def saved_body(path: str | PathLike[str]) -> Body:
+    """The body that `save_body` wrote.
+
+    Raises
+    ------
+    BodyError
+        A file that cannot be read, or does not hold a body.
+    """
+    remedy = "Give a file written by save_body, or a body file in TOML."
+    try:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return body_from_arrays({key: arrays[key] for key in arrays.files})
+    except BodyError as error:
+        raise BodyError(error.problem, file=path, remedy=error.remedy or remedy) from error
+    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise BodyError(f"cannot read the body ({error})", file=path, remedy=remedy) from error
 
 
 def text_array(names: object) -> NDArray:

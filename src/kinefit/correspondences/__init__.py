@@ -6,6 +6,8 @@ from kinefit.correspondences.collisions import collision_rows
 from kinefit.correspondences.depth_image import depth_image_rows
 from kinefit.correspondences.free_space import free_space_rows
 from kinefit.correspondences.image_lines import edge_rows, image_line_rows
+from kinefit.correspondences.morphed import morphed_outline_rows, morphed_rows
+from kinefit.correspondences.outlines import outline_pairs, outline_rows
 from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
 from kinefit.correspondences.pixels import pixel_rows
 from kinefit.correspondences.planes import plane_rows
@@ -24,6 +26,10 @@ __all__ = [
     "image_line_rows",
     "joint_bands",
     "limit_rows",
+    "morphed_outline_rows",
+    "morphed_rows",
+    "outline_pairs",
+    "outline_rows",
     "pixel_rows",
     "plane_rows",
     "point_rows",

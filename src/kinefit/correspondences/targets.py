@@ -27,9 +27,16 @@ def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
     return np.where(present, 1.0 / safe**2, 0.0)
 
 
-def fill(kernel: Any, lines: int, body: Body, state: BodyState, points: PointSet, *arguments: Any) -> Rows:
-    """Run a row-making kernel for the points of a body at a state; `lines` rows for each point at most."""
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+def fill(
+    kernel: Any, lines: int, body: Body, state: BodyState, points: PointSet, *arguments: Any,
+    frames: NDArray | None = None,
+) -> Rows:  # fmt: skip
+    """Run a row-making kernel for the points of a body at a state; `lines` rows for each point at most.
+
+    `frames` (S, 12) are those of a body whose joints move with its angles.
+    """
+    if frames is None:
+        frames, _ = body.tree.forward(state.T_world_root, state.angles)
     data, segment, group = _kernels.buffers(lines * len(points))
     end = kernel(frames, points.segments, body.points_rest(points), *arguments, data, segment, group, 0)
     return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])

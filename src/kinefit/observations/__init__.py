@@ -5,8 +5,9 @@ one sensor, `frames` what it saw at one time.
 """
 
 from kinefit.observations.depth import CloudVideo, DepthVideo
-from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, MarkerEvent, Markers, SkeletonMotion
+from kinefit.observations.silhouettes import SilhouetteVideo
 
 __all__ = [
     "MEDIAPIPE_33",
@@ -21,5 +22,7 @@ __all__ = [
     "MarkerFrame",
     "Markers",
     "PointCloud",
+    "SilhouetteFrame",
+    "SilhouetteVideo",
     "SkeletonMotion",
 ]

@@ -172,4 +172,41 @@ class MarkerFrame:
         object.__setattr__(self, "positions", positions)
 
 
-Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame
+@dataclass(frozen=True, eq=False)
+class SilhouetteFrame:
+    """Which pixels of one image show the body.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of its camera in the rig.
+    time : float [s]
+    mask : (H, W) uint8 or bool
+        In the calibration's image frame: 255 (or True) where the body is, 0 where it is not, between for an edge that
+        lies within the pixel.
+
+    Raises
+    ------
+    ObservationError
+        No image, or one that is not of 8 bits.
+    """
+
+    sensor: str
+    time: float
+    mask: NDArray
+
+    def __post_init__(self) -> None:
+        mask = np.asarray(self.mask)
+        mask = 255 * mask.astype(np.uint8) if mask.dtype == bool else mask
+        if mask.ndim != 2 or not mask.size or mask.dtype != np.uint8:
+            problem = f"a mask of {self.sensor} has shape {mask.shape} and type {mask.dtype}"
+            raise ObservationError(problem, remedy="Give (height, width), of bool, or of uint8 from 0 to 255.")
+        object.__setattr__(self, "mask", _frozen(mask, np.uint8))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self.mask.shape[1], self.mask.shape[0]
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame

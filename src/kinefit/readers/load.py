@@ -11,12 +11,13 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.observations import CloudVideo, DepthVideo, Keypoints, Markers
+from kinefit.observations import CloudVideo, DepthVideo, Keypoints, Markers, SilhouetteVideo
 from kinefit.readers.calibration import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.load_depth import load_depth
 from kinefit.readers.markers import read_markers
+from kinefit.readers.silhouettes import load_silhouettes
 from kinefit.readers.take import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.video import Video, check_rates, common_frames
 
@@ -43,6 +44,8 @@ class Observations:
         In the order of `take.depth`, whole, at their own rates; those whose files are images.
     clouds : tuple of CloudVideo
         Those whose files are points without order.
+    silhouettes : tuple of SilhouetteVideo
+        In the order of `take.silhouettes`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     """
@@ -56,6 +59,7 @@ class Observations:
     images: dict[str, ImageFrame]
     depth: tuple[DepthVideo, ...] = ()
     clouds: tuple[CloudVideo, ...] = ()
+    silhouettes: tuple[SilhouetteVideo, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -94,6 +98,10 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
         rates[stream], lengths[stream], offsets[stream] = read.rate, len(read), read.time_offset
     sensors = load_depth(take, rig, rates)
+    silhouettes = load_silhouettes(take, rig, images, rates)
+    for outlines in silhouettes:
+        stream = f"silhouettes {outlines.sensor}"
+        rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
     recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
     if not (lengths or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
@@ -111,9 +119,10 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
-        keypoints=tuple(_cut(k, frames) for k in keypoints), markers=markers,
+        markers=markers,
+        keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
-        depth=sensors.depth, clouds=sensors.clouds, notes=sensors.notes(rate),
+        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes, notes=sensors.notes(rate),
     )
 
 
@@ -207,11 +216,17 @@ def _read_keypoints(
     )
 
 
-def _cut(keypoints: Keypoints, frames: tuple[int, int]) -> Keypoints:
-    """Frames at the steps [start, stop) of the common time."""
+def _cut(keypoints: Keypoints, frames: tuple[int, int], used: tuple[int, int] | None) -> Keypoints:
+    """Frames at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
     begin = frames[0] - round(keypoints.time_offset * keypoints.rate)
     rows = slice(begin, begin + frames[1] - frames[0])
+    points, confidence = keypoints.points[rows], keypoints.confidence[rows]
+    if used is not None:
+        steps = np.arange(*frames)
+        unused = (steps < used[0]) | (steps >= used[1])
+        points, confidence = np.array(points), np.array(confidence)
+        points[unused], confidence[unused] = np.nan, 0.0
     return replace(
-        keypoints, points=keypoints.points[rows], confidence=keypoints.confidence[rows],
+        keypoints, points=points, confidence=confidence,
         time_offset=keypoints.time_offset + begin / keypoints.rate,
     )

@@ -20,6 +20,7 @@ from kinefit.readers.take_entries import (
     DepthEntry,
     KeypointsEntry,
     MarkersEntry,
+    SilhouetteEntry,
     StereoEntry,
     _Entry,
     _Head,
@@ -31,6 +32,7 @@ __all__ = [
     "DepthEntry",
     "KeypointsEntry",
     "MarkersEntry",
+    "SilhouetteEntry",
     "StereoEntry",
     "Take",
     "read_take",
@@ -45,6 +47,7 @@ class _File(_Entry, frozen=True, kw_only=True):
     markers: tuple[MarkersEntry, ...] = ()
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
+    silhouette: tuple[SilhouetteEntry, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,12 @@ class Take:
         Stature of the person, as a first guess.
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
+    start : Path or None
+        Motion file (`motion.npz`) that tells body and pose of the first step; None: they are sought.
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
-    cameras, keypoints, markers, depth, stereo : tuples of entries
+    cameras, keypoints, markers, depth, stereo, silhouettes : tuples of entries
     """
 
     path: Path
@@ -87,6 +92,8 @@ class Take:
     markers: tuple[MarkersEntry, ...]
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
+    silhouettes: tuple[SilhouetteEntry, ...] = ()
+    start: Path | None = None
 
 
 def read_take(path: str | PathLike[str]) -> Take:
@@ -115,15 +122,16 @@ def read_take(path: str | PathLike[str]) -> Take:
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$.")
         place = place.rstrip("`")
-        listed = ", ".join(map(repr, _options(place.rpartition(".")[2])))
+        listed = ", ".join(map(repr, _options(place)))
         remedy = f"There are: {listed}." if listed and "enum" in problem else None
         raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
     head = content.take
-    body = str(folder / head.body) if head.body.endswith(".toml") else head.body
+    body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
         path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
         keypoints=content.keypoints, markers=content.markers, depth=content.depth, stereo=content.stereo,
+        silhouettes=content.silhouette, start=head.start,
     )
     _check_values(take)
     _check_names(take)
@@ -142,14 +150,17 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     return make
 
 
-def _options(key: str) -> tuple[Any, ...]:
-    """What may be written for a key, where it is one of a few."""
-    for entry in (_Head, CameraEntry, KeypointsEntry):
-        if key in _fields(entry):
-            hint = get_type_hints(entry)[key]
-            literals = [hint, *get_args(hint)]
-            return next((get_args(literal) for literal in literals if get_origin(literal) is Literal), ())
-    return ()
+def _options(place: str) -> tuple[Any, ...]:
+    """What may be written at a place such as "camera[0].image", where it is one of a few."""
+    table, _, key = place.rpartition(".")
+    entries: dict[str, type[msgspec.Struct]] = {
+        "camera": CameraEntry, "keypoints": KeypointsEntry, "silhouette": SilhouetteEntry, "take": _Head,
+    }  # fmt: skip
+    entry = entries.get(table.partition("[")[0])
+    if entry is None or key not in _fields(entry):
+        return ()
+    hint = get_type_hints(entry)[key]
+    return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:
@@ -161,6 +172,7 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
     tables: dict[str, type[msgspec.Struct]] = {
         "take": _Head, "calibration": CalibrationEntry, "camera": CameraEntry, "keypoints": KeypointsEntry,
         "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
+        "silhouette": SilhouetteEntry,
     }
     for table, content in raw.items():
         if table not in tables:
@@ -203,6 +215,14 @@ def _check_values(take: Take) -> None:
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if not 0 < source.accuracy < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
             refuse(f"accuracy {source.accuracy} px, rate {source.rate} Hz", place, "Give positive numbers.")
+        if source.frames is not None and not source.frames[0] < source.frames[1]:
+            refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
+    for shape in take.silhouettes:
+        place = f"silhouette of camera {shape.camera}"
+        if not 0 < shape.accuracy < 1e4 or (shape.rate is not None and not 0 < shape.rate < 1e6):
+            refuse(f"accuracy {shape.accuracy} px, rate {shape.rate} Hz", place, "Give positive numbers.")
+        if shape.file is None and shape.format == "masks":
+            refuse("no file of masks", place, 'Write file = "..." (a folder), or another format.')
     for entry in take.markers:
         place = f"markers {entry.file.name}"
         if not 0 < entry.accuracy < 1 or not abs(entry.time_offset) < 1e6:
@@ -242,7 +262,7 @@ def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
 
 def _check_names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
-    if not (take.cameras or take.keypoints or take.markers or take.depth):
+    if not (take.cameras or take.keypoints or take.markers or take.depth or take.silhouettes):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
@@ -251,11 +271,12 @@ def _check_names(take: Take) -> None:
         if sensors.count(name) > 1:
             kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
             raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
-    for source in take.keypoints:
-        if source.camera not in names:
+    named = [("keypoints", k.camera) for k in take.keypoints] + [("silhouette", s.camera) for s in take.silhouettes]
+    for kind, camera in named:
+        if camera not in names:
             raise TakeError(
-                choices("camera", source.camera, names), file=take.path, place=f"keypoints of camera {source.camera}",
-                remedy=f'Add [[camera]] with name = "{source.camera}", or correct the name.',
+                choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
+                remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
     if take.cameras and take.calibration is None:
         raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')
@@ -268,6 +289,15 @@ def _check_names(take: Take) -> None:
                 )  # fmt: skip
         if pair.left == pair.right:
             raise TakeError("left and right are one camera", file=take.path, place=f"stereo {pair.name}")
+    videos = [entry.name for entry in take.cameras if entry.video is not None]
+    for shape in take.silhouettes:
+        if shape.format == "background" and shape.camera not in videos:
+            raise TakeError(
+                choices("camera with a video", shape.camera, videos), file=take.path,
+                place=f"silhouette of camera {shape.camera}", remedy="Give the [[camera]] its video.",
+            )  # fmt: skip
+        if [s.camera for s in take.silhouettes].count(shape.camera) > 1:
+            raise TakeError("two silhouettes", file=take.path, place=f"camera {shape.camera}", remedy="Leave one out.")
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(
@@ -281,9 +311,10 @@ def _check_files(take: Take) -> None:
     named: list[tuple[str, Path | None]] = [("[calibration] file", take.calibration.file if take.calibration else None)]
     named += [(f"camera {entry.name}, video", entry.video) for entry in take.cameras]
     named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
-    named += [("[take] subject", take.subject)]
+    named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
+    named += [("[take] subject", take.subject), ("[take] start", take.start)]
     named += [("markers", entry.file) for entry in take.markers]
-    named += [("[take] body", Path(take.body) if take.body.endswith(".toml") else None)]
+    named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:

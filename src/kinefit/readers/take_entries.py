@@ -40,6 +40,18 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: float | None = None  # [Hz]; default: the camera's video, or the take
     accuracy: float = 8.0  # [px] standard deviation, in the calibration's image
+    frames: tuple[int, int] | None = None  # steps (start, stop) at which they count; default: all
+
+
+class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
+    """`[[silhouette]]`: which pixels of one camera show the person."""
+
+    camera: str
+    file: Path | None = None  # of "masks": folder or pattern; of "background": picture of the empty scene
+    format: Literal["masks", "background", "detect"] = "masks"
+    frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
+    rate: float | None = None  # [Hz] of the masks; default: the camera's video, or the take
+    accuracy: float = 4.0  # [px] standard deviation of an outline, in the calibration's image
 
 
 class MarkersEntry(_Entry, frozen=True, kw_only=True):
@@ -92,4 +104,5 @@ class _Head(_Entry, frozen=True, kw_only=True):
     body: str = "humanoid"
     height: float | None = None
     subject: Path | None = None
+    start: Path | None = None
     frames: tuple[int, int] | None = None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
-from kinefit.rows import AnyRows, Rows, sort_out
+from kinefit.rows import AnyRows, DofRows, Rows, sort_out
 from kinefit.solvers import _kernels, _kernels_linear
 from kinefit.solvers.losses import SQUARED, Loss
 
@@ -60,8 +60,8 @@ class Equations:
 def normal_equations(
     body: Body, state: BodyState, parts: AnyRows | Iterable[AnyRows], *, loss: Loss = SQUARED
 ) -> Equations:
-    """Gather rows of any kinds at a state into H and g; the loss applies to every `Rows` with a measurement id."""
-    rows, pairs, parameters = sort_out(parts)
+    """Gather rows of any kinds at a state into H and g; the loss applies to every row with a measurement id."""
+    rows, pairs, parameters, dense = sort_out(parts)
     tree = body.tree
     n = tree.n_dofs
     _within("segment", len(tree.segments), body, rows.segment, *(q.segments for q in pairs))
@@ -79,7 +79,7 @@ def normal_equations(
     for p in parameters:
         if p.weight.ndim == 1:
             cost += _kernels.add_parameters(p.index, p.residual, p.weight, depth, C, g)
-    if pairs or joint:
+    if pairs or joint or dense:
         H = np.zeros((n, n))
         _kernels_linear.unpack(C, chain, depth, H)
         for p in joint:
@@ -92,8 +92,24 @@ def normal_equations(
                 q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
                 centre, screws, tree.dof_parent, tree.last_dof, H, g,
             )  # fmt: skip
+        for d in dense:
+            cost += _add_dense(d, body, loss, H, g)
         return Equations(body, state, rows, factor, H, g, float(cost), *_dense(n))
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
+
+
+def _add_dense(rows: DofRows, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
+    """Add rows on all degrees of freedom; their cost."""
+    if rows.jacobian.shape[1] != len(g):
+        problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {len(g)}"
+        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
+    data, factor = np.zeros((8, len(rows))), np.empty(len(rows))
+    data[6], data[7] = rows.residual, rows.weight
+    cost = _kernels.weigh(data, rows.group, len(rows), loss.kind, loss.scale, factor)
+    weighted = rows.jacobian * (rows.weight * factor)[:, None]
+    H += rows.jacobian.T @ weighted
+    g += rows.residual @ weighted
+    return float(cost)
 
 
 @lru_cache(maxsize=8)

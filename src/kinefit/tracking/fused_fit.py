@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.solvers.equations import Covariance, inverse, joint_std
 from kinefit.solvers.least_squares import gauss_newton
@@ -23,7 +26,11 @@ from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.in_sight import beside
 from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import belief
+from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement, outline_camera
 from kinefit.tracking.surface import Surface
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it."""
@@ -71,7 +78,8 @@ class FusedFit:
     body : Body, with surfaces where depth is to be used.
     rig : Rig
     rate : float [Hz] of the frames
-    accuracy : {sensor: standard deviation}, [m] or [px]; others have those of the settings.
+    accuracy : {sensor: standard deviation}, [m] or [px], "silhouette CAMERA" for silhouettes;
+        others have those of the settings.
     settings : FusionSettings
     backgrounds : {depth camera: Background}, added to when one is seen first; None for one that is to have none.
     """
@@ -82,23 +90,45 @@ class FusedFit:
     ) -> None:  # fmt: skip
         self.body, self.rig, self.rate, self.accuracy, self.settings = body, rig, rate, accuracy, settings
         self.surface = Surface(body, settings.samples) if body.surfaces else None
+        morphing = self.surface.morphing if self.surface is not None else None
+        self._moving = morphing if morphing is not None and morphing.moves_joints else None
         self._backgrounds = backgrounds
+        self._pool: ThreadPoolExecutor | None = None
         self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
         self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
         self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
 
     def measurements(self, frames: Sequence[Frame], state: BodyState) -> list[Measurement]:
         """What the sensors saw, ready to make rows about a state."""
-        return [self._measurement(frame, frames, state) for frame in frames]
+        if self.surface is not None and any(isinstance(frame, SilhouetteFrame) for frame in frames):
+            self.surface.pose(state)
+            for frame in frames:  # room for each, before they are looked at side by side
+                if isinstance(frame, SilhouetteFrame):
+                    self.surface.rims(outline_camera(self.rig[frame.sensor], self.settings))
+        return self._each(lambda frame: self._measurement(frame, frames, state), frames)
+
+    def _each(self, do: Callable[[_In], _Out], what: Sequence[_In]) -> list[_Out]:
+        """Several silhouettes side by side, on two cores, as most of it runs compiled; else one after the other."""
+        if sum(isinstance(w, SilhouetteFrame | SilhouetteMeasurement) for w in what) < 2:
+            return [do(w) for w in what]
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(2)
+        return list(self._pool.map(do, what))
 
     def _measurement(self, frame: Frame, frames: Sequence[Frame], state: BodyState) -> Measurement:
         s, name = self.settings, frame.sensor
         if isinstance(frame, KeypointFrame):
-            accuracy = self.accuracy.get(name, s.pixel)
-            return KeypointMeasurement(frame, self.body, self.rig, accuracy, self._beside(frame, frames, state))
+            accuracy, depth = self.accuracy.get(name, s.pixel), self._beside(frame, frames, state)
+            return KeypointMeasurement(frame, self.body, self.rig, accuracy, self._moving, depth=depth)
         if isinstance(frame, MarkerFrame):
-            return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker))
+            return MarkerMeasurement(frame, self.body, self.accuracy.get(name, s.marker), self._moving)
         surface = self.surface or Surface(self.body, s.samples)  # which tells what is missing
+        if isinstance(frame, SilhouetteFrame):
+            sigma = self.accuracy.get(f"silhouette {name}", s.silhouette)
+            return SilhouetteMeasurement(frame, self.rig[name], surface, surface.pose(state).vertices, sigma, s)
+        if self._moving:
+            problem = f"depth does not know of joints that move with angles, as those of body '{self.body.name}' do"
+            raise BodyError(problem, remedy="Take the body without morphs: replace(body, morphs=()), or without depth.")
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):
             return CloudMeasurement(frame, surface, vertices, sigma, s)
@@ -120,7 +150,11 @@ class FusedFit:
     def _rows(
         self, state: BodyState, held: Held | None, measurements: Sequence[Measurement], bound: float
     ) -> list[AnyRows]:
-        parts: list[AnyRows] = [rows for m in measurements for rows in m.rows(state, bound)]
+        if self.surface is not None:
+            self.surface.pose(state)
+            self.surface.posed(state)
+        told = self._each(lambda m: m.rows(state, bound), measurements)
+        parts: list[AnyRows] = [rows for several in told for rows in several]
         if held is not None:
             parts.append(belief(state, *held))
         usual = self.body.tree.usual
@@ -150,11 +184,14 @@ class FusedFit:
         result = FusionResult(time, state, std, joints, told.quality, told.lost, told.hidden, iterations)
         return result, posterior
 
-    def judged(self, state: BodyState, measurements: Iterable[Measurement]) -> Evidence:
+    def judged(self, state: BodyState, measurements: Sequence[Measurement]) -> Evidence:
         """What measurements say of each segment."""
         told = Evidence.none(len(self.body.tree.segments))
-        for m in measurements:
-            told = told + m.evidence(state)
+        if self.surface is not None:
+            self.surface.pose(state)
+            self.surface.posed(state)
+        for one in self._each(lambda m: m.evidence(state), measurements):
+            told = told + one
         return told
 
     def background(self, camera: Camera) -> Background | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import Frame
 from kinefit.solvers.equations import inverse
 from kinefit.tracking._depth_search import Search
 from kinefit.tracking.background import Background
@@ -38,7 +39,8 @@ class FusionTracker:
     body : Body, with surfaces where depth is to be used.
     rig : Rig of all cameras, depth cameras among them.
     rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
-    accuracy : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
+    accuracy : {sensor: standard deviation}
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
     up : (3,) upwards in the world, for a start with no pose given.
     on_body : depth cameras whose images show nothing but the body: no background is learnt.
 
@@ -267,9 +269,9 @@ def _better(new: FusionResult, old: FusionResult) -> bool:
 
 def _time_of(frames: Sequence[Frame], time: float | None) -> float:
     for frame in frames:
-        if not isinstance(frame, DepthFrame | PointCloud | KeypointFrame | MarkerFrame):
+        if not isinstance(frame, Frame):
             problem = f"a {type(frame).__name__} among the frames"
-            raise ObservationError(problem, remedy="Give DepthFrame, PointCloud, KeypointFrame or MarkerFrame.")
+            raise ObservationError(problem, remedy=f"Give {', '.join(kind.__name__ for kind in get_args(Frame))}.")
     if time is None:
         time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
     if not np.isfinite(time):

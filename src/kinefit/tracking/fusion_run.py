@@ -69,9 +69,10 @@ def run_steps(
         begin, state = start
         tracker.start_at(state)
     results: dict[int, FusionResult] = {}
+    seen: dict[int, list[Frame]] = {}
     try:
         for i in range(begin, len(times)):
-            found = tracker.update(steps(i), float(times[i]))
+            found = tracker.update(_told(steps, i, seen), float(times[i]))
             if found is not None:
                 results[i] = found
             elif not results and i - begin >= _GIVE_UP:
@@ -84,7 +85,7 @@ def run_steps(
         first = min(results)
         back = tracker.backwards(results[first].state)
         for i in range(first - 1, -1, -1):
-            again = back.update(steps(i), float(-times[i]))
+            again = back.update(_told(steps, i, seen), float(-times[i]))
             assert again is not None
             results[i] = again
             if progress:
@@ -94,14 +95,21 @@ def run_steps(
             raise
     done = sorted(results)
     told = {**(provenance or {}), "fusion": {"dropped": tracker.dropped, "late": tracker.late}}
-    motion = _motion(tracker, [steps(i) for i in done], [results[i] for i in done], times[done], up, name, told)
+    motion = _motion(tracker, [seen[i] for i in done], [results[i] for i in done], times[done], up, name, told)
     if len(done) < len(times):
         raise TrackingInterrupted(motion, len(times))
     return motion
 
 
+def _told(steps: Steps, i: int, seen: dict[int, list[Frame]]) -> Sequence[Frame]:
+    """What the sensors saw at a step; the points of it are kept in `seen`, as images would take much room."""
+    frames = steps(i)
+    seen[i] = [frame for frame in frames if isinstance(frame, KeypointFrame | MarkerFrame)]
+    return frames
+
+
 def _motion(
-    tracker: FusionTracker, seen: list[Sequence[Frame]], found: list[FusionResult], times: NDArray, up: str,
+    tracker: FusionTracker, seen: Sequence[Sequence[Frame]], found: list[FusionResult], times: NDArray, up: str,
     name: str, provenance: dict[str, Any],
 ) -> Motion:  # fmt: skip
     return Motion(
@@ -122,7 +130,7 @@ def _motion(
 
 
 def _residuals(
-    tracker: FusionTracker, seen: list[Sequence[Frame]], found: list[FusionResult]
+    tracker: FusionTracker, seen: Sequence[Sequence[Frame]], found: list[FusionResult]
 ) -> dict[str, Residuals]:
     """What keypoints and markers left over, sensor by sensor."""
     body, rig = tracker.body, tracker.rig

@@ -32,8 +32,13 @@ class FusionSettings:
         measurements count as there are patches.
     render_every : int
         Iterations after which the body's own hidden parts are found anew.
-    depth, pixel, marker : float [m], [px], [m]
+    depth, pixel, marker, silhouette : float [m], [px], [m], [px]
         Standard deviation of a sensor that none is given for.
+    outline : int [px]
+        Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
+        and the room about. Outlines are told to parts of a pixel.
+    angle : float [rad]
+        Largest angle between normals of two outlines of which points are paired.
     background : float [s]
         How long a thing near the body must be seen, and not be taken for the body, to count as background; see
         `Background`. inf for depth cameras that move.
@@ -74,6 +79,9 @@ class FusionSettings:
     depth: float = 0.01
     pixel: float = 4.0
     marker: float = 0.005
+    silhouette: float = 4.0
+    outline: int = 320
+    angle: float = 1.0
     background: float = 0.5
     through: float = 3.0
     collision: float = 0.01

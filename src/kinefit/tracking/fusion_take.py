@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, load_body
+from kinefit.bodies import Body, BodyState, load_body
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
@@ -23,8 +23,10 @@ from kinefit.observations import (
     Keypoints,
     MarkerFrame,
     Markers,
+    SilhouetteVideo,
 )
 from kinefit.readers.load import Observations
+from kinefit.readers.motion import read_motion
 from kinefit.readers.take import Take
 from kinefit.readers.video import Video
 from kinefit.tracking.association import choose_people
@@ -34,6 +36,7 @@ from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
 from kinefit.tracking.fusion_settings import FusionSettings
 from kinefit.tracking.marker_poses import bare
 from kinefit.tracking.placement import known_set
+from kinefit.tracking.silhouette_take import shaped_by_silhouettes, silhouettes_of
 from kinefit.tracking.subject import Progress, fit_subject
 
 _SIZES = 4  # depth images from which a person's size is found ...
@@ -59,25 +62,46 @@ def fuse_take(
     KinefitError
         What the sensors' readers and the tracker raise.
     """
+    if take.silhouettes and not (take.start or take.keypoints or take.markers or take.depth or take.stereo):
+        raise TakeError(
+            "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
+            remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
+        )  # fmt: skip
     source = FrameSource(take, seen)
     up = np.array(UP_AXES[take.up])
-    found = Sized(load_body(take.body))
-    if size:
+    found = Sized(load_body(take.body)) if take.start is None else _started(take)
+    if size and take.start is None:
         found = _sized(found.body, take, source, up, progress)
-    body = found.body
-    tracker = FusionTracker(
-        body, source.rig, rate=seen.rate, accuracy=source.accuracy(take), up=up, settings=settings,
-        on_body=[video.sensor for video in source.depth if video.on_body],
-    )  # fmt: skip
+    times = np.arange(*seen.frames) / seen.rate
+
+    def tracker_of(body: Body) -> FusionTracker:
+        return FusionTracker(
+            body, source.rig, rate=seen.rate, accuracy=source.accuracy(take), up=up, settings=settings,
+            on_body=[video.sensor for video in source.depth if video.on_body],
+        )  # fmt: skip
+
+    if size and source.silhouettes:
+        first, own = tracker_of(found.body), found.body
+        shaped = shaped_by_silhouettes(first, lambda i: source.at(i, own), times, start=found.start, progress=progress)
+        if shaped is not None:
+            sizes = dict(zip(shaped.fit.names, map(float, shaped.fit.values)))
+            found = Sized(shaped.body, shaped.start, {**found.told, "shape": sizes})
+    body, tracker = found.body, tracker_of(found.body)
     for video in source.depth:
         if video.background is not None:
             empty = [video.background.frame(i).depth for i in range(min(len(video.background), _EMPTY))]
             tracker.know_background(video.sensor, background_model(empty, share=0.5))
-    times = np.arange(*seen.frames) / seen.rate
     return run_steps(
         tracker, lambda i: source.at(i, body), times, up=take.up, start=found.start, name=take.name,
         provenance=found.told, progress=progress,
     )  # fmt: skip
+
+
+def _started(take: Take) -> Sized:
+    """Body and first state as a motion file tells them."""
+    assert take.start is not None
+    motion = read_motion(take.start)
+    return Sized(motion.body, (0, BodyState(motion.Ts_world_root[0], motion.angles[0])))
 
 
 @dataclass(frozen=True)
@@ -104,6 +128,7 @@ class FrameSource:
     ----------
     rig : Rig with all cameras, rectified stereo pairs among them.
     depth : tuple of DepthVideo, stereo pairs among them.
+    silhouettes : tuple of SilhouetteVideo
     """
 
     def __init__(self, take: Take, seen: Observations) -> None:
@@ -114,6 +139,7 @@ class FrameSource:
         if not cameras:
             raise TakeError("no camera of the take is calibrated", file=take.path, remedy="Add [calibration].")
         self.rig = Rig(cameras)
+        self.silhouettes: tuple[SilhouetteVideo, ...] = silhouettes_of(take, seen)
         self._offsets = [entry.time_offset for entry in take.markers]
         self.people: list[NDArray] = []
         if seen.keypoints:
@@ -149,6 +175,7 @@ class FrameSource:
             baseline = float(np.linalg.norm(left.centre_world - right.centre_world))
             z = 0.67 * stereo.range[1]
             out[stereo.name] = stereo.accuracy * z**2 / (video.camera.matrix[0, 0] * baseline)
+        out |= {f"silhouette {entry.camera}": entry.accuracy for entry in take.silhouettes}
         out |= {entry.camera: entry.accuracy for entry in take.keypoints}
         return out | {f"markers {k}": entry.accuracy for k, entry in enumerate(take.markers)}
 
@@ -156,7 +183,9 @@ class FrameSource:
         """Frames of step `i` of the take; of keypoints the person that is followed."""
         seen, out = self.seen, list[Frame]()
         step = seen.frames[0] + i
-        recordings: tuple[DepthVideo | CloudVideo, ...] = (*self.depth, *seen.clouds)
+        recordings: tuple[DepthVideo | CloudVideo | SilhouetteVideo, ...] = (
+            *self.depth, *seen.clouds, *self.silhouettes,
+        )  # fmt: skip
         for recording in recordings:
             k = recording.at_step(step, seen.rate)
             if k is not None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.morphing import Morphing
 from kinefit.correspondences import _kernels, targets
+from kinefit.correspondences.morphed import on_moved_joints
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame
-from kinefit.rows import AnyRows, Rows
+from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.tracking._depth_view import DepthView
 from kinefit.tracking.evidence import SHOWN, Evidence
 from kinefit.tracking.in_sight import SEEN, THICK, InSight
@@ -44,6 +46,7 @@ class KeypointMeasurement:
     Parameters
     ----------
     sigma : float [px] standard deviation of a keypoint with confidence 1.
+    morphing : Morphing of the body, where its joints move with its angles.
     depth : a depth frame of the same time, its camera beside this one, and its standard deviation [m], optional.
 
     Raises
@@ -53,10 +56,10 @@ class KeypointMeasurement:
     """
 
     def __init__(
-        self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float,
+        self, frame: KeypointFrame, body: Body, rig: Rig, sigma: float, morphing: Morphing | None = None, *,
         depth: tuple[DepthFrame, Camera, float] | None = None,
     ) -> None:  # fmt: skip
-        self.sensor, self._body, self._packed = frame.sensor, body, rig.packed
+        self.sensor, self._body, self._packed, self._morphing = frame.sensor, body, rig.packed, morphing
         seen = np.isfinite(frame.uv).all(axis=1) & (frame.confidence > 0) & (frame.confidence < np.inf)
         known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
         self.points, here = _known(known, frame.names, seen)
@@ -67,15 +70,14 @@ class KeypointMeasurement:
         shown = self.points.select(tuple(self.points.names[k] for k in self._shown))
         self._sight = None if depth is None or not len(shown) else InSight(body, shown, *depth)
 
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows | DofRows]:
         """Two rows a keypoint; one more where it lies too deep behind what was measured before it."""
         rows = [self._pixels(state)]
         return rows if self._sight is None else [*rows, self._sight.rows(state)]
 
-    def _pixels(self, state: BodyState) -> Rows:
-        camera, uv, weight = self._camera, self.uv, self._weight
-        fill = _kernels.pixel_rows
-        return targets.fill(fill, 2, self._body, state, self.points, self._packed, camera, uv, weight)
+    def _pixels(self, state: BodyState) -> Rows | DofRows:
+        given = self._packed, self._camera, self.uv, self._weight
+        return _filled(_kernels.pixel_rows, 2, self._body, self._morphing, state, self.points, *given)
 
     def square(self, state: BodyState) -> NDArray:
         """(K,) squared distances in the image, in variances; inf for those that could not be seen where they are."""
@@ -99,6 +101,7 @@ class MarkerMeasurement:
     Parameters
     ----------
     sigma : float [m]
+    morphing : Morphing of the body, where its joints move with its angles.
 
     Raises
     ------
@@ -106,20 +109,23 @@ class MarkerMeasurement:
         A marker set that the body does not have.
     """
 
-    def __init__(self, frame: MarkerFrame, body: Body, sigma: float) -> None:
-        self.sensor, self._body = frame.sensor, body
+    def __init__(self, frame: MarkerFrame, body: Body, sigma: float, morphing: Morphing | None = None) -> None:
+        self.sensor, self._body, self._morphing = frame.sensor, body, morphing
         known = body.markers(frame.marker_set) if frame.marker_set else body.landmarks
         self.points, here = _known(known, frame.names, np.isfinite(frame.positions).all(axis=1))
         self.x_world = np.ascontiguousarray(frame.positions[here])
         self._weight = np.full(len(here), 1.0 / sigma**2)
 
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
+    def rows(self, state: BodyState, bound: float) -> list[Rows | DofRows]:
         """Three rows a marker."""
-        return [targets.fill(_kernels.point_rows, 3, self._body, state, self.points, self.x_world, self._weight)]
+        given = self.x_world, self._weight
+        return [_filled(_kernels.point_rows, 3, self._body, self._morphing, state, self.points, *given)]
 
     def square(self, state: BodyState) -> NDArray:
         """(M,) squared distances, in variances."""
-        gap = self.x_world - self._body.positions(state, self.points)
+        morphing = self._morphing
+        x = morphing.pose(state).positions(self.points) if morphing else self._body.positions(state, self.points)
+        gap = self.x_world - x
         return np.asarray(self._weight * np.square(gap).sum(axis=1))
 
     def evidence(self, state: BodyState) -> Evidence:
@@ -138,6 +144,16 @@ def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
         if tree.parents[s] >= 0 and np.linalg.norm(place) < _AT_JOINT:
             out[int(far), tree.parents[s]] += SHOWN
     return Evidence(*out)
+
+
+def _filled(
+    kernel: Any, lines: int, body: Body, morphing: Morphing | None, state: BodyState, points: PointSet, *given: Any
+) -> Rows | DofRows:
+    """Rows of points of a body, on joints that move where they do."""
+    if morphing is None:
+        return targets.fill(kernel, lines, body, state, points, *given)
+    pose = morphing.pose(state)
+    return on_moved_joints(pose, targets.fill(kernel, lines, body, state, points, *given, frames=pose.frames))
 
 
 def _known(points: PointSet, names: tuple[str, ...], seen: NDArray) -> tuple[PointSet, list[int]]:

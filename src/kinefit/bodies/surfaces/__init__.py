@@ -1,8 +1,10 @@
 """Surfaces of a body's segments: tapered elliptical cylinders and meshes."""
 
 from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
+from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.nearest import Nearest, nearest
+from kinefit.bodies.surfaces.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.tables import SurfaceTables
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, triangles
 
@@ -11,8 +13,11 @@ Surface = TaperedCylinder | MeshSurface
 __all__ = [
     "BodyMesh",
     "Box",
+    "FourierCurve",
+    "FourierSurface",
     "MeshSurface",
     "Nearest",
+    "SkinnedMesh",
     "Surface",
     "SurfaceTables",
     "TaperedCylinder",

@@ -106,6 +106,12 @@ def _edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     return edges, count, balance
 
 
+def check_triangles(vertices: NDArray, faces: NDArray) -> None:
+    """Refuse triangles that do not enclose something, as `MeshSurface` does."""
+    edges, count, _ = _edges(np.asarray(faces, np.int64))
+    _check(vertices, np.asarray(faces, np.int64), edges[count % 2 == 1])
+
+
 def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
     if not len(faces):
         raise BodyError("all faces of a mesh are without area", remedy="Is it in metres?")

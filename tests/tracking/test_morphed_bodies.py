@@ -1,0 +1,113 @@
+"""Bodies that change with their pose, in the tracker: every sensor sees joints where they have moved to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.tracking.test_silhouettes import at, ring
+
+from kinefit.bodies import load_body
+from kinefit.bodies.morphing import Morphing
+from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.errors import BodyError
+from kinefit.geometry.camera import Rig
+from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
+from kinefit.rendering import Canvas
+from kinefit.tracking.fused_fit import FusedFit
+from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.fusion_settings import FusionSettings
+from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement
+
+JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body("humanoid_morphing")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return ring(3)
+
+
+def posture(body, i):
+    return at(body, arm_flex_r=70 + 2 * i, arm_add_r=-35 - i, elbow_flex_r=50 + i, arm_flex_l=40 + 2 * i)
+
+
+def silhouettes(model, state, rig, time):
+    """Masks of a body as it is morphed."""
+    vertices, out = model.pose(state).vertices, []
+    for camera in rig:
+        seen = Canvas(camera.size).draw_for(camera, vertices, model.mesh.faces, cull=True).seen
+        out.append(SilhouetteFrame(camera.name, time, seen.copy()))
+    return out
+
+
+def markers(model, state, time, names=None):
+    points = model.body.landmarks if names is None else model.body.landmarks.select(names)
+    return MarkerFrame("markers", time, points.names, model.pose(state).positions(points))
+
+
+def off(body, found, truth):
+    """(4,) [deg] errors of arm angles."""
+    own = [body.tree.coordinate(name) for name in JOINTS]
+    return np.degrees(np.abs(found.angles - truth.angles))[own]
+
+
+@pytest.mark.parametrize("sensors", ["silhouettes", "markers", "both"])
+def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
+    """The morphing body finds the arms' angles; the same one held stiff is off."""
+    model, ends = Morphing(body), {}
+    for name, own in (("morphing", body), ("stiff", replace(body, morphs=()))):
+        follow = FusionTracker(own, rig, rate=30.0, settings=FusionSettings(search=False))
+        follow.start_at(posture(body, 0))
+        for i in range(8):
+            truth, frames = posture(body, i), []
+            if sensors != "markers":
+                frames += silhouettes(model, truth, rig, i / 30)
+            if sensors != "silhouettes":
+                frames.append(markers(model, truth, i / 30))
+            result = follow.update(frames)
+        ends[name] = off(body, result.state, truth).mean()
+    assert ends["morphing"] < (1.5 if sensors == "silhouettes" else 0.3)
+    assert ends["stiff"] > 2 * ends["morphing"]
+
+
+def test_keypoints_and_markers_make_rows_on_moved_joints(body, rig):
+    model, state = Morphing(body), posture(body, 3)
+    keypoints = body.keypoints("COCO_17")
+    x = model.pose(state).positions(keypoints)
+    uv = rig.cameras[1].project(x)
+    frame = KeypointFrame("c1", 0.0, keypoints.names, uv, np.ones(len(uv)), "COCO_17")
+    for measurement in (
+        KeypointMeasurement(frame, body, rig, 3.0, model),
+        MarkerMeasurement(markers(model, state, 0.0), body, 0.01, model),
+    ):
+        np.testing.assert_allclose(measurement.square(state), 0.0, atol=1e-12)
+        (rows,) = measurement.rows(state, 0.1)
+        np.testing.assert_allclose(rows.residual, 0.0, atol=1e-9)
+        step, h = np.random.default_rng(0).normal(size=body.tree.n_dofs), 1e-6
+        ends = [measurement.rows(state.retract(s * h * step), 0.1)[0] for s in (-1, 1)]
+        slope = (ends[1].residual - ends[0].residual) / (2 * h)
+        np.testing.assert_allclose(rows.jacobian @ step, -slope, atol=1e-5)
+
+
+def test_without_moving_joints_the_derivative_is_the_trees(body, rig):
+    plain, state = replace(body, morphs=()), posture(body, 3)
+    model = Morphing(plain)
+    (rows,) = MarkerMeasurement(markers(model, state, 0.0), plain, 0.01).rows(state, 0.1)
+    J = on_moved_joints(model.pose(state), rows).jacobian
+    assert not model.moves_joints and model.is_rigid
+    _, screws = plain.tree.forward(state.T_world_root, state.angles)
+    arm = rows.point - state.T_world_root[:3, 3]
+    for k in range(0, len(rows), 17):
+        a = np.r_[rows.direction[k], np.cross(arm[k], rows.direction[k])]
+        np.testing.assert_allclose(J[k], a @ plain.tree.segment_jacobian(screws, int(rows.segment[k])), atol=1e-12)
+
+
+def test_depth_says_that_it_does_not_know_of_moving_joints(body, rig):
+    fit = FusedFit(body, Rig(rig.cameras[:1]), 30.0, {}, FusionSettings(), {})
+    image = np.full(rig.cameras[0].size[::-1], 3.0, np.float32)
+    with pytest.raises(BodyError, match="joints that move with angles.*without morphs"):
+        fit.measurements([DepthFrame("c0", 0.0, image)], posture(body, 0))
