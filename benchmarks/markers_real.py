@@ -111,15 +111,15 @@ def run(names: list[str] | None = None) -> None:
 
     moved = [100 * s["all"].right for case, s in rows if case.exercised]
     mean = float(np.mean(moved)) if moved else None
-    figure("markers.real.single.least", least("all"), "% right", ">= 98.5", reason)
-    figure("markers.real.single.mean", mean, "% right", ">= 99.5", reason)
-    figure("markers.real.single.wrong", most_wrong("all"), "%", "<= 0.2", reason)
-    figure("markers.real.removed.least", least("10 % removed"), "% right", ">= 97", reason)
-    figure("markers.real.ghosts.least", least("ten ghosts"), "% right", ">= 98", reason)
-    figure("markers.real.whole.least", least("whole"), "% right", ">= 99.9", reason)
-    figure("markers.real.whole.wrong", most_wrong("whole"), "%", "<= 0.2", reason)
+    figure("markers_real_single_least", least("all"), "% right", ">= 98.5", reason)
+    figure("markers_real_single_mean", mean, "% right", ">= 99.5", reason)
+    figure("markers_real_single_wrong", most_wrong("all"), "%", "<= 0.2", reason)
+    figure("markers_real_removed_least", least("10 % removed"), "% right", ">= 97", reason)
+    figure("markers_real_ghosts_least", least("ten ghosts"), "% right", ">= 98", reason)
+    figure("markers_real_whole_least", least("whole"), "% right", ">= 99.9", reason)
+    figure("markers_real_whole_wrong", most_wrong("whole"), "%", "<= 0.2", reason)
     large = [s["all"].slowest for case, s in rows if case.name == "clusters 61"]
-    figure("markers.real.clusters61", 1e3 * large[0] if large else None, "ms a frame, slowest", "<= 200", reason)
+    figure("markers_real_clusters61", 1e3 * large[0] if large else None, "ms a frame, slowest", "<= 200", reason)
 
 
 if __name__ == "__main__":

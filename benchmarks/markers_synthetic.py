@@ -84,10 +84,10 @@ def table(model: MarkerModel) -> None:
         worst, results[kind] = max(worst, a.wrong), a.right
         medians.append(a.median)
     for kind, goal in goals.items():
-        name = f"markers.synthetic.right.{kind[0]:.0%}.missing{kind[1]:.0%}.extra{kind[2]}"
+        name = f"markers_synthetic_right_{100 * kind[0]:.0f}_missing{100 * kind[1]:.0f}_extra{kind[2]}"
         figure(name, 100 * results[kind], "%", f">= {goal}")
-    figure("markers.synthetic.wrong.worst", 100 * worst, "%", "<= 0.1")
-    figure("markers.synthetic.median.worst", max(medians), "ms", "<= 100")
+    figure("markers_synthetic_wrong_worst", 100 * worst, "%", "<= 0.1")
+    figure("markers_synthetic_median_worst", max(medians), "ms", "<= 100")
 
 
 def surface(model: MarkerModel, file: Path | None) -> None:
@@ -144,11 +144,11 @@ def run(file: Path | None = None) -> None:
     model = synthetic_body(44)
     score(ours, model, 3)
     clean = score(ours, model, CLEAN)
-    figure("markers.synthetic.clean.identify", 100 * clean.whole, "% of frames", ">= 99.9")
-    figure("markers.synthetic.clean.identify.median", clean.median, "ms", "<= 3")
+    figure("markers_synthetic_clean_identify", 100 * clean.whole, "% of frames", ">= 99.9")
+    figure("markers_synthetic_clean_identify_median", clean.median, "ms", "<= 3")
     large = score(ours, synthetic_body(49), max(CLEAN // 10, 10))
-    figure("markers.synthetic.clean.identify.49", 100 * large.whole, "% of frames", ">= 99.9")
-    figure("markers.synthetic.clean.sapm", 100 * score(sapm, model, CLEAN).whole, "% of frames", ">= 95")
+    figure("markers_synthetic_clean_identify_49", 100 * large.whole, "% of frames", ">= 99.9")
+    figure("markers_synthetic_clean_sapm", 100 * score(sapm, model, CLEAN).whole, "% of frames", ">= 95")
     table(model)
     surface(model, file)
 

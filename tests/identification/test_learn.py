@@ -95,6 +95,16 @@ def test_joints_held_still_do_not_merge_and_do_not_promise():
     assert any(f.kind == "merged" and "template" in str(f) for f in merged)
 
 
+def test_a_label_that_the_file_has_twice_is_told():
+    take = moving()
+    first = take.names[0]
+    again = replace(take, names=(*take.names, f"{first}_2"), positions=np.concatenate(
+        [take.positions, take.positions[:, :1] + 0.3], axis=1))  # fmt: skip
+    told = [f for f in training_gate(again, learn_model(again, template=SET)) if f.kind == "twice"]
+    assert [f.name for f in told] == [f"{first}_2"] and f"label {first} twice" in str(told[0])
+    assert not [f for f in training_gate(take, learn_model(take, template=SET)) if f.kind == "twice"]
+
+
 def test_one_frame_gives_the_model_of_its_distances_wherever_it_stands():
     R, t = exp_so3(np.array([0.3, -1.0, 0.5])), np.array([5.0, 2.0, -3.0])
     model = model_from_frame(SET.places @ R.T + t, SET.labels, SET)

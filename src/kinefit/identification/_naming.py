@@ -77,8 +77,6 @@ class Naming:
                 x = self.pieces.points[own[max(i - 1, 0) : j + 2]]
                 jump = np.linalg.norm(x[2:] - 2 * x[1:-1] + x[:-2], axis=1)
                 where = min(max(max(i - 1, 0) + 1 + int(np.argmax(jump)), i + 1), j) if len(jump) else j
-                if frame[b] - frame[a] > 4 and {(frame[a] + frame[b]) // 2} - self.votes.asked:
-                    continue
                 piece[own[where:]] = fresh
                 fresh += 1
             if fresh == self.pieces.count:

@@ -36,7 +36,8 @@ class Finding:
 
     Parameters
     ----------
-    kind : "still" (a joint), "merged" (segments), "seldom" (a marker), "few" (markers on a segment), "alike" (segments)
+    kind : "twice" (a label), "still" (a joint), "merged" (segments), "seldom" (a marker), "few" (markers on a segment),
+        "alike" (segments)
     name : of the segment or label
     text : what was found
     remedy : what to record or to change
@@ -68,7 +69,15 @@ def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet
         if share < ENOUGH:
             still.append((share, _still(model, joint, full.get(name, RANGE))))
     out = [f for _, f in sorted(still, key=lambda pair: pair[0])]
-    return out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+    return _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+
+
+def _twice(model: MarkerModel) -> list[Finding]:
+    """Labels that the file had twice: its reader told them apart by a suffix."""
+    parts = [(label, *label.rpartition("_")) for label in model.labels]
+    again = [(label, base) for label, base, _, n in parts if n.isdigit() and base in model.labels]
+    text, remedy = "the file has the label {} twice", "Delete one of the two in the recording"
+    return [Finding("twice", label, text.format(base), remedy) for label, base in again]
 
 
 def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> Finding:
