@@ -23,8 +23,8 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file; `smooth` and `contacts` as in `track`.
 
-    A take with depth, stereo or silhouettes is fused frame by frame from all of its sensors (`fuse_take`), any
-    other is fitted to the keypoints of its cameras.
+    A take with depth, stereo, silhouettes or markers is fused frame by frame from all of its sensors (`fuse_take`),
+    any other is fitted to the keypoints of its cameras.
 
     Returns the motion and what the sensors saw (for overlays).
 
@@ -36,7 +36,7 @@ def track_take(
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
-    if take.depth or take.stereo or take.silhouettes:
+    if take.depth or take.stereo or take.silhouettes or take.markers:
         observations = load_observations(take)
         return fuse_take(take, observations, progress=progress), observations
     body, observations = load_body(take.body), load_keypoints(take)
