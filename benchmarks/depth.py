@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
+from benchmarks.figures import run_parts
 
 PARTS = {
     "depth_surfaces": "closest points on tapered elliptical cylinders",
@@ -18,16 +17,5 @@ PARTS = {
     "depth_speed": "time a frame, by points and background; beside Open3D",
 }
 
-
-def main(chosen: list[str]) -> None:
-    """Print the figures of the chosen parts; of all, where none is named."""
-    unknown = [name for name in chosen if name not in PARTS]
-    if unknown:
-        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(PARTS)}")
-    for name in chosen or PARTS:
-        print(f"\n# {name}: {PARTS[name]}", flush=True)
-        import_module(f"benchmarks.{name}").run()
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_parts(PARTS)

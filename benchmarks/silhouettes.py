@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
+from benchmarks.figures import run_parts
 
 PARTS = {
     "silhouettes_cga": "conformal geometric algebra",
@@ -16,16 +15,5 @@ PARTS = {
     "silhouettes_arm": "a real arm in two views",
 }
 
-
-def main(chosen: list[str]) -> None:
-    """Print the figures of the chosen parts; of all, where none is named."""
-    unknown = [name for name in chosen if name not in PARTS]
-    if unknown:
-        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(PARTS)}")
-    for name in chosen or PARTS:
-        print(f"\n# {name}: {PARTS[name]}", flush=True)
-        import_module(f"benchmarks.{name}").run()
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_parts(PARTS)
