@@ -37,7 +37,8 @@ ENOUGH = 0.65
 """Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
 
 TRUSTED = 0.72
-"""Share of the points that an explanation must have a name for, if there are no more than labels; else it is chance."""
+"""Share of the points that an explanation must have a name for, if there are no more than labels; else it is chance. At
+0.8 wrong names all but end where much is missing, and right ones with 10 % missing fall below 95 %."""
 
 WHOLE = 0.95
 """Share of the largest segments' markers that a noise level explains when no coarser one need be looked at."""
@@ -50,14 +51,15 @@ class IdentifySettings:
     Parameters
     ----------
     finest, coarsest : noise levels between which is searched, as factors on the model's deviations
-    certain : a label less probable than this is unknown
+    certain : a label less probable than this is unknown. On seven real takes with a tenth of the markers gone, 0.8
+        names up to 1.1 % more right than 0.9 and up to 0.15 % more wrong; in whole frames 0.7 begins to name wrong
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
     """
 
     finest: float = 0.02
     coarsest: float = 4.0
-    certain: float = 0.9
+    certain: float = 0.8
     gate: float = 4.5
     miss: float = 0.05
 
