@@ -246,21 +246,13 @@ def range_cost(points, theirs, index, low, high, width, out):
 
 
 @jit
-def weigh_child(new, best, total, extra, taken):
-    """Least of `best`, and -log Σ exp(-total), over the choices (C, W bits) that take none of the points `taken`."""
-    low, low_total = math.inf, math.inf
+def cheapest_free(new, best, extra, taken):
+    """Least of best + extra (C,) over the choices (C, W bits) that take none of the points `taken`."""
+    low = math.inf
     for c in range(len(best)):
         free = True
         for i in range(len(taken)):
             free = free and (new[c, i] & taken[i]) == 0
-        if free:
-            low = best[c] + extra[c] if best[c] + extra[c] < low else low
-            low_total = total[c] + extra[c] if total[c] + extra[c] < low_total else low_total
-    mass = 0.0
-    for c in range(len(best)):
-        free = True
-        for i in range(len(taken)):
-            free = free and (new[c, i] & taken[i]) == 0
-        if free:
-            mass += math.exp(low_total - total[c] - extra[c])
-    return low, low_total - math.log(mass)
+        if free and best[c] + extra[c] < low:
+            low = best[c] + extra[c]
+    return low

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.identification._kernels_evidence import place_joint
-from kinefit.identification._kernels_identify import enumerate_segment, range_cost, weigh_child
+from kinefit.identification._kernels_identify import cheapest_free, enumerate_segment, range_cost
 from kinefit.identification._tables import SegmentTable
 
 LOOSE = 0.15
@@ -20,11 +21,27 @@ ROOM = 48
 SLACK = 10.0
 """Choices whose cost is this much above the best are dropped: e^-10 of its likelihood."""
 
-BUDGET = 600
-"""Nodes; a search that needs more has a wrong noise level or too few points: from then on only first choices count."""
+WIDE = 20.0
+"""The same where one branch is looked at: a marker that is left out costs 8 to 12 at a noise of 1 to 2 cm."""
 
-QUOTA = 200
-"""Nodes for each choice of the root."""
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Points to be named, and what is thought of missing and strange ones.
+
+    Parameters
+    ----------
+    points : (N, 3) [m]; gaps : (N, N) [m] their distances
+    volume : [m³] of the box they are in
+    gain : what a matched marker earns against a missing one, log(1/m³)
+    gate : deviations by which a distance may differ
+    """
+
+    points: NDArray
+    gaps: NDArray
+    volume: float
+    gain: float
+    gate: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +67,11 @@ class Node:
 
     Parameters
     ----------
-    context : what the parent says, as a key
     index : (C, k) int, points, -1 for none; cost : (C,) own; squares : (C,) weighted residual squares
     new : (C, W) uint64, points that are chosen here (not given by the parent), as bits; all : given ones too
     empty : the choice of no point at all
-    loss : (C,) what leaving contested points out costs, of choices that do nothing else; else 0
     below : for each choice the nodes of the children; None where it is not followed
-    best : (C,) cost with the best below; total : (C,) -log of the sum over all below; inf where not followed
+    best : (C,) cost with the best below; inf where not followed
     allowed : choices dearer than this with all below were not followed
     """
 
@@ -69,59 +84,62 @@ class Node:
     all: NDArray
     hold: Hold
     empty: int
-    loss: NDArray
     below: list[list[Node] | None]
     best: NDArray
-    total: NDArray
     allowed: float = -np.inf
 
 
 class Search:
-    """One frame at one noise level.
+    """One frame at one noise level. Limbs that do not hang on each other may take the same point: see `polish`.
 
     Parameters
     ----------
-    points : (N, 3) [m]
     scale : factor on the model's deviations
-    gain : what a matched marker earns against a missing one, log(1/m³)
-    contested : (W,) bits of points that several segments want: each is tried without them, whatever that costs it
+    budget : nodes; from then on only first choices count, and `cut` tells so
+    quota : nodes for each choice of the root
     """
 
-    def __init__(
-        self,
-        tables: tuple[SegmentTable, ...],
-        points: NDArray,
-        gaps: NDArray,
-        scale: float,
-        gain: float,
-        volume: float,
-        gate: float,
-        contested: NDArray | None = None,
-    ):
-        self.tables = tables
+    def __init__(self, tables: tuple[SegmentTable, ...], frame: Frame, scale: float, budget: int = 0, quota: int = 0):
+        self.tables, self.frame, self.scale = tables, frame, scale
         self.by_index = {t.index: t for t in tables}
-        self.points, self.gaps, self.scale, self.gain, self.gate = points, gaps, scale, gain, gate
-        self.volume = volume
         self.sigma = {t.index: t.sigma * scale for t in tables}
         self.tells = {t.index: bool((t.width > 0).any()) for t in tables}
-        self.memo: dict[tuple, Node] = {}
-        words = (len(points) + 63) // 64
-        self.bits = np.zeros((len(points) + 1, words), np.uint64)  # the last row: no point
-        for i in range(len(points)):
+        count = len(frame.points)
+        self.bits = np.zeros((count + 1, (count + 63) // 64), np.uint64)  # the last row: no point
+        for i in range(count):
             self.bits[i, i // 64] = np.uint64(1) << np.uint64(i % 64)
-        self.contested = np.zeros(words, np.uint64) if contested is None else contested
-        self.wanted = np.zeros(words, np.uint64)  # bits of points that a segment would choose, had its parent not
-        self.quota = QUOTA
-        self.nodes: list[Node] = []
-        self.bids = {t.index: np.zeros(len(points)) for t in tables}  # what each point costs a segment: see `bid`
+        self.outside = self.bits[-1]  # points that nobody may take
+        self.memo: dict[tuple, Node] = {}
         self.promise = {t.index: 0.0 for t in tables}  # least cost so far of a segment and all below
+        self.cut, self.slack = False, SLACK
+        self.budget, self.each, self.quota = budget, quota, quota
+
+    def beside(self, outside: NDArray, slack: float = SLACK) -> Search:
+        """The same search, nothing of it known yet, without the points `outside` (W,) bits."""
+        local = copy(self)
+        local.slack = slack
+        local.memo, local.promise, local.cut = {}, dict.fromkeys(self.promise, 0.0), False
+        local.outside = outside
+        return local
+
+    def grant(self, nodes: int) -> None:
+        """So many nodes from now on."""
+        self.budget = self.quota = len(self.memo) + nodes
+        self.each = nodes
 
     @property
     def spent(self) -> bool:
         """Whether the search has had its nodes."""
-        return len(self.memo) > min(self.quota, BUDGET)
+        return len(self.memo) > min(self.quota, self.budget)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
+        """The node of a segment under a choice of its parent's, its choices followed downwards."""
+        found = self.seat(table, parent, choice)
+        if found.allowed < allowed:
+            self.complete(found, allowed)
+        return found
+
+    def seat(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
         hold, taken = Hold(), self.bits[-1]
@@ -142,14 +160,11 @@ class Search:
             self.promise[table.index] = min(self.promise[table.index], hope)
         clash = np.bitwise_or.reduce(found.new, 0) & taken
         if clash.any():  # others may come near the best without these points
-            self.wanted |= found.new[0] & taken
             context = (context, tuple(clash.tolist()))
             key = (table.index, context)
             found = self.memo.get(key)
             if found is None:
                 found = self.memo[key] = self.expand(table, context, given, hold, taken)
-        if found.allowed < allowed:
-            self.complete(found, allowed)
         return found
 
     def joint(self, parent: Node, choice: int, table: SegmentTable) -> Hold:
@@ -171,65 +186,47 @@ class Search:
         """(n, 3) places in the segment, (n, 3) where they are, (n,) deviations: a choice's points and its pivot [m]."""
         points, t = node.index[choice], node.table
         here = points >= 0
-        x, y, sigma = t.x[here], self.points[points[here]], self.sigma[t.index][here]
+        x, y, sigma = t.x[here], self.frame.points[points[here]], self.sigma[t.index][here]
         if node.hold.sigma > 0 and t.joint_here is not None:
             x, y = np.vstack([x, t.joint_here]), np.vstack([y, node.hold.pivot])
             sigma = np.append(sigma, node.hold.sigma)
         return x, y, sigma
 
     def choices(
-        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray, slack: float = SLACK
+        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
     ) -> tuple[NDArray, NDArray, NDArray]:
         """(C, k) points, (C,) costs, (C,) weighted squares of likely choices; the first is to choose none."""
-        k = len(table.markers)
+        k, frame = len(table.markers), self.frame
         index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
         free = hold.sigma <= 0 and not (given >= 0).any()
         joint = table.joint_here if table.joint_here is not None else np.zeros(3)
-        blocked = (self.bits[:-1] & taken).any(1)
+        blocked = (self.bits[:-1] & (taken | self.outside)).any(1)
         blocked[given[given >= 0]] = False
-        volume = self.volume
+        volume = frame.volume
         if len(hold.reach):
             span = np.linalg.norm(table.x - joint, axis=1).max() + hold.reach.min()
             volume = min(volume, 4 / 3 * np.pi * span**3)
         count = enumerate_segment(
-            self.points, self.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
-            hold.pivot, hold.sigma,
-            hold.anchors, hold.reach, hold.deviation, float(np.log(volume)), self.gate, self.gain, slack,
-            2 if free else 1, index, cost, squares,
+            frame.points, frame.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
+            hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
+            frame.gate, frame.gain, self.slack, 2 if free else 1, index, cost, squares,
         )  # fmt: skip
         return index[:count], cost[:count], squares[:count]
 
     def expand(self, table: SegmentTable, context: tuple, given: NDArray, hold: Hold, taken: NDArray) -> Node:
         """Choices of a segment, none followed yet."""
         index, cost, squares = self.choices(table, given, hold, taken)
-        keep = np.flatnonzero(cost <= cost.min() + SLACK)
+        keep = np.flatnonzero(cost <= cost.min() + self.slack)
         keep = keep[np.argsort(cost[keep])]
         if 0 not in keep:  # no choice at all
             keep = np.append(keep, 0)
-        empty = int(np.flatnonzero(keep == 0)[0])
-        index, cost, squares, loss = index[keep], cost[keep], squares[keep], np.zeros(len(keep))
-        best = index[0]
-        if (np.bitwise_or.reduce(self.bits[np.where(given == -2, best, -1)], 0) & self.contested).any():
-            more = self.without(table, given, hold, best)
-            new = ~(more[0][:, None] == index).all(-1).any(1)
-            index, cost, squares = (np.concatenate([a, b[new]]) for a, b in zip((index, cost, squares), more))
-            less = ((index == best) | (index < 0)).all(1) & (index >= 0).any(1)
-            loss = np.where(less, cost - cost[0], 0.0)
+        index, cost, squares = index[keep], cost[keep], squares[keep]
         new = np.where(given == -2, index, -1)
         return Node(
             table, context, index, cost, squares,
             np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            hold, empty, loss, [None] * len(cost), np.empty(0), np.empty(0),
+            hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0),
         )  # fmt: skip
-
-    def without(self, table: SegmentTable, given: NDArray, hold: Hold, best: NDArray) -> tuple[NDArray, ...]:
-        """The best choice without some of the contested points: indexes, costs, squares."""
-        others = np.bitwise_or.reduce(self.bits[:-1], 0) & ~np.bitwise_or.reduce(self.bits[best], 0)
-        index, cost, squares = self.choices(table, given, hold, others, np.inf)
-        own = self.bits[best] & self.contested
-        may = own.any(1) & (given == -2)
-        keep = ((index == best) | (may & (index < 0))).all(1)
-        return index[keep], cost[keep], squares[keep]
 
     def alone(self, table: SegmentTable) -> tuple[float, int, float]:
         """Of a segment on its own: the least cost, how many markers that has, by how much any other choice is dearer.
@@ -244,34 +241,34 @@ class Search:
     def complete(self, node: Node, allowed: float) -> None:
         """Follow each choice downwards while its cost, with the best known of what is still to come, stays near.
 
-        Near is: below `allowed`, and SLACK above the best choice here at most.
+        Near is: below `allowed`, and the slack above the best choice here at most.
         """
         node.allowed = allowed
-        node.best, node.total = np.full(len(node.cost), np.inf), np.full(len(node.cost), np.inf)
+        node.best = np.full(len(node.cost), np.inf)
         children = [self.by_index[child] for child in node.table.children]
         best = np.inf
         for c in range(len(node.cost)):
             if node.table.parent < 0:
-                self.quota = len(self.memo) + QUOTA
+                self.quota = len(self.memo) + self.each
             below: list[Node] = []
-            bound = total = float(node.cost[c])
-            bound += sum(self.promise[t.index] for t in children)
-            limit = min(allowed, best + SLACK) + float(node.loss[c])
+            bound = float(node.cost[c]) + sum(self.promise[t.index] for t in children)
+            limit = min(allowed, best + self.slack)
             follow = not self.spent or (c == 0 and c != node.empty)
+            self.cut |= not follow and bound <= limit
             for t in children if follow and bound <= limit else ():
                 bound -= self.promise[t.index]
                 child = self.node(t, node, c, limit - bound)
-                low, sums = weigh_child(child.new, child.best, child.total, self.between(node, c, child), node.all[c])
-                bound, total = bound + low, total + sums
+                low = cheapest_free(child.new, child.best, self.between(node, c, child), node.all[c])
+                bound += low
                 self.promise[t.index] = min(self.promise[t.index], low)
                 below.append(child)
                 if bound > limit:
                     break
             if len(below) == len(children) and bound <= limit:
-                node.below[c], node.best[c], node.total[c] = below, bound, total
+                node.below[c], node.best[c] = below, bound
             elif c == node.empty:  # for when every other clashes with what is chosen elsewhere
                 node.below[c] = [self.absent(t) for t in children]
-                node.best[c] = node.total[c] = node.cost[c]
+                node.best[c] = node.cost[c]
             else:
                 node.below[c] = None
             best = min(best, node.best[c])
@@ -283,67 +280,30 @@ class Search:
             index, zero = np.full((1, len(table.markers)), -1, np.int64), np.zeros(1)
             bits = self.bits[index[:, 0]]
             below: list[list[Node] | None] = [[self.absent(self.by_index[child]) for child in table.children]]
-            self.memo[key] = Node(
-                table, (), index, zero, zero, bits, bits, Hold(), 0, zero, below, zero.copy(), zero.copy(), np.inf
-            )
+            self.memo[key] = Node(table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), np.inf)
         return self.memo[key]
-
-    def weigh(self, node: Node, extra: NDArray | None = None) -> None:
-        """Costs of each choice with all below it: `best` and `total`."""
-        own = node.cost if extra is None else node.cost + extra
-        node.best = np.array([np.inf if below is None else cost for cost, below in zip(own, node.below)])
-        node.total = node.best.copy()
-        for c, below in enumerate(node.below):
-            for child in below or ():
-                low, total = weigh_child(child.new, child.best, child.total, self.between(node, c, child), node.all[c])
-                node.best[c] += low
-                node.total[c] += total
 
     def between(self, node: Node, choice: int, child: Node) -> NDArray:
         """(C,) what a child's choices cost beside one of its parent, by the distances of training."""
         t, out = child.table, np.zeros(len(child.cost))
         if self.tells[t.index]:
-            range_cost(self.points, node.index[choice], child.index, t.low, t.high, t.width, out)
+            range_cost(self.frame.points, node.index[choice], child.index, t.low, t.high, t.width, out)
         return out
 
-    def gather(self, root: Node) -> None:
-        """`nodes`: all that count, children before their parents."""
-        self.nodes, seen = [], set()
-
-        def visit(node: Node) -> None:
-            seen.add(id(node))
-            for below in node.below:
-                for child in below or ():
-                    if id(child) not in seen:
-                        visit(child)
-            self.nodes.append(node)
-
-        visit(root)
+    def beneath(self, node: Node, above: tuple[Node, int] | None) -> NDArray:
+        """(C,) cost of each choice with the best below it, beside a choice of the parent's; inf where they clash."""
+        if above is None:
+            return node.best
+        fits = ~(node.new & above[0].all[above[1]]).any(1)
+        return np.where(fits, node.best + self.between(*above, node), np.inf)
 
     def decode(self, node: Node, above: tuple[Node, int] | None = None) -> list[tuple[Node, int]]:
-        """The best choices of a node and all below it, top down."""
-        cost = node.best
-        if above is not None:
-            fits = ~(node.new & above[0].all[above[1]]).any(1)
-            cost = np.where(fits, node.best + self.between(*above, node), np.inf)
-        c = int(np.argmin(cost))
-        found = [(node, c)]
-        for child in node.below[c] or ():
-            found += self.decode(child, (node, c))
+        """The best choices of a node and all below it, parents first."""
+        return self.follow(node, int(np.argmin(self.beneath(node, above))))
+
+    def follow(self, node: Node, choice: int) -> list[tuple[Node, int]]:
+        """One choice of a node and the best below it, parents first."""
+        found = [(node, choice)]
+        for child in node.below[choice] or ():
+            found += self.decode(child, (node, choice))
         return found
-
-    def reweigh(self) -> None:
-        """Weigh all nodes anew, with bids."""
-        for node in self.nodes:
-            self.weigh(node, self.price(node, self.bids[node.table.index]))
-
-    def price(self, node: Node, price: NDArray) -> NDArray:
-        """(C,) what the points that each choice takes cost."""
-        padded = np.append(price, 0.0)
-        new = np.where(node.table.shared >= 0, -1, node.index)
-        return padded[new].sum(1)
-
-    def cost_of(self, chosen: list[tuple[Node, int]]) -> float:
-        """Of decoded choices, without bids."""
-        node, c = chosen[0]
-        return float(node.best[c] - sum(self.price(n, self.bids[n.table.index])[k] for n, k in chosen))

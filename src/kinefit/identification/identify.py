@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification._bids import bid, marginals
+from kinefit.identification._explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification._kernels_evidence import place_joint
-from kinefit.identification._search import Node, Search
-from kinefit.identification._tables import SegmentTable, segment_tables
+from kinefit.identification._polish import NEAR, labels_of, rivals
+from kinefit.identification._search import Frame
 from kinefit.identification.model import MarkerModel
-
-ATTEMPTS = 10
-"""Searches of a frame that is not explained well; each takes 0.1 s or less."""
-
-ROUNDS = 6
-"""Of segments that tell each other which points they want."""
-
-MOST_NODES = 6000
-"""Nodes of all attempts at a frame, a second or so; one that needs more is left as it is. Sixty poses with 10 % missing
-showed that less leaves whole bodies unexplained."""
-
-SURE = 15.0
-"""A lead that needs to be no longer."""
-
-CLEAR = 12.0
-"""Cost by which every choice leads the next, where nothing needs weighing."""
 
 OUTLIERS, OUTLYING = 0.05, 4.0
 """Share of markers beyond the noise, and how far: a usual contamination of a Gaussian."""
 
-ENOUGH = 0.65
-"""Share of the labels that a noise level must explain to need no other tried; accidents explain up to half."""
-
-TRUSTED = 0.72
-"""Share of the points that an explanation must have a name for, if there are no more than labels; else it is chance. At
-0.8 wrong names all but end where much is missing, and right ones with 10 % missing fall below 95 %."""
-
-WHOLE = 0.95
-"""Share of the largest segments' markers that a noise level explains when no coarser one need be looked at."""
+STEP, STAYS = 0.1, 2.0
+"""[m] usual way of a marker since the last frame (a hand at 5 m/s goes 8 cm at 60 Hz); what a label earns that stays
+where it was, and what it costs if it jumps. It decides between rivals alone."""
 
 
 @dataclass(frozen=True)
@@ -119,140 +97,32 @@ def identify(
         return Identification(np.full(count, -1), np.zeros(count), 0.0, False, guess=np.full(count, -1))
     gaps = np.linalg.norm(at[:, None] - at, axis=-1)
     box = float(np.prod(np.ptp(at, 0) + 0.3))
-    miss = min(max(1 - len(at) / count, settings.miss), 0.5)
-    clutter = max(len(at) - count * (1 - miss), 0.5) / box
-    gain = float(np.log((1 - miss) / (miss * clutter)))
-    best: Solution | None = None
-    spent = 0
-    for root, scale in _attempts(model, at, gaps, gain, box, settings):
-        found = _solve(segment_tables(model, root), at, gaps, scale, gain, box, settings.gate)
-        spent += len(found.search.memo)
-        if best is None or (found.clashes, found.cost) < (best.clashes, best.cost):
-            best = found
-        enough = 0.9 * len(at) if len(at) <= count else ENOUGH * count
-        if (found.matched >= enough and found.noise < 1.25 * scale) or spent > MOST_NODES:
-            break
-    assert best is not None
-    contested = best.search.wanted | _shared(best.search, best.chosen)
-    noisy = best.noise > 1.2 * best.search.scale
-    if best.matched > 3 and (noisy or contested.any()):
-        scale = 1.05 * best.noise if noisy else best.search.scale
-        found = _solve(best.search.tables, at, gaps, scale, gain, box, settings.gate, contested)
-        best = found if found.matched >= 0.8 * best.matched else best
-    named = _decide(best, count, settings.certain)
-    if best.matched < (TRUSTED * len(at) if len(at) <= count else ENOUGH * count):  # accidents
-        return replace(named, assignment=np.full(count, -1), confidence=np.zeros(count), ambiguous=True)
-    return named
+    usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
+    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate)
+    best = refine(model, explain(model, frame, settings.finest, settings.coarsest))
+    before = np.full((count, 3), np.nan) if previous is None else np.asarray(previous, float)
+    if before.shape != (count, 3):
+        raise ObservationError(
+            f"previous positions of shape {before.shape} for {count} labels",
+            remedy="Give (M, 3) [m], NaN if not known.",
+        )
+    return _decide(best, before, settings.certain)
 
 
-def _attempts(
-    model: MarkerModel, at: NDArray, gaps: NDArray, gain: float, box: float, settings: IdentifySettings
-) -> list[tuple[int, float]]:
-    """Segments to begin with and noise levels, the likeliest first.
-
-    The level is that at which the largest segments, each on its own, are explained best; the segment is that of which
-    the next choice is furthest behind the best. After that other levels and other segments, the nearest first.
-    """
-    sizes = sorted((len(m) for m in model.segments), reverse=True)
-    large = [s for s, m in enumerate(model.segments) if len(m) >= max(3, sizes[min(2, len(sizes) - 1)])][:6]
-    large = large or [int(np.argmax([len(m) for m in model.segments]))]
-    tables = segment_tables(model, large[0])
-    best, share, scale, chosen = np.inf, 0.0, settings.finest, 0
-    levels: list[tuple[float, list[int]]] = []
-    while scale <= settings.coarsest:
-        search = Search(tables, at, gaps, scale, gain, box, settings.gate)
-        found = [search.alone(search.by_index[s]) for s in large]
-        cost = sum(f[0] for f in found)
-        order = sorted(range(len(large)), key=lambda k: (-min(found[k][2], SURE), found[k][0]))
-        levels.append((scale, [large[k] for k in order]))
-        if cost < best:
-            best, chosen = cost, len(levels) - 1
-            share = sum(f[1] for f in found) / sum(len(model.segments[s]) for s in large)
-            if share > WHOLE:
-                break
-        elif share > ENOUGH + 0.05:
-            break
-        scale = max(1.6 * scale, 1.0)  # not between: a body is firm here and loose there
-    ranked = [
-        (abs(n - chosen) + rank, -n, root, scale)
-        for n, (scale, roots) in enumerate(levels) if n or not chosen for rank, root in enumerate(roots[:3])
-    ]  # fmt: skip
-    return [(root, scale) for *_, root, scale in sorted(ranked)[:ATTEMPTS]]
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """The best explanation at one noise level: the nodes and choices, top down."""
-
-    search: Search
-    root: Node
-    chosen: list[tuple[Node, int]]
-    cost: float
-    noise: float
-    matched: int
-    clashes: bool
-
-
-def _solve(
-    tables: tuple[SegmentTable, ...], at: NDArray, gaps: NDArray, scale: float, gain: float, box: float, gate: float,
-    contested: NDArray | None = None,
-) -> Solution:
-    search = Search(tables, at, gaps, scale, gain, box, gate, contested)
-    root = search.node(tables[0], None, -1)
-    search.gather(root)
-    chosen, cost, clashes = _without_conflicts(search, root, 1 + max(int(t.markers.max()) for t in tables))
-    squares, freedom, matched = 0.0, 0, 0
-    for node, c in chosen:
-        n = int((node.index[c] >= 0).sum())
-        if n >= 2:
-            squares += float(node.squares[c])
-            freedom += 1 if n == 2 else 3 * n - 6
-        matched += int((node.index[c][node.table.shared < 0] >= 0).sum())
-    matched -= int(np.bitwise_count(_shared(search, chosen)).sum())
-    return Solution(search, root, chosen, cost, scale * float(np.sqrt(squares / max(freedom, 1))), matched, clashes)
-
-
-def _without_conflicts(search: Search, root: Node, labels: int) -> tuple[list[tuple[Node, int]], float, bool]:
-    """The best explanation, its cost, and whether two labels share a point in it: what clashes is bid for."""
-    chosen = search.decode(root)
-    clash = bool(_shared(search, chosen).any())
-    found: list[tuple[float, list[tuple[Node, int]]]] = []
-
-    def until() -> bool:
-        now = search.decode(root)
-        if not _shared(search, now).any():
-            found.append((search.cost_of(now), now))
-        return bool(found)
-
-    if clash:
-        bid(search, root, labels, ROUNDS, until)
-        chosen, clash = (found[0][1], False) if found else (search.decode(root), True)
-    return chosen, search.cost_of(chosen), clash
-
-
-def _shared(search: Search, chosen: list[tuple[Node, int]]) -> NDArray:
-    """(W,) bits of points that two segments take."""
-    once = np.zeros_like(search.contested)
-    twice = once.copy()
-    for node, c in chosen:
-        twice |= once & node.new[c]
-        once |= node.new[c]
-    return twice
-
-
-def _decide(found: Solution, count: int, certain: float) -> Identification:
-    """Labels that are probable enough, by the share of all explanations that agree on them."""
-    guess = np.full(count, -1)
-    for node, c in found.chosen:
-        fresh = node.table.shared < 0
-        guess[node.table.markers[fresh]] = node.index[c, fresh]
-    if all(np.delete(node.best, c).min(initial=np.inf) - node.best[c] > CLEAR for node, c in found.chosen):
-        confidence = np.full(count, 1 - float(np.exp(-CLEAR)))
-    else:
-        confidence = _shares(found, guess)
-    for point in np.flatnonzero(np.bincount(guess[guess >= 0]) > 1):  # what nobody gave way in
-        users = np.flatnonzero(guess == point)
-        guess[users[users != users[np.argmax(confidence[users])]]] = -1
+def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
+    """Labels that are probable enough against all rivals; where it may all be accident, only what two starts say."""
+    count = len(found.labels)
+    chosen, near = (found.chosen, []) if found.clear else rivals(found.search, found.chosen)
+    pool = {labels_of(e, count).tobytes(): (dearer, e) for dearer, e in [*near, (0.0, chosen)]}
+    labels = np.array([labels_of(e, count) for _, e in pool.values()])
+    cost = np.array([dearer for dearer, _ in pool.values()]) + _moved(labels, found.search.frame.points, before)
+    best = int(np.argmin(cost))
+    chosen, guess = list(pool.values())[best][1], labels[best].copy()
+    odds = (np.exp(cost[best] - cost)[:, None] * (labels != guess)).sum(0) + np.exp(-NEAR)
+    confidence = 1 / (1 + odds)
+    if not found.settled:
+        confidence *= np.any([other.labels == guess for other in found.others], axis=0)
+    found = solution(found.search, chosen, count)
     _complete(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)
     assignment = np.where(known, guess, -1)
@@ -266,13 +136,10 @@ def _decide(found: Solution, count: int, certain: float) -> Identification:
     )
 
 
-def _shares(found: Solution, guess: NDArray) -> NDArray:
-    """(M,) share of the likelihood of all explanations that agree with a guess about each label.
-
-    A point that other segments want costs.
-    """
-    bid(found.search, found.root, len(guess), ROUNDS, lambda: False)
-    return marginals(found.search, found.root, len(guess))[np.arange(len(guess)), guess]
+def _moved(labels: NDArray, points: NDArray, before: NDArray) -> NDArray:
+    """(E,) -log likelihood of the ways from `before` (M, 3) [m] to the points of (E, M) labels; 0 where not known."""
+    square = ((points[labels] - before) ** 2).sum(-1) / STEP**2
+    return np.where((labels >= 0) & np.isfinite(square), np.minimum(0.5 * square, 2 * STAYS) - STAYS, 0.0).sum(1)
 
 
 def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
@@ -282,7 +149,7 @@ def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
     point that is none. Changes guess and confidence.
     """
     search = found.search
-    points = search.points
+    points = search.frame.points
     free = np.setdiff1d(np.arange(len(points)), guess[guess >= 0])
     for node, c in found.chosen if len(free) else ():
         t, here = node.table, node.index[c] >= 0
@@ -294,7 +161,7 @@ def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
             at = np.empty(3)
             variance = place_joint(len(x), x, y, sigma, t.x[i], at)
             wide = OUTLYING**2 * search.sigma[t.index][i] ** 2 + variance
-            odds = search.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
+            odds = search.frame.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
             odds = odds - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
             best = int(np.argmax(odds))
             share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))
