@@ -90,8 +90,8 @@ class Solution:
         return int((self.labels != other.labels).sum()) <= FEW * len(self.labels)
 
 
-def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float) -> Solution:
-    """The cheapest explanation of a frame, found from several segments and noise levels."""
+def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float, searches: int = 60) -> Solution:
+    """The cheapest explanation of a frame, found by so many searches from several segments and noise levels."""
     race = Race(model, frame)
     for many, *nodes in RUNGS:
         race.rung(nodes)
@@ -101,7 +101,8 @@ def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float) ->
             while scale <= coarsest and (root, scale) not in race.done:
                 before = race.run(root, scale, before)
                 best = race.best()
-                if best.settled:
+                searches -= 1
+                if best.settled or searches < 1:
                     return best
                 if before.noise < FITTING * scale or before.matched < ENOUGH * race.most:
                     break
@@ -226,28 +227,35 @@ def _starts(model: MarkerModel, frame: Frame, finest: float, coarsest: float) ->
     least = max(3, sizes[min(2, len(sizes) - 1)])
     large = [s for s, m in enumerate(model.segments) if len(m) >= least][:LARGEST]
     large = large or [int(np.argmax([len(m) for m in model.segments]))]
-    tables = segment_tables(model, large[0])
-    segments, scale, last = large, finest, np.inf
+    tables, scale, last, tried = segment_tables(model, large[0]), finest, np.inf, False
+    every = sorted({*large, *(s for s, m in enumerate(model.segments) if len(m) > 3)})
     held: list[tuple[int, float]] = []
     later: list[tuple[int, float]] = []
     while scale <= coarsest:
         search = Search(tables, frame, scale)
-        found = [search.alone(search.by_index[s]) for s in segments]
-        cost = sum(f[0] for f in found)
-        if cost < last - BETTER:
-            later += held
-        else:
-            yield from held
-        order = sorted(range(len(segments)), key=lambda k: (-min(found[k][2], SURE), found[k][0]))
-        share = sum(f[1] for f in found) / sum(len(model.segments[s]) for s in segments)
-        tried = scale >= 1.0 or share > WHOLE or _coarser(scale) > coarsest
-        starts = [(segments[k], scale) for k in order[: STARTS * tried]]
-        yield from starts[:FIRST]
-        held, last = starts[FIRST:], cost
+        if not tried:  # mostly one of these is enough
+            order, _, share = _ranked(search, large)
+            tried = scale >= 1.0 or share > WHOLE or _coarser(scale) > coarsest
+            yield from ((s, scale) for s in order[: FIRST * tried])
+        if tried:
+            order, cost, _ = _ranked(search, every)
+            if cost < last - BETTER:
+                later += held
+            else:
+                yield from held
+            yield from ((s, scale) for s in order[:FIRST])
+            held, last = [(s, scale) for s in order[FIRST:STARTS]], cost
         scale = _coarser(scale)
-        segments = sorted({*large, *(s for s, m in enumerate(model.segments) if len(m) > 3)})
     yield from held
     yield from later
+
+
+def _ranked(search: Search, segments: list[int]) -> tuple[list[int], float, float]:
+    """Segments each on its own, the surest first; their cost, and the share of their markers that they explain."""
+    found = {s: search.alone(search.by_index[s]) for s in segments}
+    order = sorted(segments, key=lambda s: (-min(found[s][2], SURE), found[s][0]))
+    markers = sum(len(search.by_index[s].markers) for s in segments)
+    return order, sum(f[0] for f in found.values()), sum(f[1] for f in found.values()) / markers
 
 
 def _coarser(scale: float) -> float:

@@ -33,6 +33,7 @@ class IdentifySettings:
         names up to 1.1 % more right than 0.9 and up to 0.15 % more wrong; in whole frames 0.7 begins to name wrong
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
+    searches : of one frame, from several segments and noise levels; most need one or two
     """
 
     finest: float = 0.02
@@ -40,6 +41,7 @@ class IdentifySettings:
     certain: float = 0.8
     gate: float = 4.5
     miss: float = 0.05
+    searches: int = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,7 @@ def identify(
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
     frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate)
-    best = refine(model, explain(model, frame, settings.finest, settings.coarsest))
+    best = refine(model, explain(model, frame, settings.finest, settings.coarsest, settings.searches))
     before = np.full((count, 3), np.nan) if previous is None else np.asarray(previous, float)
     if before.shape != (count, 3):
         raise ObservationError(

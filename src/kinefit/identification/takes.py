@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.identification._consistency import fill_gaps
 from kinefit.identification._naming import FINE, STRAY, Naming, Step
 from kinefit.identification._pieces import find_pieces
-from kinefit.identification.identify import Identification, identify
+from kinefit.identification.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model import MarkerModel
 from kinefit.observations import Markers
 
@@ -20,6 +20,10 @@ FIRST, TRIAL, FITS = 12, 4, 0.7
 """Frames that are asked first, how many of them before all others, and the share of labels that must be found in half
 of them (in one of the trial): a model of another subject finds half at most, and takes long; the right one finds more
 than nine in ten."""
+
+
+ANCHOR = IdentifySettings(searches=6)
+"""Of an anchor frame: one that needs more searches is no good anchor, and there are others."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +102,14 @@ class TakeIdentification:
         return replace(like, names=self.labels, positions=self.positions, residual=residual)
 
 
+def identify_anchor(model: MarkerModel, points: NDArray) -> Identification:
+    """An anchor frame on its own, as `identify`, but not for long."""
+    return identify(model, points, settings=ANCHOR)
+
+
 def identify_take(
     model: MarkerModel, markers: Markers, *, settings: TakeSettings | None = None, progress: Step | None = None,
-    identify_frame: Callable[[MarkerModel, NDArray], Identification] = identify,
+    identify_frame: Callable[[MarkerModel, NDArray], Identification] = identify_anchor,
 ) -> TakeIdentification:
     """Names for all points of a take, whatever its columns are called and wherever they break.
 
