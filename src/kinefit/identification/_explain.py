@@ -137,12 +137,11 @@ class Race:
         tables = segment_tables(self.model, root)
         search = Search(tables, self.frame, scale, *self.nodes)
         chosen = search.decode(search.node(tables[0], None, -1))
-        found = solution(search, chosen, len(self.model))
         if search.cut or shared(search, chosen).any():
             found = self.improved(solution(search, apart(search, chosen), len(self.model)))
         else:
             leads = (np.delete(node.best, c).min(initial=np.inf) - node.best[c] for node, c in chosen)
-            found = replace(found, clear=min(leads) > CLEAR)
+            found = replace(solution(search, chosen, len(self.model)), clear=min(leads) > CLEAR)
         if before is not None:
             found = min(found, at_level(before, self.frame, scale), key=_cost)
         self.done.add((root, scale))

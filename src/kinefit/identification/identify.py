@@ -30,7 +30,7 @@ class IdentifySettings:
     ----------
     finest, coarsest : noise levels between which is searched, as factors on the model's deviations
     certain : a label less probable than this is unknown. On seven real takes with a tenth of the markers gone, 0.8
-        names up to 1.1 % more right than 0.9 and up to 0.15 % more wrong; in whole frames 0.7 begins to name wrong
+        names up to 0.8 % more right than 0.9 and up to 0.1 % more wrong; in whole frames 0.6 begins to name wrong
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
     searches : of one frame, from several segments and noise levels; most need one or two

@@ -84,7 +84,8 @@ def usable(markers: Markers, marker_set: MarkerSet | None) -> tuple[NDArray, lis
     left_out = [n for i, n in enumerate(markers.names) if i not in keep and not n.startswith("*")]
     left_out = [n for n in left_out if not (marker_set and marker_set.is_computed(n))]
     if len(keep) < 3:
-        raise ObservationError(f"{len(keep)} labelled markers are ever seen", remedy="A model needs three and more.")
+        problem, remedy = f"{len(keep)} labelled markers are ever seen", "A model needs three and more."
+        raise ObservationError(problem, file=markers.source or None, remedy=remedy)
     rows = np.flatnonzero(seen[:, keep].sum(1) >= 3)
     step = max(1, -(-len(rows) // MOST_FRAMES))
     gaps = left_out + [markers.names[i] for i in keep if seen[:, i].mean() < 0.1]

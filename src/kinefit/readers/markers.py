@@ -17,6 +17,7 @@ UNITS = {
     "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01,
     "mm": 0.001, "millimeters": 0.001, "millimetres": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048,
 }  # [m] each
+_TINY = 0.01  # [m] from the origin: no further is who moves in metres that are read as millimetres
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # points of a C3D that are no positions
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
 
@@ -43,7 +44,7 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     FileError
         Missing, damaged or truncated (the message tells how many frames can be read), or neither C3D nor TRC.
     ObservationError
-        No or unknown unit; no marker, or none seen in any frame; a rate that the times contradict.
+        No or unknown unit, or two in one file; no marker, or none seen in any frame; a rate that the times contradict.
     """
     path = Path(path)
     try:
@@ -54,9 +55,9 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     except OSError as error:
         raise FileError(f"cannot be read ({error})", file=path) from error
     if head[1:2] == b"\x50" or path.suffix.lower() == ".c3d":
-        return _markers_of_c3d(read_c3d(path), path, unit)
+        return _of_one_unit(_markers_of_c3d(read_c3d(path), path, unit), path)
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(b"pathfiletype") or path.suffix.lower() == ".trc":
-        return _read_trc(path, unit)
+        return _of_one_unit(_read_trc(path, unit), path)
     raise FileError("neither C3D nor TRC", file=path, remedy="Markers are read from .c3d and .trc files.")
 
 
@@ -83,7 +84,21 @@ def _unique(names: list[str]) -> tuple[str, ...]:
 
 
 def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
-    return ObservationError(f"none of the {markers} markers is seen in any of the {frames} frames", file=path)
+    problem = f"none of the {markers} markers is seen in any of the {frames} frames"
+    return ObservationError(problem, file=path, remedy="Export it again with its trajectories, or choose another trial.")
+
+
+def _of_one_unit(markers: Markers, path: Path) -> Markers:
+    """The same; three markers that never leave the world's origin by more than _TINY are of a larger unit than others."""
+    away = np.nan_to_num(np.linalg.norm(markers.positions, axis=-1)).max(axis=0)
+    tiny = [name for name, far in zip(markers.names, away, strict=True) if 0 < far < _TINY]
+    if len(tiny) >= 3 and away.max() > 10 * _TINY:
+        listed = ", ".join(tiny[:4]) + (" ..." if len(tiny) > 4 else "")
+        raise ObservationError(
+            f"{len(tiny)} of {len(away)} markers stay within {1e3 * _TINY:.0f} mm of the origin ({listed}), others go "
+            f"{away.max():.3g} m away: two units in one file", file=path, remedy="Export all markers in one unit.",
+        )
+    return markers
 
 
 def _texts(c3d: C3d, key: str) -> list[str]:
@@ -157,7 +172,10 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
             remedy="Copy or export it again; or, if it is whole, correct NumFrames in line 3.",
         )
     if not names or not len(frames):
-        raise ObservationError(f"{len(frames)} frames of {len(names)} markers: nothing in this file", file=path)
+        raise ObservationError(
+            f"{len(frames)} frames of {len(names)} markers: nothing in this file", file=path,
+            remedy="Export it again, or choose another trial.",
+        )
     span = (times[-1] - times[0]) * rate
     if len(times) > 2 and abs(span - len(times) + 1) > max(1.0, 0.02 * len(times)):
         raise ObservationError(
