@@ -77,7 +77,7 @@ def _camera(focal: float, cx: float, cy: float) -> Any:
 def fitted(images: list[NDArray], camera: Any) -> Any:
     """(depth, camera, start, body) of every image."""
     from kinefit import load_body
-    from kinefit.tracking.depth_start import sized_start, start_from_points
+    from kinefit.initialization.from_depth import sized_start, start_from_points
 
     fit, _ = sized_start(load_body("humanoid10"), images[:_SIZED], camera, up=_UP)
     for depth in images:

@@ -82,7 +82,7 @@ def _accuracy(plain: Scene, occluded: Scene) -> dict[str, float]:
 
 def unhidden(scene: Scene, r: Run) -> NDArray:
     """(F, 10) share of each part's true outline that neither another part nor an obstacle hides."""
-    from kinefit.tracking.loss import Layers
+    from kinefit.sensors.visibility import Layers
 
     layers = Layers(scene.body, scene.rig["depth"], mesh=scene.mesh)
     out = np.empty(r.add.shape)

@@ -124,8 +124,8 @@ class Stage:
 
     def follow(self, frames: Sequence[Any], points: int = POINTS) -> tuple[NDArray, list[Any]]:
         """CPU time [ms] and result of each frame, from the second frame of the movement on."""
+        from kinefit.sensors.settings import FusionSettings
         from kinefit.tracking.fusion import FusionTracker
-        from kinefit.tracking.fusion_settings import FusionSettings
 
         settings = FusionSettings(points=points, search=False)
         tracker = FusionTracker(

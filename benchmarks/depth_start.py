@@ -88,8 +88,8 @@ def joints(body: Any, state: Any) -> NDArray:
 
 
 def _recovered(body: Any) -> None:
+    from kinefit.initialization.from_depth import start_from_points
     from kinefit.simulation.sensors import KINECT
-    from kinefit.tracking.depth_start import start_from_points
 
     camera = camera_in_front(KINECT)
     for room, suffix in ((False, ""), (True, "_room")):
@@ -112,7 +112,7 @@ def _recovered(body: Any) -> None:
 
 def _movements(sensor: str) -> None:
     """Twenty people in the midst of ten movements, in a room with a table, as a sensor of that kind sees them."""
-    from kinefit.tracking.depth_start import start_from_points
+    from kinefit.initialization.from_depth import start_from_points
 
     found = []
     for person, state, camera, depth in moving(sensor, _PEOPLE):
@@ -146,8 +146,8 @@ def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
 def _limbs(body: Any) -> None:
     """One limb put anywhere, the rest as it is."""
     from kinefit.bodies import BodyState
+    from kinefit.initialization.from_depth import restart_limb
     from kinefit.simulation.sensors import KINECT
-    from kinefit.tracking.depth_start import restart_limb
 
     camera, good, spent = camera_in_front(KINECT), [], []
     truth = [random_state(body, np.random.default_rng(300 + i), sitting=False) for i in range(_LIMBS)]
@@ -172,9 +172,9 @@ def _size(body: Any) -> None:
     from dataclasses import replace
 
     from kinefit.bodies.surfaces import TaperedCylinder
+    from kinefit.sensors.depth_view import view_of
     from kinefit.simulation.sensors import KINECT
-    from kinefit.tracking._depth_view import view_of
-    from kinefit.tracking.depth_shape import fit_surfaces
+    from kinefit.subject.depth import fit_surfaces
 
     camera, before, after = camera_in_front(KINECT), [], []
     for seed in range(4):

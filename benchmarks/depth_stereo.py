@@ -23,7 +23,7 @@ from kinefit.correspondences.free_space import FreeSpace
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images.stereo import StereoRectifier
-from kinefit.readers.calibration import read_opencv_stereo
+from kinefit.readers.calibration.read import read_opencv_stereo
 
 PAIRS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14)
 SQUARE = 0.025  # [m]
@@ -94,7 +94,7 @@ def _head() -> None:
     if folder is None:
         figure("stereo head, depth of the body", None, "px", "<= 0.25", "no recording")
         return
-    from kinefit.readers.bvh import read_bvh
+    from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation.pictures import STEREO, picture
     from kinefit.simulation.retarget import retarget
     from kinefit.simulation.scenes import Scene

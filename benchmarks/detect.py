@@ -16,10 +16,10 @@ from kinefit.cli import _detecting
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.triangulation import triangulate
+from kinefit.multiview.association import choose_people
 from kinefit.observations import MEDIAPIPE_33, Detections
-from kinefit.readers.calibration import read_calibration
+from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import read_detections
-from kinefit.tracking.association import choose_people
 
 _GOALS = {
     "detect_speed": ("frames/s", ">= 12"), "detect_landmarks_difference": ("px", "<= 4"),

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.figures import data, figure
-from kinefit.identification.audit import audit_take
-from kinefit.identification.gate import training_gate
-from kinefit.identification.learn import learn_model
+from kinefit.identification.audit.audit import audit_take
 from kinefit.identification.marker_sets import find_marker_set
-from kinefit.identification.model import MarkerModel
+from kinefit.identification.model.gate import training_gate
+from kinefit.identification.model.learn import learn_model
+from kinefit.identification.model.model import MarkerModel
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 

@@ -28,9 +28,9 @@ from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli._fit_markers import wearing
 from kinefit.exporters import write_markers, write_osim
-from kinefit.readers._c3d import read_c3d
-from kinefit.tracking.marker_subject import MarkerSubject, fit_marker_subject
-from kinefit.tracking.markers import fit_markers
+from kinefit.markers.fit import fit_markers
+from kinefit.markers.subject import MarkerSubject, fit_marker_subject
+from kinefit.readers.c3d_file import read_c3d
 
 CHILD = {"hip": "thigh", "knee": "shank", "ankle": "foot", "shoulder": "upperarm", "elbow": "forearm", "wrist": "hand"}
 SAGITTAL = {"hip": "hip_flexion", "knee": "knee_angle", "ankle": "ankle_angle"}
@@ -197,8 +197,8 @@ def two_laboratories(folder: Path) -> Iterator[tuple[str, Markers, Markers, dict
 def known_person() -> None:
     """A simulated person whose markers sit 1 to 6 cm off the set's places: what movement adds to a static trial."""
     from kinefit.evaluation import joint_errors
+    from kinefit.markers.placement import placement
     from kinefit.simulation import squat_and_wave
-    from kinefit.tracking.placement import placement
 
     rng, truth = np.random.default_rng(0), squat_and_wave(rate=60)
     placed = placement(truth.body, "CMU_41")

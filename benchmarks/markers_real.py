@@ -21,10 +21,10 @@ import numpy as np
 
 from benchmarks.figures import figure
 from benchmarks.marker_takes import CASES, Case, broken, load, shuffled, training
-from kinefit.identification.identify import identify
-from kinefit.identification.learn import learn_model
-from kinefit.identification.model import MarkerModel
-from kinefit.identification.takes import identify_take
+from kinefit.identification.frame.identify import identify
+from kinefit.identification.model.learn import learn_model
+from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.take.takes import identify_take
 from kinefit.observations import Markers
 
 FRAMES = int(os.environ.get("FRAMES", 60))

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import figure
-from kinefit.identification.identify import identify
-from kinefit.identification.model import MarkerModel
-from kinefit.identification.synthetic import random_pose, synthetic_body
+from kinefit.identification.frame.identify import identify
+from kinefit.identification.frame.synthetic import random_pose, synthetic_body
+from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes.sapm import sapm
 
 POSES = int(os.environ.get("POSES", 40))

@@ -21,12 +21,12 @@ from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
+from kinefit.subject.silhouettes import fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.silhouette_shape import fit_silhouettes
 from kinefit.tracking.silhouette_take import silhouettes_of
 from kinefit.tracking.take import track_take
 

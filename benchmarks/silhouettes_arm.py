@@ -20,13 +20,13 @@ from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import choose_person, colour_mask
+from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body, scaled
+from kinefit.sensors.settings import FusionSettings
+from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.silhouette_shape import CylinderFamily, fit_silhouettes
-from kinefit.tracking.silhouette_start import Level, coarse_to_fine
 
 UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them
 FIRST, LAST, START, RATE = 40, 378, 160, 30.0

@@ -15,9 +15,9 @@ from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import figure
 from benchmarks.silhouettes_scene import ring, standing
 from kinefit.bodies import load_body
+from kinefit.initialization.from_silhouettes import LEVELS, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
-from kinefit.tracking.silhouette_start import LEVELS, coarse_to_fine
 
 OFF = (0, 5, 10, 15, 20, 25, 30, 35, 40)  # [deg]
 TRIALS = int(os.environ.get("KINEFIT_TRIALS", "12"))

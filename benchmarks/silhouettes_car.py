@@ -13,11 +13,11 @@ from kinefit.bodies.surfaces.fourier import FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry.camera import Rig
+from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
+from kinefit.sensors.settings import FusionSettings
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.silhouette_start import Level, coarse_to_fine
 
 FRAMES = 120  # three degrees a frame
 LENGTH = 0.3  # [m]

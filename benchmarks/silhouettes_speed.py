@@ -22,8 +22,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import Canvas, render_body
+from kinefit.sensors.settings import FusionSettings
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
 
 FRAMES, WARM, ROUNDS = 45, 5, 3
 RED, GREEN = (200, 60, 50), (30, 90, 40)

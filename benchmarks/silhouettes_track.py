@@ -16,8 +16,8 @@ from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.rendering import render_body, scaled
 from kinefit.tracking.silhouette_take import silhouettes_of
 from kinefit.tracking.take import track_take

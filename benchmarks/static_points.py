@@ -76,7 +76,7 @@ def static_residual(rig: Rig, names: tuple[str, ...] | None = None) -> float:
 def main() -> None:
     """Print the medians of the shipped and of the refined calibration."""
     from benchmarks.figures import data
-    from kinefit.readers.calibration import read_calibration
+    from kinefit.readers.calibration.read import read_calibration
 
     folder = data("video_balancing_4cam")
     if folder is None:

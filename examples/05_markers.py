@@ -12,8 +12,8 @@ import numpy as np
 
 import kinefit
 from kinefit.exporters import write_markers, write_mot, write_osim
+from kinefit.markers.placement import placement
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.placement import placement
 
 
 def simulated(frames=120, seed=0):

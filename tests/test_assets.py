@@ -12,8 +12,8 @@ import pytest
 from kinefit import assets
 from kinefit.errors import AssetError, FileError
 from kinefit.geometry.triangulation import triangulate
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 
 FILES = {"thing/video.mp4": b"moving pictures", "thing-1.dist-info/LICENSE": b"do as you like"}
 KEPT = {"thing/video.mp4": "videos/cam01.mp4", "thing-1.dist-info/LICENSE": "LICENSE"}

@@ -18,14 +18,22 @@ LEVELS = [
     {"readers", "images", "rendering", "rows"},
     {"correspondences"},
     {"solvers"},
-    {"identification", "tracking"},
+    {"identification", "sensors"},
+    {"multiview"},
+    {"initialization", "subject"},
+    {"smoothing"},
+    {"markers"},
+    {"tracking"},
     {"calibration"},
     {"simulation", "recipes"},
     {"evaluation"},
     {"batch"},
     {"cli", "__main__"},
 ]
-BESIDE = {("motion", "bodies"), ("__main__", "cli")}
+BESIDE = {
+    ("motion", "bodies"), ("__main__", "cli"), ("initialization", "subject"), ("subject", "initialization"),
+    ("smoothing", "tracking"), ("initialization", "tracking"), ("smoothing", "subject"),
+}
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {

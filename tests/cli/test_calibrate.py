@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from kinefit.cli.calibrate import calibrate
 from kinefit.errors import CalibrationError, ExportError, FileError
-from kinefit.readers.calibration import read_calibration
+from kinefit.readers.calibration.read import read_calibration
 
 
 def call(*words):

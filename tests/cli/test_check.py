@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 from kinefit.cli.check import check, free_name, with_calibration
 from kinefit.errors import KinefitError
-from kinefit.readers.calibration import read_calibration
-from kinefit.readers.take import read_take
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.take.file import read_take
 
 
 def run(*args):

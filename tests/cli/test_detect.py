@@ -15,8 +15,8 @@ from kinefit.errors import AssetError, FileError, KinefitError, ObservationError
 from kinefit.images.person_detector import Person
 from kinefit.images.pose_model import SIZE, Pose
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 

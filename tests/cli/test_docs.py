@@ -11,8 +11,8 @@ from kinefit.bodies import catalogue, load_body, records
 from kinefit.bodies.files import JOINT_TYPES
 from kinefit.cli._results import NAMES
 from kinefit.exporters import tables
-from kinefit.readers import take as takes
 from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.take import file as takes
 from kinefit.simulation import cut, squat_and_wave
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

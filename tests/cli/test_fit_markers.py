@@ -7,8 +7,8 @@ from kinefit import Markers, read_markers, read_motion
 from kinefit.cli._fit_markers import FORMATS, fit_file
 from kinefit.errors import ExportError, FileError
 from kinefit.exporters import write_markers
+from kinefit.markers.placement import placement
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.placement import placement
 
 
 @pytest.fixture(scope="module")

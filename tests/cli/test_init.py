@@ -6,8 +6,8 @@ from click.testing import CliRunner
 
 import kinefit.cli
 from kinefit.cli import main
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
 
 

@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from kinefit import Markers, read_markers
 from kinefit.cli import main
 from kinefit.exporters import write_markers
+from kinefit.markers.placement import placement
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.placement import placement
 
 
 @pytest.fixture(scope="module")

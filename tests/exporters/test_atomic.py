@@ -10,7 +10,7 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit import exporters
 from kinefit.errors import ExportError
-from kinefit.exporters._atomic import write_text, writing
+from kinefit.exporters.atomic import write_text, writing
 from kinefit.readers.video import Video
 
 MOTION = smooth_motion(30)

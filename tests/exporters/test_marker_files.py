@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kinefit.errors import ExportError, FileError
 from kinefit.exporters import write_markers
 from kinefit.observations import MarkerEvent, Markers
-from kinefit.readers._c3d import read_c3d
+from kinefit.readers.c3d_file import read_c3d
 from kinefit.readers.markers import read_markers
 
 EVENTS = (MarkerEvent("Foot Strike", 0.25, "Left", "Anna"), MarkerEvent("Foot Off", 61.5, "Right"))

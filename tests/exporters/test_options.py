@@ -14,7 +14,7 @@ from tests.exporters.synthetic import smooth_motion
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
 from kinefit.exporters import tables, write_bvh, write_c3d, write_csv, write_glb, write_trc, write_usd
-from kinefit.exporters._skeleton import NAMES, bone_names
+from kinefit.exporters.skeletons.common import NAMES, bone_names
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 UPS = ("x", "y", "z", "-x", "-y", "-z")

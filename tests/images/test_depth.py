@@ -128,7 +128,7 @@ def test_what_cannot_be_is_told():
 
 
 def test_real_frames_lose_flying_pixels_and_little_else(data_dir):
-    from kinefit.readers.depth import read_depth
+    from kinefit.readers.depth.recordings import read_depth
 
     cam = Camera("sr305", (640, 480), [[476.007, 0, 313.683], [0, 476.007, 242.755], [0, 0, 1]])
     video = read_depth(data_dir("depth_sr305_upperbody") / "20210326-231615", unit=0.000125)

@@ -8,7 +8,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.depth import clean, to_points
 from kinefit.images.depth_noise import denoised
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
-from kinefit.readers.depth import read_depth
+from kinefit.readers.depth.recordings import read_depth
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
 from kinefit.simulation.scenes import Scene

@@ -11,7 +11,7 @@ from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.stereo import StereoRectifier, stereo_points
-from kinefit.readers.calibration import read_opencv_stereo
+from kinefit.readers.calibration.read import read_opencv_stereo
 
 MATRIX = [[290.0, 0, 159.5], [0, 290.0, 119.5], [0, 0, 1]]
 NORMAL, OFFSET = np.array([0.1, -0.15, 1.0]) / np.linalg.norm([0.1, -0.15, 1.0]), 2.0  # the wall n·x = offset

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, FileError
-from kinefit.exporters.detections import draw_people, write_detections
+from kinefit.exporters.pictures.detections import draw_people, write_detections
 from kinefit.observations import Detections
 from kinefit.readers.detections import detections_file, detections_key, read_detections
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import FileError, KinefitError, ObservationError
-from kinefit.readers._c3d import read_c3d
+from kinefit.readers.c3d_file import read_c3d
 from kinefit.readers.markers import read_markers
 
 TABLE = {  # folder/part of the name: markers, frames, rate, up, first frame

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.identification.synthetic import random_pose, synthetic_body
+from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.recipes._sapm_steps import candidate_table, errors, nearest
 from kinefit.recipes.sapm import sapm
 

@@ -8,9 +8,9 @@ from tests.tracking.fusion_oracle import a_rig
 
 from kinefit import FusionTracker, Markers, fit_marker_subject, learn_model
 from kinefit.errors import TrackingError
+from kinefit.markers.placement import placement
 from kinefit.recipes.unlabelled_markers import name_frame, start_from_markers
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.placement import placement
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ import pytest
 from kinefit.errors import ExportError, ObservationError
 from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
-from kinefit.readers.load import load_observations
 from kinefit.readers.motion import ARRAYS
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
+from kinefit.sensors.channels import mirror_name
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
-from kinefit.tracking.channels import mirror_name
 
 MOTION = squat_and_wave(rate=60.0, duration=4.0)
 RIG = studio_rig(MOTION)

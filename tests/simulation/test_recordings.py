@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, ObservationError
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.simulation import SENSORS, TOF, cut, simulate_depth, squat_and_wave, write_recording
 from kinefit.simulation.pictures import depth_picture

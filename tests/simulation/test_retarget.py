@@ -10,8 +10,8 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
-from kinefit.readers.amc import read_amc
-from kinefit.readers.bvh import read_bvh
+from kinefit.readers.skeletons.amc import read_amc
+from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import cut, resampled, retarget, squat_and_wave
 from kinefit.simulation.skeletons import bone_directions, family_of
 

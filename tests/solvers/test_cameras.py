@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.oracle import rig_around
 
-from kinefit.calibration.bundle import bundle_adjust
+from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.solvers.cameras import (
     COLUMNS,

@@ -9,12 +9,12 @@ from kinefit.bodies import load_body
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
+from kinefit.sensors.settings import FusionSettings
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
 from kinefit.simulation.scenes import Scene
 from kinefit.simulation.sensors import KINECT, measured_depth
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
 
 BODY = load_body("humanoid10")
 RATE = 30.0

@@ -31,8 +31,8 @@ from kinefit.bodies.parts import PartJoint, box, with_part, with_surfaces, witho
 from kinefit.errors import BodyError, CalibrationError, KinefitError, ObservationError
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
+from kinefit.sensors.settings import FusionSettings
 from kinefit.tracking.fusion import FusionResult, FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
 
 FEW = ("neck", "r_wrist", "l_ankle")
 KINDS = {

@@ -9,8 +9,8 @@ from kinefit.cli import main
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
 from kinefit.observations import Markers
-from kinefit.readers.load import load_observations
-from kinefit.readers.take import read_take
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.tracking.fusion_take import FrameSource, fuse_take

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.tracking.test_silhouettes import at, ring
+from tests.sensors.test_silhouette import at, ring
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import Morphing
@@ -13,10 +13,10 @@ from kinefit.errors import BodyError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
+from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
+from kinefit.sensors.settings import FusionSettings
 from kinefit.tracking.fused_fit import FusedFit
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
 

@@ -6,7 +6,7 @@ import av
 import numpy as np
 
 from kinefit.exporters import write_motion
-from kinefit.readers.calibration import write_calibration
+from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 
 RATE = 30

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from kinefit.geometry.camera import Rig
     from kinefit.observations import Keypoints
-    from kinefit.readers.take import Take
+    from kinefit.readers.take.file import Take
 
 _FRAMES = 50
 
@@ -23,7 +23,7 @@ def print_agreement(take: Take) -> None:
     """Print, for every two cameras, how far the points that both saw miss each other."""
     from rich.table import Table
 
-    from kinefit.readers.load import load_observations
+    from kinefit.readers.take.load import load_observations
 
     seen = load_observations(take)
     table = Table("cameras", "points seen by both", "median error of their meeting", box=None, pad_edge=False)

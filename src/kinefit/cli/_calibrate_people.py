@@ -34,11 +34,11 @@ def people(
     from statistics import median
 
     from kinefit.bodies import load_body
-    from kinefit.calibration.people import calibrate_people
+    from kinefit.calibration.people.calibrate import calibrate_people
     from kinefit.cli._detecting import with_detections
     from kinefit.errors import ExportError
-    from kinefit.readers.calibration import write_calibration
-    from kinefit.readers.take import read_take
+    from kinefit.readers.calibration.read import write_calibration
+    from kinefit.readers.take.file import read_take
     from kinefit.tracking.take import load_keypoints
 
     entry = read_take(take)

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kinefit.calibration.check import Check
-from kinefit.calibration.findings import Finding
+from kinefit.calibration.check.check import Check
+from kinefit.calibration.check.findings import Finding
 from kinefit.cli._check_pictures import pair, picture_section
-from kinefit.exporters import page as p
+from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES
 
 if TYPE_CHECKING:
-    from kinefit.calibration.result import Refinement
+    from kinefit.calibration.refine.result import Refinement
 
 _LOOKS = {"fault": "bad", "doubt": "warning", "note": "note", "good": "good"}
 _TITLES = {"fault": "Fault", "doubt": "Doubt", "note": "Note", "good": "In order"}

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.bias import CameraBias
-from kinefit.calibration.check import Check
-from kinefit.calibration.views import from_others
+from kinefit.calibration.check.bias import CameraBias
+from kinefit.calibration.check.check import Check
+from kinefit.calibration.check.views import from_others
 from kinefit.errors import KinefitError
-from kinefit.exporters import page as p
+from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.readers.video import Video
 

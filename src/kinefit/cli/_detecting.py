@@ -20,7 +20,7 @@ from kinefit.errors import ObservationError, TakeError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from kinefit.readers.take import Take
+    from kinefit.readers.take.file import Take
 
 PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
@@ -93,7 +93,7 @@ def ensure_detections(
 
 def with_detections(take: Take, step: _screen.Step) -> Take:
     """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
-    from kinefit.readers.take import KeypointsEntry
+    from kinefit.readers.take.file import KeypointsEntry
 
     asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
     videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo or take.silhouettes)
@@ -171,7 +171,7 @@ def detect(
 
 def _from_beside(job: Job, key: str, people: int | None, masks: bool | None) -> None:
     """Copy what another take of the same folder found in the same video already."""
-    from kinefit.exporters._atomic import writing
+    from kinefit.exporters.atomic import writing
     from kinefit.readers.detections import detections_key
 
     if _fits(detections_key(job.file), key, people, masks):
@@ -190,7 +190,7 @@ class _Stopped(Exception):
 def _look_through(
     job: Job, networks: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None]
 ) -> None:
-    from kinefit.exporters.detections import write_detections
+    from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detection import detect_people
     from kinefit.images.models import Models
     from kinefit.readers.video import Video

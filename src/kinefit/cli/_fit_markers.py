@@ -13,8 +13,8 @@ from kinefit.bodies import Body, PointSet, load_body
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
 from kinefit.errors import ExportError
+from kinefit.markers.subject import MarkerSubject
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.tracking.marker_subject import MarkerSubject
 
 FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 """Formats that are written where none are named."""
@@ -64,10 +64,10 @@ def fit_file(
         A file cannot be read or written, too few labels are known, or no frame shows enough: see `fit_markers`.
     """
     from kinefit.exporters import write_markers, write_osim
+    from kinefit.markers.fit import fit_markers
+    from kinefit.markers.people import split_people
+    from kinefit.markers.subject import fit_marker_subject
     from kinefit.readers.markers import read_markers
-    from kinefit.tracking.marker_people import split_people
-    from kinefit.tracking.marker_subject import fit_marker_subject
-    from kinefit.tracking.markers import fit_markers
 
     step = step or (lambda what, done, total: None)
     source, formats = Path(path), tuple(formats)

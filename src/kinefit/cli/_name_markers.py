@@ -11,14 +11,14 @@ import numpy as np
 
 from kinefit.cli._screen import Step
 from kinefit.errors import ObservationError
-from kinefit.identification.files import load_model
-from kinefit.identification.from_frame import model_from_frame
-from kinefit.identification.gate import Finding, training_gate
-from kinefit.identification.learn import learn_model
 from kinefit.identification.marker_sets import find_marker_set, load_marker_set
-from kinefit.identification.model import MarkerModel
-from kinefit.identification.people import identify_people, one_after_the_other
-from kinefit.identification.takes import TakeIdentification, TakeSettings
+from kinefit.identification.model.files import load_model
+from kinefit.identification.model.from_frame import model_from_frame
+from kinefit.identification.model.gate import Finding, training_gate
+from kinefit.identification.model.learn import learn_model
+from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.take.people import identify_people, one_after_the_other
+from kinefit.identification.take.takes import TakeIdentification, TakeSettings
 from kinefit.observations import Markers
 
 
@@ -93,7 +93,7 @@ def identify_file(
         A file cannot be read or written, or no subject is found.
     """
     from kinefit.exporters import write_markers
-    from kinefit.exporters._atomic import write_text
+    from kinefit.exporters.atomic import write_text
     from kinefit.readers.markers import read_markers
 
     source = Path(path)

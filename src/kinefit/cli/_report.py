@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from kinefit.motion import Motion
-    from kinefit.readers.load import Observations
-    from kinefit.readers.take import Take
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
 
 _PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
 
@@ -26,7 +26,7 @@ def write_track_report(
 ) -> None:
     """Write report.html into a folder of results, with links to what lies there already; enter it into `files`."""
     from kinefit.cli._results import ABOUT
-    from kinefit.exporters.report import write_report
+    from kinefit.exporters.report.report import write_report
 
     pictures = take_pictures(motion, take, seen, step)
     step("report", 0, 1)
@@ -43,7 +43,7 @@ def take_pictures(
     Frames that a video does not reach are left out.
     """
     from kinefit.cli._results import _residuals
-    from kinefit.exporters._report_pictures import close_up, report_frames
+    from kinefit.exporters.report.pictures import close_up, report_frames
     from kinefit.readers.video import Video
 
     out: dict[str, dict[int, NDArray[np.uint8]]] = {}

@@ -12,8 +12,8 @@ from kinefit.errors import ExportError
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion, Residuals
-    from kinefit.readers.load import Observations
-    from kinefit.readers.take import Take
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
 
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
@@ -81,7 +81,7 @@ def write_overlays(
 ) -> None:
     """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
-    from kinefit.exporters.overlay import nearest_frame
+    from kinefit.exporters.pictures.overlay import nearest_frame
     from kinefit.readers.video import Video
 
     if not (seen.videos or seen.depth) or seen.rig is None:

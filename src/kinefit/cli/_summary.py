@@ -89,7 +89,7 @@ def _median(r: Residuals) -> str:
 
 
 def _left_out(r: Residuals) -> float:
-    from kinefit.exporters._drawing import OUTLIER_WEIGHT
+    from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 
     seen = np.isfinite(r.norms)
     return float(np.mean(np.asarray(r.weights)[seen] < OUTLIER_WEIGHT)) if seen.any() else 0.0

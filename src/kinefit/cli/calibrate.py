@@ -11,7 +11,7 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
-    from kinefit.calibration.board import BoardCalibration
+    from kinefit.calibration.board.calibrate import BoardCalibration
 
 _WAYS = {"board": "kinefit.cli.calibrate", "people": "kinefit.cli._calibrate_people"}
 
@@ -66,11 +66,11 @@ def board(
     Give a synchronised video for each camera, named as the camera, or a folder of them; or folders of pictures. Frames
     of one number are of one time. The board's square gives the scale, the board on the floor the origin and up.
     """
-    from kinefit.calibration.board import calibrate_board
-    from kinefit.calibration.board_detect import Board
-    from kinefit.calibration.board_sources import camera_sources, find_boards
+    from kinefit.calibration.board.calibrate import calibrate_board
+    from kinefit.calibration.board.detection import Board
+    from kinefit.calibration.board.sources import camera_sources, find_boards
     from kinefit.errors import ExportError
-    from kinefit.readers.calibration import read_calibration, write_calibration
+    from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     described = Board.parse(spec)
     found = camera_sources(sources)

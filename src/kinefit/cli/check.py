@@ -11,8 +11,8 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
-    from kinefit.calibration.check import Check
-    from kinefit.calibration.result import Refinement
+    from kinefit.calibration.check.check import Check
+    from kinefit.calibration.refine.result import Refinement
 
 _EXAMPLES = """\b
 Examples:
@@ -51,12 +51,12 @@ def check(
     """
     if (focal or distortion or time_offsets or copy or points) and not refine:
         raise click.UsageError("--focal, --distortion, --time-offsets, --points and --take only go with --refine.")
-    from kinefit.calibration.check import check_take
+    from kinefit.calibration.check.check import check_take
     from kinefit.cli._check_page import check_page
     from kinefit.cli._detecting import with_detections
     from kinefit.errors import KinefitError
-    from kinefit.exporters._atomic import write_text
-    from kinefit.readers.take import read_take
+    from kinefit.exporters.atomic import write_text
+    from kinefit.readers.take.file import read_take
 
     entry, out = read_take(take), out or take.with_name(f"{take.stem}-check.html")
     refined: Refinement | None = None
@@ -87,7 +87,7 @@ def _refine(
     found: Check, step: _screen.Step, points: Path | None, *, focal: bool, distortion: bool, time_offsets: bool
 ) -> Refinement:
     from kinefit.bodies import load_body
-    from kinefit.calibration.refine import refine
+    from kinefit.calibration.refine.refine import refine
     from kinefit.errors import CalibrationError
     from kinefit.readers.static_points import read_static_points
 
@@ -139,8 +139,8 @@ def _print(found: Check, verbose: bool) -> None:
 
 
 def _write_refined(found: Check, refined: Refinement, path: Path, *, copy: bool) -> None:
-    from kinefit.exporters._atomic import write_text
-    from kinefit.readers.calibration_write import write_calibration_like
+    from kinefit.exporters.atomic import write_text
+    from kinefit.readers.calibration.write import write_calibration_like
 
     assert found.take is not None and found.take.calibration is not None
     old = found.take.calibration

@@ -41,7 +41,7 @@ def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out:
 
 
 def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[_detecting.Job]:
-    from kinefit.readers.take import read_take
+    from kinefit.readers.take.file import read_take
 
     takes = [path for path in inputs if path.suffix.lower() == ".toml"]
     if takes:

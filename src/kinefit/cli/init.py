@@ -28,8 +28,8 @@ def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
     Nothing else is changed. Look at what is a guess or open, then run kinefit check.
     """
     from kinefit.errors import TakeError
-    from kinefit.exporters._atomic import write_text
-    from kinefit.readers.guess import guess_take
+    from kinefit.exporters.atomic import write_text
+    from kinefit.readers.guess.folder import guess_take
 
     out = out or folder / "take.toml"
     if out.exists() and not force:

@@ -10,7 +10,7 @@ import click
 from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
-    from kinefit.identification.takes import TakeIdentification
+    from kinefit.identification.take.takes import TakeIdentification
     from kinefit.observations import Markers
 
 MOST_DOUBTS = 12
@@ -54,7 +54,7 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best one in which every joint moves."""
     from kinefit.cli._name_markers import learn_files
-    from kinefit.identification.files import save_model
+    from kinefit.identification.model.files import save_model
 
     if no_set and (marker_set or frame is not None):
         raise click.UsageError("--no-set learns from motion alone: without --set and --frame.")
@@ -95,7 +95,7 @@ def identify(
     not looked at. What is not certain has no name; doubtful frames are printed, and all of them written as a table.
     """
     from kinefit.cli._name_markers import identify_file
-    from kinefit.identification.takes import TakeSettings
+    from kinefit.identification.take.takes import TakeSettings
 
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
     with _screen.bars() as step:
@@ -196,9 +196,9 @@ def audit(
     unit: str | None, verbose: bool,
 ) -> None:  # fmt: skip
     """Find swapped labels, and markers off their segment, in takes that somebody labelled."""
-    from kinefit.identification.audit import audit_take
-    from kinefit.identification.files import load_model
+    from kinefit.identification.audit.audit import audit_take
     from kinefit.identification.marker_sets import load_marker_set
+    from kinefit.identification.model.files import load_model
     from kinefit.readers.markers import read_markers
 
     model = load_model(subject) if subject else None

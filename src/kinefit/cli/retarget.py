@@ -25,8 +25,8 @@ Examples:
 def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
     """Put a recorded motion onto the humanoid, by the directions of its bones."""
     from kinefit.exporters import write_motion
-    from kinefit.readers.amc import read_amc
-    from kinefit.readers.bvh import read_bvh
+    from kinefit.readers.skeletons.amc import read_amc
+    from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation import retarget as retarget_motion
 
     suffix = recording.suffix.lower()

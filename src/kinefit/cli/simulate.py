@@ -84,9 +84,9 @@ def simulate(
 def _known(path: Path, body: str | None, asf: Path | None, rate: float | None, step: _screen.Step) -> Motion:
     """The motion on the body and at the rate asked for."""
     from kinefit.bodies import load_body
-    from kinefit.readers.amc import read_amc
-    from kinefit.readers.bvh import read_bvh
     from kinefit.readers.motion import read_motion
+    from kinefit.readers.skeletons.amc import read_amc
+    from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation import on_body, resampled, retarget
 
     suffix = path.suffix.lower()

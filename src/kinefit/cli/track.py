@@ -70,7 +70,7 @@ def run(
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TrackingError
-    from kinefit.readers.take import read_take
+    from kinefit.readers.take.file import read_take
     from kinefit.tracking.take import track_take
     from kinefit.tracking.video import TrackingInterrupted
 

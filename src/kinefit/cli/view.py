@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from kinefit.motion import Motion
-    from kinefit.readers.load import Observations
-    from kinefit.readers.take import Take
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
     from kinefit.viewers.show import Recording
 
 _EXAMPLES = """\b
@@ -54,9 +54,9 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
     """Read everything that is to be shown."""
     import numpy as np
 
-    from kinefit.readers.load import load_observations
     from kinefit.readers.motion import read_motion
-    from kinefit.readers.take import read_take
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.load import load_observations
     from kinefit.viewers.pictures import Pictures
     from kinefit.viewers.show import Recording
 
@@ -95,8 +95,8 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
 def _fitting(file: Path | None, name: str) -> tuple[Take, Observations] | None:
     """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
     from kinefit.errors import KinefitError
-    from kinefit.readers.load import load_observations
-    from kinefit.readers.take import read_take
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.load import load_observations
 
     if file is None:
         return None
@@ -132,9 +132,9 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
 
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
-    from kinefit.tracking.association import choose_people
-    from kinefit.tracking.channels import make_channels
-    from kinefit.tracking.initialise import triangulated
+    from kinefit.initialization.from_points import triangulated
+    from kinefit.multiview.association import choose_people
+    from kinefit.sensors.channels import make_channels
 
     if seen.rig is None or not seen.keypoints:
         return None
@@ -171,7 +171,7 @@ def _serve(recording: Recording, port: int, host: str, browser: bool) -> None:
 
 
 def _write(recording: Recording, html: Path) -> None:
-    from kinefit.exporters._atomic import write_text
+    from kinefit.exporters.atomic import write_text
     from kinefit.viewers.page import page
 
     _screen.note("Drawing the scene ...")

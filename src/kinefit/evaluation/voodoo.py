@@ -207,7 +207,7 @@ METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_metho
 
 def found_start(run: Sequence) -> BodyState:
     """Pose found in the first depth image with none given."""
-    from kinefit.tracking.depth_start import start_from_points
+    from kinefit.initialization.from_depth import start_from_points
 
     depth = np.asarray(run.depth[0].depth)
     return start_from_points(run.truth.body, None, run.rig["depth"], depth, up=(0.0, 1.0, 0.0))[0].state

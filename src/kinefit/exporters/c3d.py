@@ -7,9 +7,9 @@ from os import PathLike
 import numpy as np
 
 from kinefit.errors import ExportError
-from kinefit.exporters._atomic import write_bytes
-from kinefit.exporters._c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
-from kinefit.exporters._skeleton import UNITS, bone_names, length_factor, plain_names, turned
+from kinefit.exporters.atomic import write_bytes
+from kinefit.exporters.c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
+from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, plain_names, turned
 from kinefit.motion import Motion
 
 

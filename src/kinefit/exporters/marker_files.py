@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
-from kinefit.exporters._atomic import write_bytes, write_text
-from kinefit.exporters._c3d_file import MOST, Value, c3d_bytes, label_groups, screens
-from kinefit.exporters._skeleton import length_factor
+from kinefit.exporters.atomic import write_bytes, write_text
+from kinefit.exporters.c3d_file import MOST, Value, c3d_bytes, label_groups, screens
+from kinefit.exporters.skeletons.common import length_factor
 from kinefit.observations import Markers
-from kinefit.readers._c3d import C3d, read_c3d
+from kinefit.readers.c3d_file import C3d, read_c3d
 
 UNITS = {"m": 1.0, "dm": 10.0, "cm": 100.0, "mm": 1000.0, "in": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
 """Units of length in a metre."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.serial import body_to_arrays, text_array
 from kinefit.errors import ExportError
-from kinefit.exporters._atomic import writing
+from kinefit.exporters.atomic import writing
 from kinefit.motion import Motion
 from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, VERSION
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
-from kinefit.exporters._atomic import writing
-from kinefit.exporters._skeleton import UNITS, bone_names, continuous_quaternions, length_factor, turned
+from kinefit.exporters.atomic import writing
+from kinefit.exporters.skeletons.common import UNITS, bone_names, continuous_quaternions, length_factor, turned
 from kinefit.motion import Motion, Residuals
 
 Table = dict[str, NDArray]  # column -> (rows,)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MarkerEvent, Markers
-from kinefit.readers._c3d import C3d, read_c3d
+from kinefit.readers.c3d_file import C3d, read_c3d
 
 UNITS = {
     "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01,
@@ -85,14 +85,15 @@ def _unique(names: list[str]) -> tuple[str, ...]:
 
 def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
     problem = f"none of the {markers} markers is seen in any of the {frames} frames"
-    return ObservationError(problem, file=path, remedy="Export it again with its trajectories, or choose another trial.")
+    remedy = "Export it again with its trajectories, or choose another trial."
+    return ObservationError(problem, file=path, remedy=remedy)
 
 
 def _of_one_unit(markers: Markers, path: Path) -> Markers:
-    """The same; three markers that never leave the world's origin by more than _TINY are of a larger unit than others."""
+    """The same; three markers that never leave the origin by more than _TINY are of a larger unit than others."""
     away = np.nan_to_num(np.linalg.norm(markers.positions, axis=-1)).max(axis=0)
     tiny = [name for name, far in zip(markers.names, away, strict=True) if 0 < far < _TINY]
-    if len(tiny) >= 3 and away.max() > 10 * _TINY:
+    if 3 <= len(tiny) <= len(away) // 2 and away.max() > 10 * _TINY:  # most are of the unit that the file states
         listed = ", ".join(tiny[:4]) + (" ..." if len(tiny) > 4 else "")
         raise ObservationError(
             f"{len(tiny)} of {len(away)} markers stay within {1e3 * _TINY:.0f} mm of the origin ({listed}), others go "

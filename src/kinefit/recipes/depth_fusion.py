@@ -17,10 +17,10 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import DepthFrame, Frame
+from kinefit.sensors.settings import FusionSettings
+from kinefit.subject.keypoints import Progress
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.subject import Progress
 
 _SIZES = 4  # depth images that the person's size is found from ...
 _FIRST = 150  # ... among so many first ones

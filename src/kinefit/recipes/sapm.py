@@ -1,6 +1,6 @@
 """Segment-based articulated point matching, as Holstein and Li print it (P5): candidate tables, then the hierarchy.
 
-For names that can be relied on take `kinefit.identification.identify`; this is the published method.
+For names that can be relied on take `kinefit.identification.frame.identify`; this is the published method.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.identification.model import MarkerModel
+from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes._sapm_steps import MANY, candidate_table, coarse_updates, errors, mean_distance, nearest, triples
 
 CORRECTIONS = 3

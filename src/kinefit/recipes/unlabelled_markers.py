@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from kinefit.bodies import BodyState
 from kinefit.errors import TrackingError
-from kinefit.identification.identify import IdentifySettings, identify
-from kinefit.identification.model import MarkerModel
+from kinefit.identification.frame.identify import IdentifySettings, identify
+from kinefit.identification.model.model import MarkerModel
+from kinefit.initialization.from_points import pose_from_points
+from kinefit.markers.poses import bare
+from kinefit.markers.subject import MarkerSubject
 from kinefit.observations import MarkerFrame
-from kinefit.tracking.initialise import pose_from_points
-from kinefit.tracking.marker_poses import bare
-from kinefit.tracking.marker_subject import MarkerSubject
 
 OFF = 0.05
 """[m] median distance of named markers beyond which a pose explains none of them."""

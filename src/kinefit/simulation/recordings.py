@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
-from kinefit.readers.calibration import write_calibration
+from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.keypoints import simulate_keypoints
 from kinefit.simulation.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
 from kinefit.simulation.placing import in_front, places

@@ -14,7 +14,7 @@ from kinefit.errors import ExportError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.observations import Keypoints
-from kinefit.readers.calibration import write_calibration
+from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.exercise import squat_and_wave
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig

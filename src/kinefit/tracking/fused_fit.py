@@ -16,18 +16,18 @@ from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.rows import AnyRows, ParameterRows
+from kinefit.sensors.background import Background
+from kinefit.sensors.depth_image import DepthMeasurement
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
+from kinefit.sensors.occlusion import beside
+from kinefit.sensors.point_cloud import CloudMeasurement
+from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.silhouette import SilhouetteMeasurement, outline_camera
+from kinefit.sensors.surface import Surface
 from kinefit.solvers.equations import Covariance, inverse, joint_std
 from kinefit.solvers.least_squares import gauss_newton
-from kinefit.tracking.background import Background
-from kinefit.tracking.cloud_measurement import CloudMeasurement
-from kinefit.tracking.depth_measurement import DepthMeasurement
-from kinefit.tracking.evidence import Evidence
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.in_sight import beside
-from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import belief
-from kinefit.tracking.silhouette_measurement import SilhouetteMeasurement, outline_camera
-from kinefit.tracking.surface import Surface
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")

@@ -14,16 +14,16 @@ from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry.camera import Rig
+from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, find_starts
+from kinefit.initialization.depth_search import Search
 from kinefit.observations import Frame
+from kinefit.sensors.background import Background
+from kinefit.sensors.depth_image import DepthMeasurement
+from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
+from kinefit.sensors.point_cloud import CloudMeasurement
+from kinefit.sensors.settings import FusionSettings
 from kinefit.solvers.equations import inverse
-from kinefit.tracking._depth_search import Search
-from kinefit.tracking.background import Background
-from kinefit.tracking.cloud_measurement import CloudMeasurement
-from kinefit.tracking.depth_measurement import DepthMeasurement
 from kinefit.tracking.fused_fit import FusedFit, FusionResult, Held
-from kinefit.tracking.fusion_search import LEAP, dofs_of_limbs, find_limbs, find_starts
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.tracking.prediction import Prediction, forgetting
 
 __all__ = ["FusionResult", "FusionTracker"]

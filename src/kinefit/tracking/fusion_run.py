@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera
+from kinefit.initialization.from_depth import sized_start
 from kinefit.motion import Motion, Residuals
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame
-from kinefit.tracking.depth_start import sized_start
+from kinefit.subject.keypoints import Progress
 from kinefit.tracking.fusion import FusionResult, FusionTracker
 from kinefit.tracking.interrupted import TrackingInterrupted
-from kinefit.tracking.subject import Progress
 
 Steps = Callable[[int], Sequence[Frame]]
 """Number of a step of time -> what the sensors saw then; nothing where none did."""

@@ -13,7 +13,10 @@ from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
+from kinefit.markers.placement import known_set
+from kinefit.markers.poses import bare
 from kinefit.motion import UP_AXES, Motion
+from kinefit.multiview.association import choose_people
 from kinefit.observations import (
     CloudVideo,
     DepthFrame,
@@ -25,19 +28,16 @@ from kinefit.observations import (
     Markers,
     SilhouetteVideo,
 )
-from kinefit.readers.load import Observations
 from kinefit.readers.motion import read_motion
-from kinefit.readers.take import Take
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
 from kinefit.readers.video import Video
-from kinefit.tracking.association import choose_people
-from kinefit.tracking.channels import make_channels
+from kinefit.sensors.channels import make_channels
+from kinefit.sensors.settings import FusionSettings
+from kinefit.subject.keypoints import Progress, fit_subject
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
-from kinefit.tracking.fusion_settings import FusionSettings
-from kinefit.tracking.marker_poses import bare
-from kinefit.tracking.placement import known_set
 from kinefit.tracking.silhouette_take import shaped_by_silhouettes, silhouettes_of
-from kinefit.tracking.subject import Progress, fit_subject
 
 _SIZES = 4  # depth images from which a person's size is found ...
 _FIRST = 5.0  # [s] ... spread over so much of the beginning

@@ -16,13 +16,13 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.silhouette_background import BackgroundPlate
 from kinefit.observations import Frame, SilhouetteFrame, SilhouetteVideo
-from kinefit.readers.load import Observations
-from kinefit.readers.silhouettes import in_calibration
-from kinefit.readers.take import Take
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+from kinefit.readers.take.silhouettes import in_calibration
 from kinefit.readers.video import Video
+from kinefit.subject.keypoints import Progress
+from kinefit.subject.silhouettes import CylinderFamily, ShapeFit, fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.silhouette_shape import CylinderFamily, ShapeFit, fit_silhouettes
-from kinefit.tracking.subject import Progress
 
 _SIDE = 1000  # [px] of a picture that its background is taken from: larger ones are made smaller by a whole number
 _LEARNT = 30  # pictures of a video from which its background is learnt

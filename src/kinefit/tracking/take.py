@@ -7,12 +7,12 @@ from os import PathLike
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError
 from kinefit.motion import Motion
-from kinefit.readers.load import Observations, load_observations
-from kinefit.readers.take import Take, read_take
-from kinefit.tracking.association import choose_people
-from kinefit.tracking.channels import make_channels
+from kinefit.multiview.association import choose_people
+from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.load import Observations, load_observations
+from kinefit.sensors.channels import make_channels
+from kinefit.subject.keypoints import Subject, fit_subject
 from kinefit.tracking.fusion_take import fuse_take
-from kinefit.tracking.subject import Subject, fit_subject
 from kinefit.tracking.tracker import Settings
 from kinefit.tracking.video import Progress, track
 

@@ -11,14 +11,14 @@ from kinefit.bodies import Body
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, Residuals
+from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
-from kinefit.tracking.association import choose_people
-from kinefit.tracking.channels import Channels, make_channels
+from kinefit.sensors.channels import Channels, make_channels
+from kinefit.smoothing.smoother import smooth_results
+from kinefit.smoothing.uncertainty import with_lasting_errors
+from kinefit.subject.keypoints import Progress, Subject, fit_subject
 from kinefit.tracking.interrupted import TrackingInterrupted
-from kinefit.tracking.smoothing import smooth_results
-from kinefit.tracking.subject import Progress, Subject, fit_subject
 from kinefit.tracking.tracker import FrameResult, Settings, Tracker
-from kinefit.tracking.uncertainty import with_lasting_errors
 
 
 def track(

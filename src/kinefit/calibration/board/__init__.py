@@ -1,0 +1,1 @@
+"""Cameras calibrated with a board."""

@@ -1,0 +1,235 @@
+"""Cameras calibrated with a board: interiors from its views, exteriors from the frames in which two of them see it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.calibration.board.bundle import BoardBundle, adjust_boards
+from kinefit.calibration.board.detection import Board, CameraViews
+from kinefit.calibration.board.extrinsics import Placed, place_cameras
+from kinefit.calibration.board.intrinsics import Interiors, calibrate_interiors, coverage
+from kinefit.errors import CalibrationError, choices
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import inverse
+
+_ENOUGH_VIEWS = 15  # of one camera; fewer leave the distortion to chance
+_ENOUGH_SHARED = 8  # frames of a pair
+_ENOUGH_COVERED = 0.5  # of the picture
+_SURE = 0.005  # of the focal length, one standard deviation
+
+
+@dataclass(frozen=True, eq=False)
+class CameraReport:
+    """How well one camera was calibrated.
+
+    Parameters
+    ----------
+    rms_px : float [px]
+        Distance of the corners seen from where cameras and boards together put them.
+    own_rms_px : float [px]
+        The same, the board being where this view has it: what lens and detector leave.
+    views, used : int
+        Pictures in which the board was found, and of these the ones that the interior was found from.
+    coverage : float
+        Share of the picture (cells of an 8 x 8 grid) in which corners were seen.
+    focal_std_px, position_std : float [px], [m]
+        Standard deviations; 0 for what was given or defines the world, infinite where nothing tells.
+    """
+
+    rms_px: float
+    own_rms_px: float
+    views: int
+    used: int
+    coverage: float
+    focal_std_px: float
+    position_std: float
+
+
+@dataclass(frozen=True, eq=False)
+class BoardCalibration:
+    """Cameras calibrated with a board.
+
+    Parameters
+    ----------
+    rig : Rig
+    board : Board
+    cameras : {camera: CameraReport}
+    rms_px, own_rms_px : float [px], as in `CameraReport`, over all cameras.
+    shared : {(camera, camera): int}
+        Frames in which both see the board and agree; empty where only interiors were wanted.
+    jitter : (float [m], float [rad])
+        How far a view's board was from its place in the frame: what cameras out of step, or a bent board, do.
+    world : str
+        Where the origin is, and what points up.
+    advice : tuple of str
+        What to record more of.
+    """
+
+    rig: Rig
+    board: Board
+    cameras: dict[str, CameraReport]
+    rms_px: float
+    own_rms_px: float
+    shared: dict[tuple[str, str], int]
+    jitter: tuple[float, float]
+    world: str
+    advice: tuple[str, ...]
+
+    @property
+    def distances(self) -> dict[tuple[str, str], float]:
+        """{(camera, camera): distance [m]}."""
+        return {
+            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
+            for a, b in combinations(self.rig, 2)
+        }
+
+
+def calibrate_board(
+    seen: Mapping[str, CameraViews],
+    board: Board,
+    *,
+    interiors: Rig | None = None,
+    floor: int | None = None,
+    exteriors: bool = True,
+) -> BoardCalibration:
+    """Calibrate cameras with a board; its squares give the scale.
+
+    Parameters
+    ----------
+    seen : {camera: CameraViews}, as `find_boards` gives them; views of one frame number are of one time.
+    board : Board
+    interiors : Rig, optional
+        Interiors that are kept (their poses are not used); without, they are calibrated too.
+    floor : int, optional
+        Frame in which the board lies on the floor, face up: origin in its first inner corner, x along its rows, z up.
+        Without, the world is the first camera's frame.
+    exteriors : bool
+        False: interiors alone; the cameras need not see the board together, and stand at the origin.
+
+    Raises
+    ------
+    CalibrationError
+        Too few views, a focal length that they do not determine, cameras that share no view, a floor that is not seen.
+    """
+    if not seen:
+        raise CalibrationError("no camera", remedy="Give the views of at least one camera.")
+    if interiors is None:
+        single = {name: calibrate_interiors(name, views, board) for name, views in seen.items()}
+        cameras = {name: of_camera.camera for name, of_camera in single.items()}
+    else:
+        single, cameras = {}, {name: _given(interiors, name, views) for name, views in seen.items()}
+    if not exteriors:
+        return _interiors_only(board, seen, cameras, single)
+    placed = place_cameras(cameras, seen, board)
+    bundle = adjust_boards(placed.rig, placed.Ts_world_board, placed.corners, interiors=interiors is None)
+    rig, world = _in_world(bundle, placed, floor, board)
+    reports = {
+        camera.name: _report(c, seen[camera.name], single.get(camera.name), placed, bundle)
+        for c, camera in enumerate(rig)
+    }
+    return BoardCalibration(
+        rig, board, reports, _rms(bundle.residuals), _rms(bundle.within), placed.agreeing, bundle.jitter, world,
+        tuple(_advice(rig, reports, placed.agreeing, len(seen))),
+    )
+
+
+def _given(interiors: Rig, name: str, views: CameraViews) -> Camera:
+    if name not in interiors:
+        raise CalibrationError(
+            choices("interior of camera", name, interiors.names), remedy="Name the videos as the cameras."
+        )
+    camera = interiors[name].with_pose(np.eye(4))
+    if camera.size != views.size:
+        raise CalibrationError(
+            f"its picture has {views.size[0]}x{views.size[1]} px, its interior is of {camera.size[0]}x{camera.size[1]}",
+            place=f"camera {name}",
+            remedy="Calibrate the interior anew, or record as it was calibrated.",
+        )
+    return camera
+
+
+def _interiors_only(
+    board: Board, seen: Mapping[str, CameraViews], cameras: dict[str, Camera], single: dict[str, Interiors]
+) -> BoardCalibration:
+    if not single:
+        raise CalibrationError("interiors are given and exteriors not wanted", remedy="Leave out one of the two.")
+    reports = {
+        name: CameraReport(
+            one.rms_px, one.rms_px, len(seen[name].views), len(one.frames), one.coverage, one.focal_std, np.inf
+        )
+        for name, one in single.items()
+    }
+    rms = float(np.sqrt(np.mean([one.rms_px**2 for one in single.values()])))
+    rig = Rig(tuple(cameras.values()))
+    advice = tuple(_advice(rig, reports, {}, 1))
+    return BoardCalibration(rig, board, reports, rms, rms, {}, (0.0, 0.0), "Interiors alone: no poses.", advice)
+
+
+def _in_world(bundle: BoardBundle, placed: Placed, floor: int | None, board: Board) -> tuple[Rig, str]:
+    first = bundle.rig.names[0]
+    if floor is None:
+        return bundle.rig, (
+            f"The world is the frame of {first} (x right, y down, z forward in its picture): its -y points up if "
+            f"{first} was level. Give the frame in which the board lies on the floor to have z up."
+        )
+    if floor not in placed.frames:
+        nearest = min(placed.frames, key=lambda frame: abs(frame - floor))
+        raise CalibrationError(
+            f"no camera sees the board in frame {floor}, in which it should lie on the floor",
+            place="floor",
+            remedy=f"The nearest frame with a board is {nearest}; the last is {placed.frames[-1]}.",
+        )
+    rig = bundle.rig.moved(inverse(bundle.Ts_world_board[placed.frames.index(floor)]))
+    below = [camera.name for camera in rig if camera.centre_world[2] < 0]
+    if below:
+        raise CalibrationError(
+            f"in frame {floor} the board's face points away from {', '.join(below)}, as if below the floor",
+            place="floor",
+            remedy="Give a frame in which the board lies flat on the floor, face up.",
+        )
+    return rig, (
+        f"Origin in the first inner corner of the board on the floor (frame {floor}), x along its rows, z up. Write "
+        'up = "z" in the take.'
+    )
+
+
+def _rms(residuals: NDArray) -> float:
+    return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
+
+
+def _report(c: int, seen: CameraViews, single: Interiors | None, placed: Placed, bundle: BoardBundle) -> CameraReport:
+    mine = placed.corners.camera == c
+    used = len(np.unique(placed.corners.frame[mine]))
+    return CameraReport(
+        _rms(bundle.residuals[mine]), _rms(bundle.within[mine]), len(seen.views),
+        len(single.frames) if single else used, coverage(seen), float(bundle.focal_std[c]),
+        float(bundle.position_std[c]),
+    )
+
+
+def _advice(
+    rig: Rig, reports: Mapping[str, CameraReport], shared: Mapping[tuple[str, str], int], count: int
+) -> list[str]:
+    out = []
+    for camera in rig:
+        report = reports[camera.name]
+        if report.views < _ENOUGH_VIEWS:
+            out.append(f"{camera.name}: {report.views} views; record {_ENOUGH_VIEWS} or more, turned to all sides.")
+        if report.focal_std_px and report.coverage < _ENOUGH_COVERED:
+            out.append(
+                f"{camera.name}: the board covered {100 * report.coverage:.0f} % of the picture; bring it near, and "
+                "into the corners: the distortion there is a guess."
+            )
+        if report.focal_std_px > _SURE * camera.matrix[0, 0]:
+            part = 100 * report.focal_std_px / camera.matrix[0, 0]
+            out.append(f"{camera.name}: focal length known to {part:.1f} % only; turn the board by 20 to 45 degrees.")
+    for camera in rig if count > 1 else ():
+        best = max((n for pair, n in shared.items() if camera.name in pair), default=0)
+        if best < _ENOUGH_SHARED:
+            out.append(f"{camera.name}: shares {best} frames with another camera; record {_ENOUGH_SHARED} or more.")
+    return out

@@ -1,0 +1,240 @@
+"""Videos and pictures in which a board is looked for: one a camera, frame by frame at the same times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.calibration.board.detection import (
+    Board,
+    CameraViews,
+    Finder,
+    View,
+    fitting_boards,
+    with_dictionary,
+)
+from kinefit.errors import CalibrationError, FileError
+from kinefit.readers.video import Video
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
+_SAMPLES = 6  # pictures of each camera in which another board is looked for, when the one named is not there
+_PAIRED = 5  # frames by which videos of one recording differ where one recorder stopped later
+
+Progress = Callable[[str, int, int], object]
+
+
+class Pictures:
+    """Pictures of one camera by frame number; as `Video`, but some frames may be missing."""
+
+    def __init__(self, files: Mapping[int, Path]) -> None:
+        self.files = dict(sorted(files.items()))
+        first = self.read(next(iter(self.files)))
+        self.size: tuple[int, int] = (first.shape[1], first.shape[0])
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the frames that there are."""
+        return tuple(self.files)
+
+    def read(self, frame: int) -> NDArray[np.uint8]:
+        """One frame, (H, W, 3) RGB."""
+        data = np.fromfile(self.files[frame], np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
+        if image is None:
+            raise FileError("not a picture that can be read", file=self.files[frame], remedy="Remove or replace it.")
+        size = (image.shape[1], image.shape[0])
+        if getattr(self, "size", size) != size:
+            raise CalibrationError(
+                f"has {size[0]}x{size[1]} px, the pictures before it {self.size[0]}x{self.size[1]}",
+                file=self.files[frame],
+                remedy="Calibrate pictures of one size; sort the others out.",
+            )
+        return image
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class _Frames(Video):
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the frames that there are."""
+        return tuple(range(len(self)))
+
+
+def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dict[int, Path]]:
+    """Cameras and what each saw, by name: a video, or pictures by frame number.
+
+    A file is a video, named as the camera. A folder holds videos; or pictures whose names end or begin with the
+    frame's number: left01.jpg, 01_right.jpg are two cameras, 01.jpg one with the folder's name; or folders of such
+    pictures, one a camera.
+
+    Raises
+    ------
+    FileError
+        Nothing there, or nothing that is known.
+    CalibrationError
+        Two cameras of one name.
+    """
+    found: dict[str, Path | dict[int, Path]] = {}
+
+    def add(name: str, source: Path | dict[int, Path], at: Path) -> None:
+        if name in found:
+            raise CalibrationError("two cameras of one name", file=at, place=f"camera {name}", remedy="Rename one.")
+        found[name] = source
+
+    for path in map(Path, paths):
+        if path.is_file():
+            add(path.stem, path, path)
+            continue
+        if not path.is_dir():
+            raise FileError("no such file or folder", file=path, remedy="Give videos, or folders of pictures.")
+        inside = sorted(path.iterdir())
+        videos = [file for file in inside if file.suffix.lower() in _VIDEOS]
+        pictures = [file for file in inside if file.suffix.lower() in _PICTURES]
+        folders = {sub.name: _pictures(sub) for sub in inside if sub.is_dir()}
+        if videos:
+            for video in videos:
+                add(video.stem, video, video)
+        elif pictures:
+            for name, files in _by_camera(pictures, path.name).items():
+                add(name, files, path)
+        else:
+            for name, listed in folders.items():
+                if listed:
+                    add(name, dict(enumerate(listed)), path)
+        if not (videos or pictures or any(folders.values())):
+            raise FileError(
+                "no video and no picture in it", file=path, remedy=f"Known are {', '.join(_VIDEOS + _PICTURES)}."
+            )
+    return found
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _PICTURES)
+
+
+def _by_camera(files: list[Path], folder: str) -> dict[str, dict[int, Path]]:
+    out: dict[str, dict[int, Path]] = {}
+    for n, file in enumerate(files):
+        last = re.fullmatch(r"(?P<name>.*?)[\s_.-]*(?P<number>\d+)", file.stem)
+        numbered = last or re.fullmatch(r"(?P<number>\d+)[\s_.-]+(?P<name>.+)", file.stem)
+        name, number = (numbered["name"] or folder, int(numbered["number"])) if numbered else (folder, n)
+        group = out.setdefault(name, {})
+        group[number if number not in group else max(group) + 1] = file
+    if max(len(group) for group in out.values()) == 1:  # names that say nothing
+        return {folder: dict(enumerate(files))}
+    return out
+
+
+def find_boards(
+    sources: Mapping[str, Path | dict[int, Path]],
+    board: Board,
+    *,
+    max_frames: int = 200,
+    include: Sequence[int] = (),
+    progress: Progress | None = None,
+) -> tuple[Board, dict[str, CameraViews]]:
+    """Look for the board in all cameras, at the same frames of each.
+
+    Parameters
+    ----------
+    sources : as `camera_sources` gives them.
+    max_frames : int
+        So many frames at most, evenly over the recording.
+    include : frames that are looked at in any case.
+
+    Returns
+    -------
+    Board
+        With the dictionary, where the one given named none.
+    {camera: CameraViews}
+
+    Raises
+    ------
+    CalibrationError
+        A camera in which the board is never seen; the message tells what other board is, if one is.
+    """
+    opened: dict[str, Pictures | _Frames] = {}
+    try:
+        for name, source in sources.items():
+            opened[name] = Pictures(source) if isinstance(source, dict) else _Frames(source)
+        _check_lengths({name: len(o) for name, o in opened.items() if isinstance(o, _Frames)})
+        frames = sorted({frame for o in opened.values() for frame in o.numbers})
+        chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).astype(int)}
+        wanted = sorted(chosen | (set(include) & set(frames)))
+        if board.kind == "charuco" and not board.dictionary:
+            board = with_dictionary(board, [image for o in opened.values() for image in _sample(o, 4)])
+        finder, seen, total = Finder(board), {}, len(wanted) * len(opened)
+        for n, (name, camera) in enumerate(opened.items()):
+            views: list[View] = []
+            own = set(camera.numbers)
+            for i, frame in enumerate(wanted):
+                view = finder.find(camera.read(frame), frame) if frame in own else None
+                views += [view] if view is not None else []
+                if progress:
+                    progress("finding boards", n * len(wanted) + i + 1, total)
+            seen[name] = CameraViews(camera.size, tuple(views))
+        unseen = [name for name, views in seen.items() if not views.views]
+        if unseen:
+            _refuse(board, unseen, opened, any(views.views for views in seen.values()))
+        if board.kind == "checkerboard":
+            _refuse_part(board, seen, opened)
+        return board, seen
+    finally:
+        for camera in opened.values():
+            camera.close()
+
+
+def _check_lengths(lengths: Mapping[str, int]) -> None:
+    if lengths and max(lengths.values()) - min(lengths.values()) > _PAIRED:
+        told = ", ".join(f"{name} {count}" for name, count in lengths.items())
+        raise CalibrationError(
+            f"the videos have different numbers of frames ({told}), so frames of one number are not of one time",
+            remedy="Cut them so that they begin and end together.",
+        )
+
+
+def _sample(source: Pictures | _Frames, count: int) -> list[NDArray]:
+    frames = source.numbers
+    return [source.read(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
+
+
+def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | _Frames], others: bool) -> None:
+    place = f"camera{'s' * (len(unseen) > 1)} {', '.join(unseen)}"
+    if others:
+        raise CalibrationError(
+            f"the board {board} is never seen there, though other cameras see it",
+            place=place,
+            remedy="Show the board to every camera, near enough that its squares are 20 px or more; or leave it out.",
+        )
+    images = [image for name in unseen for image in _sample(opened[name], _SAMPLES)]
+    fits = fitting_boards(board, images[: 2 * _SAMPLES])
+    tried = "other dictionaries, the legacy pattern and the board turned" if board.kind == "charuco" else "other sizes"
+    found = f"there is one that reads as --board {fits[0]}" if fits else f"nor with {tried}"
+    size = "squares" if board.kind == "charuco" else "inner corners, which are one less than squares"
+    raise CalibrationError(
+        f"no board {board} is seen; {found}",
+        place=place,
+        remedy=f"Check columns and rows (of {size}) and that the pictures are sharp and the board whole.",
+    )
+
+
+def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, Pictures | _Frames]) -> None:
+    """Refuse a board that is a part of a larger one: which part, differs from picture to picture."""
+    shown = [source.read(seen[name].views[i].frame) for name, source in opened.items() for i in (0, -1)]
+    for other in fitting_boards(board, shown[:4])[:1]:
+        ours, theirs = sorted(board.size), sorted(other.size)
+        if ours != theirs and all(a <= b for a, b in zip(ours, theirs)):
+            raise CalibrationError(
+                f"{board} is only a part of the board that is seen, {other}",
+                place=f"cameras {', '.join(opened)}",
+                remedy=f"Give --board {other}, if its squares have that size.",
+            )

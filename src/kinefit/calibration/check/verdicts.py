@@ -1,0 +1,215 @@
+"""From measured biases, time offsets and exchanged sides to what they mean: findings in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from kinefit.calibration.check.bias import SHIFT, TURN, CameraBias, Disagreement
+from kinefit.calibration.check.findings import Finding, Severity, listed
+from kinefit.calibration.check.timing import TimeOffsets
+from kinefit.calibration.check.views import Views
+
+_ACCURACY = 8.0  # [px] of keypoints of which nothing else is said, as in a take
+_SURE = 4.0  # standard errors from which a bias or an offset is there
+_TENTH, _FIFTH, _WRONG = (
+    0.1,
+    0.2,
+    0.75,
+)  # [frames] from which an offset is told, is a doubt, puts frames together wrongly
+_UNSURE = 0.5  # [frames] standard error beyond which an offset cannot be told
+_NEARLY_ALL = 0.9  # of the squared disagreement
+_OUTLIERS = 0.15  # share of a camera's points that agree with nobody: detectors stay well below
+
+
+def bias_findings(
+    biases: Sequence[CameraBias], parts: Disagreement | None, accuracy: Mapping[str, float], take: str
+) -> list[Finding]:
+    """Cameras whose calibration is off by more than a keypoint is inaccurate, and which of them moved.
+
+    Parameters
+    ----------
+    parts : Disagreement, or None where only two cameras are there.
+    accuracy : {camera: [px]}
+        Of the take's keypoints: a bias as large does as much harm as all their noise, and never averages out.
+    take : str
+        Name of the take file, for remedies.
+    """
+    out: list[Finding] = []
+    for b in biases:
+        if b.count and np.isfinite(b.bias).all():
+            out += _one_bias(b, accuracy.get(b.camera, _ACCURACY), take)
+        if b.outliers > _OUTLIERS:
+            text = f"{100 * b.outliers:.0f} % of {b.camera}'s points agree with no other camera."
+            remedy = "Look at its keypoints (the picture below): another person, a poster, or exchanged sides?"
+            out.append(Finding("doubt", "outliers", text, (b.camera,), remedy=remedy))
+    sizes = [b.size for b in biases if np.isfinite(b.size)]
+    if parts is not None:
+        noticed = any(found.kind == "bias" for found in out)
+        moved = _who_moved(parts, min(accuracy.values(), default=_ACCURACY), take, noticed)
+        out += [moved] if moved else []
+    if sizes and not out:
+        out.append(Finding(
+            "good", "bias", f"The cameras agree: biases of {max(sizes):.1f} px at most, "
+            f"spread {np.nanmedian([b.spread for b in biases]):.1f} px.",
+        ))  # fmt: skip
+    return out
+
+
+def _one_bias(b: CameraBias, accuracy: float, take: str) -> list[Finding]:
+    significance = float(np.max(np.abs(b.bias) / np.maximum(b.std, 1e-9)))
+    if b.size < 0.5 * accuracy or significance < (_SURE if b.size < accuracy else 0.5 * _SURE):
+        return []
+    severity: Severity = "fault" if b.size >= accuracy and significance >= _SURE else "doubt"
+    way = " and ".join(
+        f"{abs(v):.1f} px too far {names[int(v > 0)]}"
+        for v, names in zip(b.bias, (("left", "right"), ("up", "down")), strict=True) if abs(v) >= 0.25 * b.size
+    )  # fmt: skip
+    text = (
+        f"{b.camera}: the calibration places the points {way} of where the camera sees them "
+        f"(bias {b.bias[0]:+.1f}, {b.bias[1]:+.1f} ± {b.std.max():.1f} px, spread {b.spread:.1f} px"
+    )
+    alone = (
+        f"; against the other cameras alone {b.alone[0]:+.1f}, {b.alone[1]:+.1f} px"
+        if np.isfinite(b.alone).all()
+        else ""
+    )
+    words = "Sure" if significance > 2 * _SURE else "Likely" if significance >= _SURE else "Not sure"
+    sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
+    how = f"{sure}; more than the keypoints' accuracy ({accuracy:g} px)." if severity == "fault" else f"{sure}."
+    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, f"Run: kinefit check {take} --refine")]
+
+
+def _who_moved(parts: Disagreement, accuracy: float, take: str, noticed: bool) -> Finding | None:
+    """Which cameras, if they alone had moved, would explain how all disagree.
+
+    Where no camera was noticed by its bias, only one that explains nearly all alone is told: a wrong focal length moves
+    points this way and that.
+    """
+    cameras = range(len(parts.cameras))
+    whole = parts.explained(parts.of(*cameras))
+    refine = f"Run: kinefit check {take} --refine"
+    text = f"The cameras disagree by {whole:.1f} px (root mean square) in a way that does not change over the recording"
+    for count in (1, 2):
+        if len(cameras) < 2 + count:
+            break
+        shares = {
+            which: (parts.explained(parts.of(*which)) / max(whole, 1e-9)) ** 2 for which in combinations(cameras, count)
+        }
+        best, second = sorted(shares, key=lambda which: -shares[which])[:2]
+        alone = count == 1 and shares[best] > _NEARLY_ALL and shares[second] < 0.5 * shares[best]
+        if not noticed and not (alone and whole > 0.25 * accuracy):
+            return None
+        if whole * np.sqrt(max(1.0 - shares[best], 0.0)) > 0.5 * accuracy:
+            continue
+        names = tuple(parts.cameras[c] for c in best)
+        lines = "; ".join(_how(parts, c, values) for c, values in zip(best, parts.solve(*best), strict=True))
+        clear = shares[second] < 0.9 * shares[best]
+        others = listed(parts.cameras[c] for c in second)
+        sure = (
+            f"{'Likely' if clear else 'A guess'}: it would explain {100 * shares[best]:.0f} % of the squared "
+            f"disagreement, {others} instead {100 * shares[second]:.0f} %."
+        )
+        verb = "has" if count == 1 else "have"
+        told = f"{text}: {listed(names)} {verb} moved or turned since the calibration ({lines})."
+        return Finding("note" if noticed else "doubt", "moved", told, names, sure, refine)
+    return Finding(
+        "note", "moved", f"{text}; no one or two cameras explain it: the calibration as a whole is inaccurate.", (), "",
+        f"{refine}; or calibrate again.",
+    )  # fmt: skip
+
+
+def _how(parts: Disagreement, c: int, values: np.ndarray) -> str:
+    """What happened to one camera's picture: a shift, and a turn or a scale where these explain a good part."""
+    focal = parts.explained(parts.of(c)) ** 2
+    told = [f"{parts.cameras[c]}: shifted by {values[0]:+.1f}, {values[1]:+.1f} px"]
+    if parts.explained(parts.of(c, parts=[SHIFT, TURN])) ** 2 > 1.05 * parts.explained(parts.of(c, parts=[SHIFT])) ** 2:
+        told.append(f"turned about its axis by {np.degrees(values[2]):+.2f} degrees")
+    if focal > 1.05 * parts.explained(parts.of(c, parts=[SHIFT, TURN])) ** 2:
+        told.append(f"scaled by {100 * values[3]:+.1f} % (focal length, image size, or distance)")
+    return ", ".join(told)
+
+
+def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: Mapping[str, float]) -> list[Finding]:
+    """Cameras out of step.
+
+    Parameters
+    ----------
+    take_offsets : {camera: [s]} `time_offset` as the take has it.
+    whole : {camera: [px]} how far the fast points of each camera's picture move in a frame.
+    """
+    out: list[Finding] = []
+    known = np.isfinite(times.offsets) & (times.std * times.rate < _UNSURE)
+    if not known.any():
+        text = "Whether the cameras are in step cannot be told: too little motion that several cameras see."
+        return [Finding("note", "time", text, remedy="Clap, jump or swing the arms once at the start of a recording.")]
+    unsure = [name for name, fine in zip(times.cameras, known, strict=True) if not fine]
+    if unsure:
+        verb = "is" if len(unsure) == 1 else "are"
+        text = f"Whether {listed(unsure)} {verb} in step cannot be told: too little motion."
+        out.append(Finding("note", "time", text, tuple(unsure)))
+    for c in np.flatnonzero(known):
+        name, late, std = times.cameras[c], times.frames[c], times.std[c] * times.rate
+        if abs(late) < max(_TENTH, _SURE * std):
+            continue
+        value = take_offsets.get(name, 0.0) + times.offsets[c]
+        way = "later" if late > 0 else "earlier"
+        text = (
+            f"{name} runs {abs(late):.2f} ± {std:.2f} frames ({1e3 * abs(times.offsets[c]):.0f} ms) {way} than the "
+            f"take says: a fast point is {abs(late) * whole.get(name, np.nan):.0f} px off by that."
+        )
+        severity: Severity = "fault" if abs(late) >= _WRONG else "doubt" if abs(late) >= _FIFTH else "note"
+        sure = "Sure" if abs(late) >= 2 * max(_TENTH, _SURE * std) else "Likely"
+        if abs(late) < 1.0:
+            sure += "; a detector that smooths over time, or a rolling shutter, can also delay by part of a frame"
+        out.append(Finding(
+            severity, "time", text, (name,), f"{sure}.",
+            f"Write time_offset = {value:.4f} into [[camera]] {name}.",
+        ))  # fmt: skip
+    if not out:
+        worst = float(np.max(np.abs(times.frames[known])))
+        std = float(np.max(times.std[known])) * times.rate
+        out.append(Finding("good", "time", f"The cameras are in step to {max(worst, std):.2f} frames (± {std:.2f})."))
+    return out
+
+
+def side_findings(views: Views) -> list[Finding]:
+    """Where the detector took left for right."""
+    if len(views.rig) < 3:
+        return [Finding("note", "sides", "With two cameras nobody can tell which of them takes left for right.")]
+    found = {name: np.flatnonzero(views.swapped[:, c]) for c, name in enumerate(views.rig.names)}
+    found = {name: frames for name, frames in found.items() if len(frames)}
+    if not found:
+        return [Finding("good", "sides", "Left and right agree in all cameras and frames.")]
+    told = [f"{len(frames)} of {len(views)} frames of {name} ({_ranges(frames)})" for name, frames in found.items()]
+    most = max(found, key=lambda name: len(found[name]))
+    often = len(found[most]) > 0.5 * len(views)
+    remedy = (
+        f"Is the picture of {most} mirrored?" if often else "Nothing: tracking puts it right from the other cameras."
+    )
+    text = f"The detector took left for right in {listed(told)}."
+    sure = "Sure: exchanged, they fit the other cameras."
+    return [Finding("doubt" if often else "note", "sides", text, tuple(found), sure, remedy)]
+
+
+def explained(findings: Sequence[Finding]) -> list[Finding]:
+    """Biases of cameras that did not move become notes where those that did explain them."""
+    moved = next((found for found in findings if found.kind == "moved" and found.cameras), None)
+    if moved is None or not moved.confidence.startswith("Likely"):
+        return list(findings)
+    out = []
+    for found in findings:
+        if found.kind == "bias" and found.cameras and not set(found.cameras) & set(moved.cameras):
+            found = replace(found, severity="note", remedy=f"Nothing: it follows from {listed(moved.cameras)}.")
+        out.append(found)
+    return out
+
+
+def _ranges(frames: np.ndarray, most: int = 6) -> str:
+    """Frames as "3, 7-9"."""
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    told = [f"{r[0]}" if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs]
+    return ", ".join(told[:most]) + (f" and {len(told) - most} more" if len(told) > most else "")

@@ -1,0 +1,176 @@
+"""One person's keypoints as every camera sees them, left and right put right: what a calibration is checked by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.multiview.association import choose_people
+from kinefit.observations import Keypoints
+from kinefit.sensors.channels import mirror_name
+
+AGREE = 0.03  # of the picture's diagonal: cameras that differ by more have not seen the same point
+_SURE = 0.3  # confidence from which a point counts; detectors give hidden points less
+_PAIRS = 3  # left-right pairs that must be seen to tell the sides
+_CLEARLY = 0.6  # exchanged, the pairs must fit to this share of their error, or the detector is believed
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Pixels of one person's K points in F frames of the C cameras of a rig.
+
+    Parameters
+    ----------
+    rig : Rig
+    names : (K,)
+    partner : (K,) int
+        Point with left and right exchanged; itself for a point in the middle.
+    rate : float [Hz]
+    uv : (F, K, C, 2) [px]
+        In the calibration's image; NaN where unseen or unsure. Sides are as in `swapped`.
+    swapped : (F, C) bool
+        Where left and right were exchanged to make `uv`.
+    begins : (C,) [s]
+        Time of every camera's first frame.
+    """
+
+    rig: Rig
+    names: tuple[str, ...]
+    partner: NDArray
+    rate: float
+    uv: NDArray
+    swapped: NDArray
+    begins: NDArray
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    @property
+    def limit(self) -> float:
+        """[px] beyond which two cameras have not seen the same point."""
+        return AGREE * max(float(np.hypot(*camera.size)) for camera in self.rig)
+
+    def at(self, frames: NDArray) -> Views:
+        """Some frames."""
+        return replace(self, uv=self.uv[frames], swapped=self.swapped[frames])
+
+    def spread(self, count: int) -> Views:
+        """At most so many frames, spread over the recording."""
+        return self.at(np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).astype(int)))
+
+    def select(self, cameras: Sequence[str]) -> Views:
+        """Only some cameras."""
+        at = [self.rig.index(name) for name in cameras]
+        return replace(
+            self, rig=self.rig.select(tuple(cameras)), uv=self.uv[:, :, at], swapped=self.swapped[:, at],
+            begins=self.begins[at],
+        )  # fmt: skip
+
+    def pixels(self) -> NDArray:
+        """(F · K, C, 2) [px] all points, frame after frame."""
+        return self.uv.reshape(-1, len(self.rig), 2)
+
+
+def make_views(rig: Rig, keypoints: Sequence[Keypoints]) -> Views:
+    """Views of the person whom most cameras agree on, as the detectors saw it.
+
+    Raises
+    ------
+    TrackingError
+        Nobody is seen in any frame.
+    """
+    people = choose_people(rig, keypoints)
+    sets: dict[str, tuple[str, ...]] = {}
+    for record in keypoints:
+        sets.setdefault(record.keypoint_set, record.names)
+    starts = dict(zip(sets, np.cumsum([0, *map(len, sets.values())]), strict=False))
+    names = tuple(name for of_set in sets.values() for name in of_set)
+    frames = min(len(record) for record in keypoints)
+    uv = np.full((frames, len(names), len(rig), 2), np.nan)
+    begins = np.full(len(rig), np.nan)
+    for record, chosen in zip(keypoints, people, strict=True):
+        c, start = rig.index(record.camera), starts[record.keypoint_set]
+        points, begins[c] = _of_person(record, chosen[:frames]), record.time_offset
+        uv[:, start : start + len(record.names), c] = points
+    partner = []
+    for name, of_set in sets.items():
+        partner += [
+            starts[name] + (of_set.index(m) if (m := mirror_name(n)) in of_set else i) for i, n in enumerate(of_set)
+        ]
+    known = begins[np.isfinite(begins)]
+    begins = np.where(np.isfinite(begins), begins, known.min())
+    return Views(rig, names, np.array(partner), keypoints[0].rate, uv, np.zeros((frames, len(rig)), bool), begins)
+
+
+def _of_person(record: Keypoints, chosen: NDArray) -> NDArray:
+    """(F, K, 2) [px] of the chosen person; of the largest where the cameras agree on none in most frames."""
+    frames = np.arange(len(chosen))
+    points = np.where((record.confidence > _SURE)[..., None], record.points, np.nan)[: len(chosen)]
+    if not points.shape[1]:
+        return np.full((len(chosen), len(record.names), 2), np.nan)
+    seen = np.isfinite(points).all(-1)
+    anybody = np.any(seen, axis=(1, 2))
+    if np.sum(chosen >= 0) < 0.5 * anybody.sum():
+        low, high = (np.where(seen, points[..., 1], fill) for fill in (np.inf, -np.inf))
+        tall = np.where(seen.any(-1), high.max(-1) - low.min(-1), -1.0)
+        chosen = np.where(anybody, np.argmax(tall, axis=1), -1)
+    return np.where((chosen >= 0)[:, None, None], points[frames, np.maximum(chosen, 0)], np.nan)
+
+
+def meet(views: Views) -> tuple[NDArray, NDArray]:
+    """Where the views of each point meet: x_world (F, K, 3) [m], and which of them do, (F, K, C) bool."""
+    x, agree, _ = triangulate_robust(views.rig, views.pixels(), max_residual_px=views.limit)
+    shape = views.uv.shape[:2]
+    return x.reshape(*shape, 3), agree.reshape(*shape, len(views.rig))
+
+
+def from_others(views: Views, c: int) -> NDArray:
+    """(F, K, 2) [px] where camera c should see the points, by all other cameras; NaN where these do not tell."""
+    uv = views.pixels().copy()
+    uv[:, c] = np.nan
+    x, _, _ = triangulate_robust(views.rig, uv, max_residual_px=views.limit)
+    return views.rig.cameras[c].project(x).reshape(*views.uv.shape[:2], 2)
+
+
+def with_sides_right(views: Views) -> Views:
+    """The same with left and right exchanged in single cameras and frames where the others clearly want it.
+
+    Needs three cameras; with two nobody can tell which one is wrong. In every frame the camera that gains most is put
+    right first, then the others are asked anew.
+    """
+    paired = np.flatnonzero(views.partner != np.arange(len(views.partner)))
+    cameras = len(views.rig)
+    if cameras < 3 or not len(paired):
+        return views
+    todo = np.arange(len(views))
+    for _ in range(cameras - 1):
+        part = views.at(todo)
+        gain = np.stack([_gain(part, c, paired) for c in range(cameras)], axis=1)  # (F, C)
+        best = np.argmax(gain, axis=1)
+        wrong = gain[np.arange(len(todo)), best] > 0
+        if not wrong.any():
+            break
+        frames, which = todo[wrong], best[wrong]
+        uv, swapped = views.uv.copy(), views.swapped.copy()
+        uv[frames, :, which] = uv[frames[:, None], views.partner, which[:, None]]
+        swapped[frames, which] ^= True
+        views, todo = replace(views, uv=uv, swapped=swapped), frames
+    return views
+
+
+def _gain(views: Views, c: int, paired: NDArray) -> NDArray:
+    """(F,) [px] by how much the pairs of camera c fit better exchanged; 0 where not clearly."""
+    told, seen = from_others(views, c)[:, paired], views.uv[:, :, c]
+    as_is, turned = (
+        np.minimum(np.linalg.norm(seen[:, order] - told, axis=-1), views.limit)
+        for order in (paired, views.partner[paired])
+    )
+    both = np.isfinite(as_is) & np.isfinite(turned)
+    count = both.sum(axis=1)
+    before, after = (np.where(both, e, 0.0).sum(axis=1) / np.maximum(count, 1) for e in (as_is, turned))
+    return np.where((count >= 2 * _PAIRS) & (after < _CLEARLY * before), before - after, 0.0)

@@ -1,0 +1,1 @@
+"""Cameras calibrated from the people in view."""

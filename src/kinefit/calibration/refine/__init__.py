@@ -1,0 +1,1 @@
+"""Cameras refined with a body's own motion."""

@@ -1,0 +1,266 @@
+"""Cameras set right by the body that they saw: bundle adjustment over poses, bone lengths and cameras together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.calibration.refine.gauge import aligned, resized
+from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
+from kinefit.calibration.refine.sightings import Progress, Sighting, pixel_frames, sight, spread_frames, static_pixels
+from kinefit.calibration.refine.uncertainty import bias, chance
+from kinefit.errors import CalibrationError, ObservationError, TrackingError
+from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate
+from kinefit.observations import Keypoints
+from kinefit.solvers.body_bundle import fit_body_and_cameras
+from kinefit.solvers.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
+
+PLACE_SIGMA, TURN_SIGMA = 0.05, np.radians(2.0)
+"""How far a calibration is believed to be off [m, rad]: tripods that were knocked, not cameras that were moved."""
+_FOCAL_SIGMA, _RADIAL_SIGMA, _TIME_SIGMA = 0.03, 0.05, 0.2  # share, 1, [s]
+_STATIC_SIGMA = 1.0  # [px] of a point read by hand
+_RAYLEIGH = 1.177  # median length of a normal error in the plane, in σ
+_COARSEST = 30.0  # [px] beyond it points of different cameras are not taken for one
+_MOST_FRAMES, _LEAST_FRAMES = 600, 10
+_ROUNDS, _CLOCK_ROUNDS = 3, 6  # clocks come nearer by steps: how fast a point moves is told by frames out of step
+_SETTLED, _SETTLED_FRAMES = 2e-4, 0.02  # [m, rad] 0.3 px; [frames]: tracking anew would find the same
+_LIMIT_PX = 10.0  # a calibration known no better than this is no better than the ones that need refining
+_LIMIT_POINT = 0.05  # [m] the same: a tripod that was knocked
+_IMPLAUSIBLE = 0.02  # of the image's diagonal: a camera left with more is another one, or elsewhere
+
+
+StaticPoints = Mapping[str, Mapping[str, tuple[float, float]]]
+Length = tuple[str, str, float]
+Gauge = Callable[[Rig, Sighting], tuple[Rig, str]]
+
+
+def refine(
+    rig: Rig,
+    keypoints: Sequence[Keypoints],
+    body: Body,
+    *,
+    focal: bool = False,
+    distortion: bool = False,
+    time_offsets: bool = False,
+    static_points: StaticPoints | None = None,
+    height: float | None = None,
+    known_length: Length | None = None,
+    up: str = "z",
+    accuracy: float = 8.0,
+    progress: Progress | None = None,
+) -> Refinement:
+    """A rig set right by the person that it saw, and by static points where some are given.
+
+    Poses, bone lengths, the places of the detector's points and the cameras are solved together, robustly; then the
+    person is tracked anew with the better cameras, and so on for three rounds.
+
+    Parameters
+    ----------
+    rig : Rig, near the truth: 5 cm and 2° a camera are its prior.
+    keypoints : records of the same number of frames and the same rate.
+    body : Body, generic.
+    focal, distortion, time_offsets : bool
+        Estimate focal lengths (one factor a camera), k1 and k2, time offsets too. Principal points stay.
+    static_points : {name: {camera: (u, v)}} [px] in the calibration's image, of things that did not move.
+    height : float [m] stature of the person: sets the scale.
+    known_length : (point, point, [m]): sets the scale; static points or keypoints of the body.
+    accuracy : float [px] standard deviation of a sure keypoint.
+
+    Raises
+    ------
+    CalibrationError
+        Too little motion, or too few common views, to tell the cameras better than 10 px; cameras that fit nothing.
+    ObservationError
+        Streams that differ; a height, length or static point that cannot be.
+    """
+    check_input(rig, keypoints, height, known_length, static_points)
+    sigma = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
+
+    def gauge(new: Rig, seen: Sighting) -> tuple[Rig, str]:
+        return _in_old_frame(new, rig, seen, static_points or {}, height, known_length)
+
+    return refine_from(
+        rig, keypoints, body, CameraPrior(rig, sigma), up=up, accuracy=accuracy, gauge=gauge,
+        static_points=static_points, progress=progress,
+    )  # fmt: skip
+
+
+def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bool) -> NDArray:
+    """(C, 10) how far each parameter of a calibrated camera may be off."""
+    sigma = np.zeros((cameras, COLUMNS))
+    sigma[:, :3], sigma[:, 3:6] = PLACE_SIGMA, TURN_SIGMA
+    sigma[:, FOCAL] = _FOCAL_SIGMA * focal
+    sigma[:, RADIAL] = _RADIAL_SIGMA * distortion
+    sigma[:, TIME] = _TIME_SIGMA * time_offsets
+    return sigma
+
+
+def refine_from(
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, prior: CameraPrior, *, up: str,
+    accuracy: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
+    from_scratch: bool = False,
+) -> Refinement:  # fmt: skip
+    """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule."""
+    step = progress or (lambda *_: None)
+    names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
+    offsets = np.zeros(len(rig))
+    first: Sighting | None = None
+    rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
+    for turn in range(rounds):
+        step("refining", turn, rounds + 1)
+        seen = _sight(rig, keypoints, body, accuracy, up, offsets)
+        first = first or seen
+        off = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH
+        if off > 2.0 * accuracy:  # so far off, a robust loss would take most of what is seen for outliers
+            seen = _sight(rig, keypoints, body, min(off, _COARSEST), up, offsets)
+        chosen = spread_frames(seen, _MOST_FRAMES)
+        _check_frames(seen, chosen)
+        pixels, velocity = pixel_frames(seen, chosen)
+        assert seen.subject.shape is not None
+        model = seen.subject.shape.parameters
+        bundle = fit_body_and_cameras(
+            model, rig, pixels, velocity, [seen.motion.state(int(f)) for f in chosen], seen.subject.shape.theta, prior,
+            static=static, x_static=static_start(rig, static),
+        )  # fmt: skip
+        change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))
+        rig, offsets = bundle.rig, offsets + bundle.offsets
+        offsets = offsets - offsets[0]
+        if change[0] < _SETTLED and change[1] * seen.motion.rate < _SETTLED_FRAMES:
+            break
+    step("refining", rounds, rounds + 1)
+    covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, velocity, prior, static)
+    rig, rule = gauge(rig, seen)
+    last = _sight(rig, keypoints, body, accuracy, up, offsets)
+    assert first is not None
+    changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
+    step("refining", rounds + 1, rounds + 1)
+    _check_result(rig, changes, distance)
+    left = _static_residuals(rig, static, names)
+    return Refinement(
+        rig, dict(zip(rig.names, offsets.tolist(), strict=True)), changes, rule, chosen,
+        all(c.uncertainty <= SURE_PX for c in changes.values()), last.motion, distance, left, from_scratch,
+    )  # fmt: skip
+
+
+def _sight(
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, accuracy: float, up: str, offsets: NDArray
+) -> Sighting:
+    try:
+        late = dict(zip(rig.names, offsets.tolist(), strict=True))
+        return sight(rig, keypoints, body, accuracy=accuracy, up=up, offsets=late)
+    except TrackingError as error:
+        raise CalibrationError(
+            f"the cameras agree on nobody ({error.problem})",
+            remedy="Check that the calibration is of this recording and that no two cameras are exchanged; "
+            "`kinefit calibrate people` needs no poses of the cameras at all.",
+        ) from error
+
+
+def static_start(rig: Rig, static: PointPixels) -> NDArray:
+    """(P, 3) [m] static points triangulated with a rig."""
+    count = int(static.point.max(initial=-1)) + 1
+    uv = np.full((count, len(rig), 2), np.nan)
+    uv[static.point, static.camera] = static.uv
+    return triangulate(rig, uv)
+
+
+def _static_residuals(rig: Rig, static: PointPixels, names: tuple[str, ...]) -> dict[str, float]:
+    x, out = static_start(rig, static), {}
+    for p, name in enumerate(names):
+        mine = static.point == p
+        seen = zip(static.camera[mine], static.uv[mine], strict=True)
+        out[name] = float(np.median([np.linalg.norm(rig.cameras[c].project(x[p]) - uv) for c, uv in seen]))
+    return out
+
+
+def _in_old_frame(
+    rig: Rig, old: Rig, seen: Sighting, static: StaticPoints, height: float | None, known_length: Length | None
+) -> tuple[Rig, str]:
+    """The rig in the old frame and with the right scale, and the rule in words."""
+    rule = "The world is the old calibration's: all cameras together stay as near as they can to where they were"
+    if known_length is not None:
+        a, b, metres = known_length
+        names, pixels = static_pixels(rig, static, _STATIC_SIGMA)
+        if a in names and b in names:
+            x = static_start(rig, pixels)
+            length = float(np.linalg.norm(x[names.index(a)] - x[names.index(b)]))
+        else:
+            length = length_of(seen, a, b)
+        text = f", and {a} to {b} is {metres:g} m long"
+    elif height is not None and seen.motion.body.stature > 0:
+        length, metres = seen.motion.body.stature, height
+        text = f", and the person is {height:g} m tall"
+    else:
+        return aligned(rig, old)[0], f"{rule}, in place, turn and scale."
+    return aligned(resized(rig, metres / length), old, scale=False)[0], f"{rule} in place and turn{text}."
+
+
+def length_of(seen: Sighting, a: str, b: str) -> float:
+    """[m] median distance between two keypoints of the person as tracked."""
+    x = seen.motion.positions(seen.channels.with_points(seen.motion.body).points.select((a, b)))
+    return float(np.median(np.linalg.norm(x[:, 0] - x[:, 1], axis=1)))
+
+
+def check_input(
+    rig: Rig, keypoints: Sequence[Keypoints], height: float | None, known_length: Length | None,
+    static: StaticPoints | None = None,
+) -> None:  # fmt: skip
+    """Refuse what cannot be before any work is done."""
+    unseen = [name for name in rig.names if name not in {k.camera for k in keypoints}]
+    if len(rig) < 2 or unseen:
+        raise CalibrationError(
+            f"no keypoints of camera {', '.join(unseen)}" if unseen else "one camera alone cannot be refined",
+            remedy="Give keypoints of every camera, and two cameras or more.",
+        )
+    if len({(len(k), k.rate) for k in keypoints}) > 1:
+        told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
+        raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
+    if height is not None and not 0.3 < height < 3.0:
+        raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
+    if known_length is not None and not 1e-3 < known_length[2] < 100.0:
+        raise ObservationError(f"a length of {known_length[2]:g} m", remedy="Give it in metres.")
+    for name, views in (static or {}).items():
+        flat = np.array(list(views.values()), float)
+        if len(views) < 2 or flat.shape != (len(views), 2) or not np.isfinite(flat).all():
+            raise ObservationError(
+                f"the static point {name} is not given as (u, v) in two cameras or more",
+                remedy="Give {camera: (u, v)} in pixels of the calibration's image.",
+            )
+        for camera in views:
+            rig.index(camera)
+
+
+def _check_frames(seen: Sighting, frames: NDArray) -> None:
+    if len(frames) < _LEAST_FRAMES:
+        raise CalibrationError(
+            f"only {len(frames)} of {len(seen.motion)} frames show the person well enough to refine the cameras",
+            remedy="Record someone who walks through the whole volume for ten seconds, seen by all cameras.",
+        )
+
+
+def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float) -> None:
+    """Refuse cameras that still fit nothing, and those that the recording does not tell."""
+    wrong = [
+        name for name, c in changes.items()
+        if not c.residual_after < _IMPLAUSIBLE * float(np.hypot(*rig[name].size))
+    ]
+    if wrong:
+        told = ", ".join(f"{name} ({changes[name].residual_after:.0f} px)" for name in wrong)
+        raise CalibrationError(
+            f"refined, the body still does not lie where these cameras see it: {told}",
+            remedy="Look whether two cameras are exchanged, the calibration is of another session or the cameras are "
+            "out of step; `kinefit calibrate people` starts from no poses at all.",
+        )
+    unknown = [name for name, c in changes.items() if not c.uncertainty <= _LIMIT_PX]
+    if unknown or not distance <= _LIMIT_POINT:
+        told = ", ".join(f"{name} to {changes[name].uncertainty:.0f} px" for name in unknown)
+        told = told or f"space to {1e3 * distance:.0f} mm"
+        raise CalibrationError(
+            f"too little motion to refine: static points about the person would be known in {told}",
+            remedy="Record someone who walks through the whole volume, turns and raises the arms, seen by all cameras; "
+            "or give static points.",
+        )

@@ -1,0 +1,174 @@
+"""The result of a calibration: the rig, what changed, and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.calibration.refine.sightings import Sighting
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
+from kinefit.solvers.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
+
+SURE_PX = 3.0
+"""[px] up to which a rig is trusted: a static point about the person is seen where it says, one standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraChange:
+    """What refining did to one camera.
+
+    Parameters
+    ----------
+    residual_before, residual_after : float [px] median over its keypoints, of the body tracked.
+    bias_before, bias_after : (2,) [px] median shift, measured minus fitted.
+    turn, shift : float [rad], [m] how far it was turned and moved.
+    focal : float, change of the focal length as a share.
+    time : float [s] to add to its times.
+    turn_std, shift_std, focal_std, time_std : float
+        One standard deviation of each, in the gauge stated; 0 for what was fixed.
+    uncertainty : float [px] one standard deviation of a static point's residual, anywhere about the person.
+    """
+
+    residual_before: float
+    residual_after: float
+    bias_before: NDArray
+    bias_after: NDArray
+    turn: float
+    shift: float
+    focal: float
+    time: float
+    turn_std: float
+    shift_std: float
+    focal_std: float
+    time_std: float
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A refined rig, and how sure it is.
+
+    Parameters
+    ----------
+    rig : Rig
+    time_offsets : {camera: [s]} to add to each camera's, the first camera's being 0.
+    cameras : {camera: CameraChange}
+    gauge : str, the rule that place, turn and scale of the world keep to.
+    frames : (F,) int used.
+    confident : bool
+        A static point about the person is seen where the rig says to 3 px in every camera (one standard deviation).
+    motion : Motion as tracked with the new rig.
+    point_std : float [m] one standard deviation of where a point about the person is found to be.
+    static : {point: [px]} median residual of the static points given, triangulated with the new rig.
+    from_scratch : bool, no poses were known before; then `turn` and `shift` tell of a first guess.
+    """
+
+    rig: Rig
+    time_offsets: Mapping[str, float]
+    cameras: Mapping[str, CameraChange]
+    gauge: str
+    frames: NDArray
+    confident: bool
+    motion: Motion
+    point_std: float
+    static: Mapping[str, float]
+    from_scratch: bool = False
+
+    def told(self) -> list[str]:
+        """The result in plain words, a line each."""
+        known = f"points about the person known to {1e3 * self.point_std:.0f} mm"
+        out = [f"{len(self.frames)} frames; {known}. {self.gauge}"]
+        for name, c in self.cameras.items():
+            turn, shift = f"± {np.degrees(c.turn_std):.2f}°", f"± {1e3 * c.shift_std:.0f} mm"
+            if self.from_scratch:
+                line = f"{name}: residual {c.residual_after:.1f} px; placed {shift}, {turn}"
+            else:
+                line = (
+                    f"{name}: residual {c.residual_before:.1f} -> {c.residual_after:.1f} px; turned "
+                    f"{np.degrees(c.turn):.2f} {turn}, moved {1e3 * c.shift:.0f} {shift}"
+                )
+            if c.focal_std:
+                line += f", focal length {100 * c.focal:+.2f} ± {100 * c.focal_std:.2f} %"
+            if c.time_std or c.time:
+                line += f", clock {1e3 * c.time:+.1f} ± {1e3 * c.time_std:.1f} ms"
+            out.append(f"{line}; static points known to {c.uncertainty:.1f} px")
+        if not self.confident:
+            out.append("Not sure: more movement through the whole volume would tell the cameras better.")
+        return out
+
+
+def changes_of(
+    old: Rig, rig: Rig, first: Sighting, last: Sighting, covariance: NDArray, offsets: NDArray
+) -> tuple[dict[str, CameraChange], float]:
+    """What was done to each camera, and how far [m] a point may lie from where it is.
+
+    covariance (C · 10, C · 10) is that of the cameras' parameters.
+    """
+    clock = np.zeros((len(rig), len(covariance)))  # against the first camera's: a common delay changes nothing
+    clock[np.arange(len(rig)), np.arange(TIME, len(covariance), COLUMNS)] = 1.0
+    clock[:, TIME] -= 1.0
+    clock_std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", clock, covariance, clock), 0.0))
+    pixel, distance = expected_errors(rig, covariance, places(last.motion))
+    moved = departure(rig, old)
+    out = {}
+    for c, name in enumerate(rig.names):
+        std = np.sqrt(np.maximum(np.diag(covariance)[c * COLUMNS : (c + 1) * COLUMNS], 0.0))
+        before, after = (_left(s, c) for s in (first, last))
+        out[name] = CameraChange(
+            residual_before=float(np.median(np.linalg.norm(before, axis=-1))),
+            residual_after=float(np.median(np.linalg.norm(after, axis=-1))),
+            bias_before=np.median(before, axis=0), bias_after=np.median(after, axis=0),
+            turn=float(np.linalg.norm(moved[c, 3:6])),
+            shift=float(np.linalg.norm(rig.cameras[c].centre_world - old.cameras[c].centre_world)),
+            focal=float(np.expm1(moved[c, FOCAL])), time=float(offsets[c]),
+            turn_std=float(np.linalg.norm(std[3:6])), shift_std=float(np.linalg.norm(std[:3])),
+            focal_std=float(std[FOCAL]), time_std=float(clock_std[c]),
+            uncertainty=float(pixel[c]),
+        )  # fmt: skip
+    return out, distance
+
+
+def _left(seen: Sighting, camera: int) -> NDArray:
+    """(M, 2) [px] what a camera's keypoints left over, seen ones alone."""
+    mine = seen.residuals[:, seen.channels.camera == camera].reshape(-1, 2)
+    mine = mine[np.isfinite(mine).all(axis=1)]
+    return mine if len(mine) else np.full((1, 2), np.inf)
+
+
+def places(motion: Motion) -> NDArray:
+    """(P, 3) [m] places spread over the box that the person was in."""
+    x = motion.segment_poses()[..., :3, 3].reshape(-1, 3)
+    return np.stack(np.meshgrid(*np.linspace(x.min(axis=0), x.max(axis=0), 4).T), axis=-1).reshape(-1, 3)
+
+
+def expected_errors(rig: Rig, covariance: NDArray, x_world: NDArray) -> tuple[NDArray, float]:
+    """Median over static points (P, 3) [m] of what their triangulation is off by, one standard deviation.
+
+    covariance (C · 10, C · 10) is that of the cameras. Returns (C,) [px] the length of the residual in each camera, and
+    [m] how far the point lies from where it is.
+    """
+    J_camera = np.stack([camera_jacobian(camera, x_world) for camera in rig], axis=1)
+    J_camera[..., TIME] = 0.0
+    J_point = np.stack([camera.project_with_jacobian(x_world)[1] for camera in rig], axis=1)
+    seen = np.isfinite(J_point).all(axis=(2, 3))
+    seen &= (seen.sum(axis=1) >= 2)[:, None]
+    J_point = np.where(seen[..., None, None], J_point, 0.0)
+    pixel, distance = np.full((len(x_world), len(rig)), np.nan), np.full(len(x_world), np.nan)
+    for p in np.flatnonzero(seen.any(axis=1)):
+        J = np.zeros((2 * len(rig), covariance.shape[0]))
+        for c in np.flatnonzero(seen[p]):
+            J[2 * c : 2 * c + 2, c * COLUMNS : (c + 1) * COLUMNS] = J_camera[p, c]
+        A = J_point[p].reshape(-1, 3)
+        to_point = -np.linalg.pinv(A) @ J
+        left = J + A @ to_point
+        variance = np.einsum("ij,jk,ik->i", left, covariance, left).reshape(-1, 2).sum(axis=1)
+        pixel[p, seen[p]] = np.sqrt(np.maximum(variance, 0.0))[seen[p]]
+        distance[p] = np.sqrt(max(np.trace(to_point @ covariance @ to_point.T), 0.0))
+    known = np.isfinite(pixel).any(axis=0)
+    out = np.full(len(rig), np.inf)
+    out[known] = np.nanmedian(pixel[:, known], axis=0)
+    return out, float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.inf

@@ -1,0 +1,200 @@
+"""What a rig saw of one person, put right by tracking: the measurements that a bundle adjustment takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
+from kinefit.multiview.association import choose_people
+from kinefit.observations import Keypoints
+from kinefit.sensors.channels import Channels, make_channels
+from kinefit.solvers.cameras import PointPixels
+from kinefit.solvers.shape import PixelFrames
+from kinefit.subject.keypoints import Subject, fit_subject
+from kinefit.tracking.video import track
+
+Progress = Callable[[str, int, int], None]
+
+_INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
+_TRACKED = 0.3  # quality of a frame that counts
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One person as tracked with a rig.
+
+    Parameters
+    ----------
+    channels : Channels of the generic body's points.
+    subject : Subject
+    motion : Motion
+    uv : (F, N, 2) [px] with left and right put right, NaN where unseen.
+    confidence : (F, N) of them.
+    """
+
+    channels: Channels
+    subject: Subject
+    motion: Motion
+    uv: NDArray
+    confidence: NDArray
+
+    @property
+    def residuals(self) -> NDArray:
+        """(F, N, 2) [px] measured minus fitted."""
+        return np.concatenate([self.motion.residuals[name].values for name in self.channels.sources], axis=1)
+
+    @property
+    def weights(self) -> NDArray:
+        """(F, N) robust weight in 0..1."""
+        return np.concatenate([self.motion.residuals[name].weights for name in self.channels.sources], axis=1)
+
+    @property
+    def trusted(self) -> NDArray:
+        """(F, N, 2) [px] residuals of what is no outlier; else NaN."""
+        return np.where((self.weights > _INLIER)[..., None], self.residuals, np.nan)
+
+
+def one_person(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Keypoints]:
+    """The keypoints of the person to follow alone."""
+    people = choose_people(rig, keypoints)
+    out = []
+    for record, person in zip(keypoints, people, strict=True):
+        frames, there = np.arange(len(record)), (person >= 0)[:, None]
+        if record.points.shape[1] == 0:
+            out.append(record)
+            continue
+        points = np.where(there[..., None], record.points[frames, np.maximum(person, 0)], np.nan)
+        confidence = np.where(there, record.confidence[frames, np.maximum(person, 0)], 0.0)
+        out.append(replace(record, points=points[:, None], confidence=confidence[:, None]))
+    return out
+
+
+def shifted(record: Keypoints, offset: float) -> Keypoints:
+    """One person's keypoints at times `offset` [s] earlier in the record: what a camera whose clock is late saw.
+
+    Frame f becomes what was seen at f − offset · rate, linear between two frames that both saw the point.
+    """
+    if offset == 0.0:
+        return record
+    at = np.arange(len(record)) - offset * record.rate
+    low = np.floor(at + 1e-9).astype(int)
+    share = np.clip(at - low, 0.0, 1.0)[:, None, None]
+    inside = (low >= 0) & (low + (share[:, 0, 0] > 1e-6) < len(record))
+    a, b = np.clip(low, 0, len(record) - 1), np.clip(low + 1, 0, len(record) - 1)
+    b = np.where(share[:, 0, 0] > 1e-6, b, a)
+    points = (1 - share[..., None]) * record.points[a] + share[..., None] * record.points[b]
+    confidence = np.minimum(record.confidence[a], record.confidence[b])
+    points = np.where(inside[:, None, None, None], points, np.nan)
+    confidence = np.where(inside[:, None, None] & np.isfinite(points).all(axis=-1), confidence, 0.0)
+    return replace(record, points=points, confidence=confidence)
+
+
+def sight(
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, *, accuracy: float, up: str,
+    offsets: Mapping[str, float], progress: Progress | None = None,
+) -> Sighting:  # fmt: skip
+    """Track one person with a rig whose cameras' clocks are late by `offsets` [s]."""
+    alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
+    channels = make_channels(body, rig, alone, choose_people(rig, alone), [accuracy] * len(alone))
+    subject = fit_subject(body, channels)
+    motion = track(
+        rig, alone, body, accuracy=accuracy, subject=subject, up=up, smooth=False, progress=progress
+    )
+    uv = np.concatenate([motion.residuals[name].measured for name in channels.sources], axis=1)
+    own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)
+    confidence = np.where(own, channels.confidence, channels.confidence[:, channels.partner])
+    return Sighting(channels, subject, motion, uv, np.where(np.isfinite(uv).all(axis=-1), confidence, 0.0))
+
+
+def spread_frames(sighting: Sighting, most: int) -> NDArray:
+    """Frames with a trusted pose, spread evenly over the take."""
+    good = np.flatnonzero(sighting.motion.quality > _TRACKED)
+    return good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).astype(int))] if len(good) else good
+
+
+def pixel_frames(sighting: Sighting, frames: NDArray) -> tuple[PixelFrames, NDArray]:
+    """Measurements of some frames, and the pixels' velocities (F, N, 2) [px/s].
+
+    Errors of a detector's points on one segment in one view come together (a hidden shoulder, a blurred face): n points
+    of correlation ρ tell as much as n / (1 + (n − 1) ρ) of them (the design effect: L. Kish, Survey sampling, 1965),
+    with the ρ that the residuals show.
+    """
+    c = sighting.channels
+    group = _groups(sighting)
+    share = 1.0 / (1.0 + (np.bincount(group)[group] - 1) * togetherness(sighting))
+    weight = sighting.confidence / np.square(c.sigma)
+    return (
+        PixelFrames(c.points, c.camera, c.column, np.nan_to_num(sighting.uv[frames]), weight[frames], share),
+        velocities(sighting)[frames],
+    )
+
+
+def _groups(sighting: Sighting) -> NDArray:
+    """(N,) int: channels of one source on one segment."""
+    c = sighting.channels
+    key = c.source * len(sighting.motion.body.tree.segments) + c.points.segments[c.column]
+    return np.unique(key, return_inverse=True)[1]
+
+
+def togetherness(sighting: Sighting) -> float:
+    """Correlation, 0..1, of the residuals of points on one segment in one view."""
+    values = sighting.trusted
+    seen = np.isfinite(values).all(axis=-1)
+    values, group = np.where(seen[..., None], values, 0.0), _groups(sighting)
+    member = (group[:, None] == np.arange(group.max(initial=0) + 1)).astype(float)
+    count, square = seen @ member, np.sum(values**2, axis=-1) @ member
+    total = np.einsum("fnd,ng->fgd", values, member)
+    cross, pairs = np.sum(total**2, axis=-1) - square, count * (count - 1)
+    power = square.sum(axis=0) / np.maximum(count.sum(axis=0), 1)
+    expected = float(np.sum(pairs * power))
+    return float(np.clip(cross.sum(where=count > 1) / expected, 0.0, 1.0)) if expected > 0 else 0.0
+
+
+def velocities(sighting: Sighting) -> NDArray:
+    """(F, N, 2) [px/s] of every channel's point as tracked; 0 where it cannot be seen."""
+    c, motion = sighting.channels, sighting.motion
+    x = motion.positions(c.with_points(motion.body).points)
+    x_dot = np.gradient(x, 1.0 / motion.rate, axis=0) if len(x) > 1 else np.zeros_like(x)
+    out = np.zeros(sighting.uv.shape)
+    for k, camera in enumerate(c.rig):
+        mine = c.camera == k
+        _, J = camera.project_with_jacobian(x[:, c.column[mine]])
+        out[:, mine] = (J @ x_dot[:, c.column[mine]][..., None])[..., 0]
+    return np.nan_to_num(out)
+
+
+def static_pixels(
+    rig: Rig, points: Mapping[str, Mapping[str, tuple[float, float]]], sigma: float
+) -> tuple[tuple[str, ...], PointPixels]:
+    """Names and pixels of points that do not move, {name: {camera: (u, v)}}."""
+    names = tuple(points)
+    rows = [(rig.index(c), p, uv) for p, name in enumerate(names) for c, uv in points[name].items()]
+    return names, PointPixels(
+        np.array([r[0] for r in rows], int), np.array([r[1] for r in rows], int),
+        np.array([r[2] for r in rows], float).reshape(-1, 2), np.full(len(rows), sigma**-2),
+    )
+
+
+def correlation_time(values: NDArray) -> float:
+    """Frames in which the errors (F, N, 2) of channels forget themselves; 1 if they do at once, at most F.
+
+    Integrated autocorrelation, over lags until the mean correlation falls below zero (the initial positive sequence:
+    C. Geyer, Practical Markov chain Monte Carlo, 1992).
+    """
+    seen = np.isfinite(values).all(axis=-1)
+    x = np.where(seen[..., None], values, 0.0)
+    power = np.sum(x * x) / max(int(seen.sum()), 1)
+    total = 1.0
+    for lag in range(1, len(x)):
+        pairs = int(np.sum(seen[lag:] & seen[:-lag]))
+        rho = np.sum(x[lag:] * x[:-lag]) / pairs / power if pairs and power > 0 else 0.0
+        if rho <= 0.0:
+            break
+        total += 2.0 * rho * (1.0 - lag / len(x))
+    return float(min(total, len(x)))

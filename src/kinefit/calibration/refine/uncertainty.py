@@ -1,0 +1,66 @@
+"""How sure refined cameras are: what the residuals say of chance, and what parts of the body say of bias."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
+from kinefit.calibration.refine.sightings import Sighting, correlation_time
+from kinefit.geometry.camera import Rig
+from kinefit.solvers.body_bundle import BodyBundle, fit_body_and_cameras
+from kinefit.solvers.cameras import CameraPrior, PointPixels, departure
+from kinefit.solvers.shape import PixelFrames, ShapeParameters
+
+_FRAMES = 40  # that the parts are compared over
+
+
+def chance(bundle: BodyBundle, prior: CameraPrior, seen: Sighting, frames: NDArray) -> NDArray:
+    """Covariance (C · 10, C · 10) of the cameras for errors that come and go.
+
+    They are as large, and last as long, as the residuals without each channel's mean.
+    """
+    values = seen.trusted
+    counts = np.isfinite(values).all(axis=-1).sum(axis=0)
+    mean = np.nansum(values, axis=0) / np.maximum(counts, 1)[:, None]
+    new = min(1.0, len(values) / max(len(frames), 1) / correlation_time(values - mean))  # share of frames that are news
+    share = seen.confidence / np.square(seen.channels.sigma)
+    power = float(np.nanmean(np.sum((values - mean) ** 2, axis=-1) * share)) / 2.0
+    free = prior.freedom.ravel() > 0
+    return covariance_in_gauge(bundle.rig, bundle.S * new / max(power, 1e-12), free)
+
+
+def bias(
+    model: ShapeParameters, bundle: BodyBundle, frames: PixelFrames, velocity: NDArray, prior: CameraPrior,
+    static: PointPixels,
+) -> NDArray:  # fmt: skip
+    """Covariance (C · 10, C · 10) of the cameras for errors that stay.
+
+    A detector's points lie beside the anatomical ones, differently from each side. Grouped jackknife (M. Quenouille,
+    1956; J. Tukey, 1958): the cameras are fitted without one segment's points after the other.
+    """
+    some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_FRAMES, len(frames.uv))).astype(int))
+    owner = frames.points.segments[frames.column]
+    groups = np.unique(owner)
+
+    def fit(rig: Rig, states: Sequence[BodyState], theta: NDArray, x: NDArray, without: int | None) -> BodyBundle:
+        kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
+        part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept)
+        return fit_body_and_cameras(
+            model, rig, part, velocity[some], states, theta, prior, static=static, x_static=x,
+            offsets=bundle.offsets, max_iterations=6,
+        )
+
+    whole = fit(bundle.rig, [bundle.states[f] for f in some], bundle.theta, bundle.x_static, None)
+    away = []
+    for group in groups:
+        part = fit(whole.rig, whole.states, whole.theta, whole.x_static, int(group))
+        row = departure(aligned(part.rig, whole.rig)[0], whole.rig)
+        row[:, -1] = part.offsets - whole.offsets
+        away.append(row.ravel())
+    spread = np.array(away) - np.mean(away, axis=0)
+    return (len(groups) - 1) / len(groups) * spread.T @ spread

@@ -1,0 +1,1 @@
+"""OpenSim files."""

@@ -1,0 +1,96 @@
+"""OpenSim: landmarks over time (.trc), angles over time (.mot) and the fitted body as a model (.osim).
+
+All three stand in OpenSim's world, y up (TRC unless told otherwise). The root's coordinates are those of OpenSim's
+ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x (list) and y (rotation).
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from kinefit.bodies import Body, PointSet
+from kinefit.exporters.atomic import write_text
+from kinefit.exporters.opensim.model import model
+from kinefit.exporters.skeletons.common import UNITS, euler_zxy, length_factor, plain_names, turned
+from kinefit.motion import Motion
+
+
+def write_trc(
+    motion: Motion, path: str | PathLike[str], points: PointSet | None = None, *, unit: str = "m", up: str = "y"
+) -> None:
+    """Write points of the fitted body over time as TRC.
+
+    Parameters
+    ----------
+    motion : Motion
+    path : path
+    points : PointSet, optional
+        By default the body's landmarks, which `write_osim` puts into the model's marker set.
+    unit : "m", "cm" or "mm"
+    up : str
+        Vertical axis of the file's world, which the format does not state; OpenSim's is y.
+
+    Raises
+    ------
+    ExportError
+        Unknown unit or axis, or the file cannot be written.
+    """
+    factor = length_factor(unit, UNITS, path)
+    points = motion.body.landmarks if points is None else points
+    names = plain_names(points.names)
+    values = factor * turned(motion, up, path).positions(points).reshape(len(motion), -1) + 0.0
+    axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{motion.rate:g}\t{motion.rate:g}\t{len(motion)}\t{len(names)}\t{unit}\t{motion.rate:g}\t1\t{len(motion)}",
+        "Frame#\tTime\t" + "\t\t\t".join(names),
+        "\t" + axes,
+        "",
+    ]
+    row = "\t".join(["%d", "%.9f"] + ["%.8f"] * values.shape[1])
+    lines += [row % (i, t, *v) for i, (t, v) in enumerate(zip(motion.times.tolist(), values.tolist()), 1)]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
+    """Write the angles [deg] and the root's way [m] as MOT: the coordinates of the model that `write_osim` writes."""
+    y_up = motion.turned("y")
+    tree = motion.body.tree
+    root = np.degrees(euler_zxy(y_up.Ts_world_root[:, :3, :3]))
+    angles = np.where(tree.prismatic, motion.angles, np.degrees(motion.angles))
+    table = np.concatenate([motion.times[:, None], root, y_up.Ts_world_root[:, :3, 3], angles], axis=1) + 0.0
+    names = ["time", *root_coordinates(motion.body), *plain_names(tree.coordinates)]
+    lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}"]
+    lines += ["inDegrees=yes", "", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees."]
+    lines += ["", "endheader", "\t".join(names)]
+    row = "\t".join(["%.9f"] + ["%.8f"] * (table.shape[1] - 1))
+    lines += [row % tuple(values) for values in table.tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_osim(body: Body, path: str | PathLike[str]) -> None:
+    """Write a body as an OpenSim 4 model: joints, coordinates with limits, masses, landmarks as markers, cylinders.
+
+    The masses are the usual shares of a person of 75 kg (de Leva 1996); where a segment has no share of its own, that
+    of its surface filled with water. They are there so that the model can be used at once, not measured.
+
+    Raises
+    ------
+    ExportError
+        A joint whose axes OpenSim cannot express, or the file cannot be written.
+    """
+    document = ET.Element("OpenSimDocument", Version="40000")
+    document.append(model(body, root_coordinates(body), path))
+    ET.indent(document)
+    write_text(path, '<?xml version="1.0" encoding="UTF-8" ?>\n' + ET.tostring(document, encoding="unicode") + "\n")
+
+
+def root_coordinates(body: Body) -> list[str]:
+    """Names of the root's six coordinates, such as pelvis_tilt, pelvis_list, pelvis_rotation, pelvis_tx, _ty, _tz."""
+    root = plain_names([body.alias("opensim", body.tree.segments[0])])[0]
+    return [f"{root}_{what}" for what in ("tilt", "list", "rotation", "tx", "ty", "tz")]

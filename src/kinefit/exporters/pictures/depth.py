@@ -1,0 +1,78 @@
+"""Depth images as pictures with the body's outlines drawn on them: what a person can judge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from os import PathLike
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.exporters.atomic import writing
+from kinefit.exporters.pictures.drawing import WHITE, write_lines
+from kinefit.exporters.pictures.overlay import _encoder, nearest_frame
+from kinefit.geometry.camera import Camera
+from kinefit.motion import Motion
+from kinefit.observations import DepthVideo
+from kinefit.rendering import render_body, scaled
+
+_ABOUT = 0.6  # [m] in front of and behind the body that the colours are spread over
+_WIDTH = 640  # [px] of a picture, at least: small sensors are enlarged
+
+
+def depth_picture(
+    depth: NDArray, motion: Motion, frame: int | None, camera: Camera, *, label: str = ""
+) -> NDArray[np.uint8]:
+    """One depth image, near red and far blue, with the outlines of all segments; holes are black.
+
+    Parameters
+    ----------
+    depth : (H, W) [m], 0 where nothing was measured
+    frame : int or None, of the motion
+    camera : Camera of the depth images
+
+    Returns
+    -------
+    (H, W, 3) uint8 RGB, enlarged by a whole factor to 640 pixels of width where the image is smaller
+    """
+    depth = np.asarray(depth, np.float32)
+    times = max(-(-_WIDTH // depth.shape[1]), 1)
+    large = scaled(camera, float(times))
+    middle = float(np.median(depth[depth > 0])) if (depth > 0).any() else 2.0
+    raster = None
+    if frame is not None:
+        raster = render_body(motion.body, motion.state(frame), large)
+        middle = float(np.median(raster.depth[raster.seen])) if raster.seen.any() else middle
+    shade = np.clip((middle + _ABOUT - depth) / (2.0 * _ABOUT), 0.0, 1.0)
+    picture = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    picture = np.where((depth > 0)[..., None], picture, 0).astype(np.uint8)
+    out = np.ascontiguousarray(np.repeat(np.repeat(picture, times, axis=0), times, axis=1))
+    if raster is not None:
+        part = raster.segment
+        out[1:][part[1:] != part[:-1]] = WHITE
+        out[:, 1:][part[:, 1:] != part[:, :-1]] = WHITE
+    if label:
+        write_lines(out, [(label, WHITE)])
+    return out
+
+
+def write_depth_overlay(
+    motion: Motion, camera: Camera, depth: DepthVideo, path: str | PathLike[str], *,
+    progress: Callable[[int], None] | None = None,
+) -> None:  # fmt: skip
+    """Write a video of every depth image with the fitted body's outlines.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    height, width = (n - n % 2 for n in depth_picture(depth.frame(0).depth, motion, None, camera).shape[:2])
+    with writing(path) as temporary, _encoder(path, temporary, depth.rate, width, height) as encode:
+        for i, time in enumerate(depth.times):
+            at = nearest_frame(motion, float(time))
+            label = f"{camera.name}   frame {i}" + ("" if at is not None else "   no motion here")
+            encode(depth_picture(depth.frame(i).depth, motion, at, camera, label=label)[:height, :width])
+            if progress:
+                progress(i + 1)

@@ -1,0 +1,106 @@
+"""Drawing on images: bones seen by a camera, keypoints, writing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.exporters.skeletons.tubes import side_colour
+from kinefit.geometry.camera import Camera, ImageFrame
+from kinefit.motion import Motion, Residuals
+
+LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
+MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
+OUTLIER_WEIGHT = 0.05
+_SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
+_SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+
+
+@lru_cache(maxsize=8)
+def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, int], ...]]:
+    """Bones of a body: end points as a PointSet of (2 B) points (from, to, from, to ...), owners (B,), colours (B,).
+
+    From every joint to the joints of its children; from the last joint of a limb to the end of its surface.
+    """
+    tree, ends = body.tree, body.segment_ends()
+    owners, points, colours = [], [], []
+    for s, name in enumerate(tree.segments):
+        children = np.flatnonzero(tree.parents == s)
+        tips = [(tree.offsets[c], tree.segments[c]) for c in children]
+        if not tips and s in ends:
+            tips = [(ends[s], name)]
+        for tip, side in tips:
+            owners.append(s)
+            points += [np.zeros(3), tip]
+            colours.append(side_colour(side))
+    names = tuple(f"{tree.segments[s]}_{k}" for s in owners for k in (0, 1))
+    return PointSet(names, np.repeat(owners, 2), np.array(points)), tuple(owners), tuple(colours)
+
+
+def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
+    """Draw the fitted skeleton into an image (H, W, 3) uint8 RGB, far bones first; thicker the nearer."""
+    points, owners, colours = bones(motion.body)
+    ends = motion.body.positions(motion.state(frame), points).reshape(-1, 2, 3)
+    lines = ends[:, :1] * (1 - _SAMPLES) + ends[:, 1:] * _SAMPLES  # (B, samples, 3)
+    uv = image_frame.from_calibration(camera.project(lines))
+    depth = ends.mean(1) @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    px_per_metre = camera.matrix[0, 0] * float(np.mean(image_frame.scale)) / np.maximum(depth, 1e-3)
+    thick = np.clip(np.rint(0.022 * px_per_metre), 2, 24).astype(int)
+    edge = max(1, round(image.shape[0] / 900))
+    for b in np.argsort(-depth):
+        lost = motion.segment_quality[frame, owners[b]] <= 0
+        width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
+        _line(image, uv[b], DARK, width + 2 * edge)
+        _line(image, uv[b], LOST if lost else colours[b], width)
+    for b in range(len(uv)):
+        _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
+
+
+def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame: ImageFrame) -> None:
+    """Draw measured keypoints (rings; red crosses where they were left out) and the way to the fitted ones."""
+    measured = image_frame.from_calibration(residuals.measured[frame])
+    fitted = image_frame.from_calibration(residuals.measured[frame] - residuals.values[frame])
+    size = max(2.5, image.shape[0] / 320)
+    thin = max(1, round(size / 3))
+    for k in np.flatnonzero(np.isfinite(measured).all(-1)):
+        outlier = residuals.weights[frame, k] < OUTLIER_WEIGHT
+        if np.isfinite(fitted[k]).all() and not outlier:
+            _line(image, np.stack([measured[k], fitted[k]]), WAY, thin)
+        if outlier:
+            for way in ((1, 1), (1, -1)):
+                step = size * np.array(way)
+                _line(image, np.stack([measured[k] - step, measured[k] + step]), DARK, thin + 2)
+                _line(image, np.stack([measured[k] - step, measured[k] + step]), OUTLIER, thin)
+        else:
+            _dot(image, measured[k], size, DARK, thin + 2)
+            _dot(image, measured[k], size, MEASURED, thin)
+
+
+def write_lines(image: NDArray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
+    """Write lines of text, each with its colour, on a darkened ground at the upper left."""
+    scale = max(0.35, min(image.shape[0] / 1920, image.shape[1] / 1080) * 1.25)
+    thick, pad = max(1, round(2 * scale)), round(16 * scale)
+    sizes = [cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)[0] for text, _ in lines]
+    step = max(h for _, h in sizes) + pad
+    ground = image[: step * len(lines) + pad, : max(w for w, _ in sizes) + 2 * pad]
+    ground[:] = ground // 3
+    for i, (text, colour) in enumerate(lines, 1):
+        cv2.putText(image, text, (pad, step * i), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick, cv2.LINE_AA)
+
+
+def _line(image: NDArray, uv: NDArray, colour: tuple[int, int, int], thickness: int) -> None:
+    seen = np.isfinite(uv).all(-1) & (np.abs(uv) < _FAR).all(-1)
+    if seen.sum() >= 2:
+        points = np.rint(uv[seen] * (1 << _SHIFT)).astype(np.int32)
+        cv2.polylines(image, [points], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+    if np.isfinite(uv).all() and (np.abs(uv) < _FAR).all():
+        x, y, r = (round(float(v) * (1 << _SHIFT)) for v in (uv[0], uv[1], radius))
+        cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SHIFT)

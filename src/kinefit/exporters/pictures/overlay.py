@@ -1,0 +1,212 @@
+"""Overlay videos: the fitted skeleton, the keypoints and what is between them, on the pictures of a camera."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from os import PathLike
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import write_bytes, writing
+from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_bones, draw_residuals, write_lines
+from kinefit.geometry.camera import Camera, ImageFrame
+from kinefit.motion import Motion, Residuals
+from kinefit.readers.video import Video
+
+_NOTE = (255, 200, 60)
+_CODECS = {"libx264": {"preset": "superfast", "crf": "21"}, "mpeg4": {"qscale": "3"}}
+
+
+def write_overlay(
+    motion: Motion,
+    camera: Camera,
+    video: Video,
+    path: str | PathLike[str],
+    *,
+    image_frame: ImageFrame | None = None,
+    residuals: Residuals | None = None,
+    time_offset: float = 0.0,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Write a video (H.264 where the codec is there, else MPEG-4) of every picture with the fit drawn on it.
+
+    Left is blue, right orange, the middle green, a lost segment thin and grey; measured keypoints are yellow rings,
+    those left out as outliers red crosses; pink lines lead to the fitted keypoints.
+
+    Parameters
+    ----------
+    motion : Motion
+    camera : Camera
+    video : Video
+    path : path
+    image_frame : ImageFrame, optional
+        From the camera's calibration to the video's pictures; by default they are the same.
+    residuals : Residuals, optional
+        By default those that the motion holds under the camera's name.
+    time_offset : float [s]
+        Added to frame / rate to get the time of the take.
+    progress : callable, optional
+        Called with the number of pictures done.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    width, height = (side - side % 2 for side in video.size)  # the encoder wants even sides
+    with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
+        for i, image in enumerate(video.frames()):
+            frame = nearest_frame(motion, i / video.rate + time_offset)
+            drawn = draw_overlay(
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}"
+            )
+            encode(drawn[:height, :width])
+            if progress:
+                progress(i + 1)
+
+
+def nearest_frame(motion: Motion, time: float) -> int | None:
+    """Frame of a motion nearest to a time [s], None where there is none within one frame."""
+    if not len(motion):
+        return None
+    i = int(np.argmin(np.abs(motion.times - time)))
+    return i if abs(motion.times[i] - time) < 1.0 / motion.rate else None
+
+
+def draw_overlay(
+    image: NDArray[np.uint8],
+    motion: Motion,
+    frame: int | None,
+    camera: Camera,
+    *,
+    image_frame: ImageFrame | None = None,
+    residuals: Residuals | None = None,
+    label: str | None = None,
+) -> NDArray[np.uint8]:
+    """One picture with the fit drawn on it.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 RGB; left as it is.
+    motion, camera, image_frame, residuals : see `write_overlay`.
+    frame : frame of the motion, None for a picture outside of it.
+    label : str, optional
+        By default the number of the frame.
+
+    Returns
+    -------
+    (H, W, 3) uint8 RGB
+    """
+    out = np.array(image, order="C")
+    image_frame = image_frame or ImageFrame.identity()
+    residuals = motion.residuals.get(camera.name) if residuals is None else residuals
+    if residuals is not None and residuals.unit != "px":
+        residuals = None
+    lines = [(f"{camera.name}   {label or f'frame {frame}'}", WHITE)]
+    if frame is None:
+        write_lines(out, [*lines, ("no motion here", _NOTE)])
+        return out
+    draw_bones(out, motion, frame, camera, image_frame)
+    if residuals is not None:
+        draw_residuals(out, residuals, frame, image_frame)
+        lines.append((_told(residuals, frame), WHITE))
+    write_lines(out, lines + [(note, _NOTE) for note in _notes(motion, residuals, frame)])
+    return out
+
+
+def write_montage(
+    images: Mapping[str, NDArray[np.uint8]], path: str | PathLike[str], *, height: int = 960, gap: int = 8
+) -> None:
+    """Write pictures {name: (H, W, 3) uint8 RGB} side by side as one PNG (or .jpg), all `height` px tall.
+
+    Raises
+    ------
+    ExportError
+        No pictures, or the file cannot be written.
+    """
+    if not images:
+        raise ExportError("there are no pictures to put side by side", file=path)
+    row: list[NDArray] = []
+    for image in images.values():
+        size = (max(1, round(image.shape[1] * height / image.shape[0])), height)
+        row += [np.full((height, gap, 3), 255, np.uint8), cv2.resize(image, size, interpolation=cv2.INTER_AREA)]
+    suffix = ".jpg" if str(path).lower().endswith((".jpg", ".jpeg")) else ".png"
+    written, data = cv2.imencode(suffix, cv2.cvtColor(np.concatenate(row[1:], axis=1), cv2.COLOR_RGB2BGR))
+    if not written:
+        raise ExportError("the picture cannot be encoded", file=path, remedy="Give a name that ends in .png.")
+    write_bytes(path, data.tobytes())
+
+
+def _told(residuals: Residuals, frame: int) -> str:
+    norms = residuals.norms[frame]
+    seen = np.isfinite(norms)
+    used = seen & (residuals.weights[frame] >= OUTLIER_WEIGHT)
+    if not seen.any():
+        return "no keypoints"
+    text = f"residual: median {np.median(norms[seen]):.1f}, mean {np.mean(norms[seen]):.1f} px, {used.sum()} points"
+    return text + (f", {int((seen & ~used).sum())} left out" if (seen & ~used).any() else "")
+
+
+def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]:
+    notes = []
+    if residuals is not None and residuals.swapped[frame]:
+        notes.append("left and right were taken for each other: put right")
+    if motion.quality[frame] <= 0:
+        return [*notes, "not tracked"]
+    lost = [name for name, q in zip(motion.body.tree.segments, motion.segment_quality[frame]) if q <= 0]
+    if lost:
+        notes.append("lost: " + ", ".join(lost[:4]) + (f" and {len(lost) - 4} more" if len(lost) > 4 else ""))
+    return notes
+
+
+class _encoder:
+    """Context that gives a function to encode one picture (H, W, 3) after the other."""
+
+    def __init__(self, path: Any, temporary: Any, rate: float, width: int, height: int) -> None:
+        self.path, self.temporary = path, temporary
+        self.codec = next((name for name in _CODECS if name in av.codecs_available), None)
+        self.rate, self.size = Fraction(rate).limit_denominator(10000), (width, height)
+        self.container: Any = None
+
+    def __enter__(self) -> Callable[[NDArray], None]:
+        if self.codec is None:
+            raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=self.path)
+        self.container = _told_by_system(av.open, str(self.temporary), "w")
+        self.stream = self.container.add_stream(self.codec, rate=self.rate, options=_CODECS[self.codec])
+        self.stream.width, self.stream.height = self.size
+        self.stream.pix_fmt = "yuv420p"
+        return self._encode
+
+    def _encode(self, image: NDArray) -> None:
+        planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)  # four times as fast as FFmpeg's
+        frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        for packet in self.stream.encode(frame):
+            _told_by_system(self.container.mux, packet)
+
+    def __exit__(self, kind: Any, error: Any, at: Any) -> None:
+        if kind is not None:
+            try:
+                self.container.close()
+            except (av.FFmpegError, OSError, ValueError):
+                pass  # the first error is the one to tell
+            return
+        for packet in self.stream.encode():
+            _told_by_system(self.container.mux, packet)
+        _told_by_system(self.container.close)
+
+
+def _told_by_system(call: Callable, *args: Any) -> Any:
+    """The call; FFmpeg's errors become the system's, a muxer that cannot go on counts as a full disk."""
+    try:
+        return call(*args)
+    except OSError:
+        raise
+    except av.FFmpegError as error:
+        raise OSError(error.errno or errno.EIO, str(error.strerror or error)) from error

@@ -1,0 +1,288 @@
+"""Angles over time with their error bars and over the cycle, one plot for each joint, left and right together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.exporters.opensim.files import root_coordinates
+from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
+from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
+from kinefit.exporters.skeletons.common import euler_zxy
+from kinefit.motion import Motion
+
+MOST = 1000  # points of a curve; the page is about as many pixels wide
+_COLOURS = {"left": LEFT, "right": RIGHT, "": CENTRE}
+_ROW, _GREY = 190, "#8a949e"  # [px] height of one plot
+
+# In the humanoid's order of interest; a joint that is not here keeps its own name and comes last.
+_JOINTS = {
+    "hip": "Hip", "knee": "Knee", "ankle": "Ankle", "mtp": "Toes", "pelvis": "Pelvis", "back": "Lower back",
+    "thoracic": "Upper back", "neck": "Neck", "sternoclavicular": "Collarbone", "shoulder": "Shoulder",
+    "elbow": "Elbow and forearm", "wrist": "Wrist",
+}  # fmt: skip
+
+_POSITIVE = {
+    "hip_flexion": "thigh forward", "hip_adduction": "towards the middle", "hip_rotation": "inwards",
+    "knee_angle": "flexion", "ankle_angle": "toes up", "subtalar_angle": "inversion", "mtp_angle": "toes up",
+    **{f"{part}_extension": "backward" for part in ("lumbar", "thorax", "neck")},
+    **{f"{part}_bending": "to the right" for part in ("lumbar", "thorax", "neck")},
+    **{f"{part}_rotation": "to the left" for part in ("lumbar", "thorax", "neck", "pelvis")},
+    "clav_prot": "shoulder forward", "clav_elev": "shoulder up", "arm_flex": "forward", "arm_add": "towards the middle",
+    "arm_rot": "inwards", "elbow_flex": "flexion", "pro_sup": "pronation", "wrist_flex": "flexion",
+    "wrist_dev": "towards the little finger", "pelvis_tilt": "backward", "pelvis_list": "right side down",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One coordinate over time, as OpenSim calls it: values and standard deviations (F,) in `unit`."""
+
+    name: str
+    joint: str
+    side: str  # "left", "right" or ""
+    unit: str
+    values: NDArray
+    std: NDArray
+
+    @property
+    def stem(self) -> str:
+        """Name without the side."""
+        return self.name[:-2] if self.side else self.name
+
+
+def curves(motion: Motion) -> list[Curve]:
+    """All coordinates: the root's as OpenSim's ground_pelvis joint has them, y up, then the angles; without jumps."""
+    tree, y_up = motion.body.tree, motion.turned("y")
+    names = root_coordinates(motion.body)
+    turns, turns_std = _root_turns(y_up)
+    out = []
+    if tree.root_free:
+        columns = [*turns.T, *y_up.Ts_world_root[:, :3, 3].T]
+        stds = [*turns_std.T, *y_up.dof_std[:, :3].T]
+        units = ["deg"] * 3 + ["m"] * 3
+        out = [Curve(n, "pelvis", "", u, c, s) for n, u, c, s in zip(names, units, columns, stds)]
+    for d, name in enumerate(tree.coordinates):
+        slides = bool(tree.prismatic[d])
+        values, std = motion.angles[:, d], motion.dof_std[:, 6 + d]
+        if not slides:
+            values, std = np.degrees(np.unwrap(values)), np.degrees(std)
+        side, joint = _side(name), motion.body.joints[tree.owners[d]]
+        out.append(Curve(name, joint[:-2] if _side(joint) else joint, side, "m" if slides else "deg", values, std))
+    return out
+
+
+def joint_plots(motion: Motion) -> dict[str, Html]:
+    """{joint: plot} of all coordinates over time with bands of ±2 standard deviations."""
+    out = {}
+    for joint, rows in _by_joint(curves(motion)).items():
+        traces: list[dict] = []
+        ranges = []
+        for row, sides in enumerate(rows.values()):
+            for curve in sides:
+                traces += _over_time(curve, motion.times, row, sides[0].side in ("left", "right"))
+            ranges.append(_range(sides))
+        out[joint] = _stacked(traces, list(rows.values()), "time [s]", ranges, seeks=True)
+    return out
+
+
+def cycle_plots(motion: Motion, cycles: Cycles) -> dict[str, Html]:
+    """{joint: plot} of all coordinates over the cycle: mean, ±1 standard deviation, few cycles singly."""
+    spans = {side.name: side.spans for side in cycles.sides}
+    other = next(iter(spans))  # of the middle of the body: the cycles of this side
+    marks = {s.name: float(np.nanmean(s.toe_off)) for s in cycles.sides if np.isfinite(s.toe_off).any()}
+    out = {}
+    found = [c for c in curves(motion) if not c.name.endswith(("_tx", "_tz"))]  # the way over ground is no cycle
+    for joint, rows in _by_joint(found).items():
+        traces: list[dict] = []
+        shown: dict[str, list[Curve]] = {}
+        for stem, sides in rows.items():
+            usable = [c for c in sides if c.side in spans or not c.side or "both" in spans]
+            if not usable:
+                continue
+            for curve in usable:
+                side = curve.side if curve.side in spans else other
+                values = normalised(curve.values, spans[side])
+                traces += _over_cycle(curve, values, len(shown), "" if side == "both" else side + " ")
+            shown[stem] = usable
+        if shown:
+            of = {c.side or other for sides in shown.values() for c in sides}
+            lines = [_mark(at, _COLOURS[side]) for side, at in marks.items() if side in of]
+            out[joint] = _stacked(traces, list(shown.values()), "cycle [%]", [None] * len(shown), shapes=lines)
+    return out
+
+
+def thinned(values: NDArray, most: int = MOST) -> NDArray:
+    """Frames that keep the shape of a curve (F,): the lowest and highest value of each of `most` / 2 equal parts."""
+    if len(values) <= most:
+        return np.arange(len(values))
+    parts = np.array_split(np.arange(len(values)), most // 2)
+    ends = [p[k] for p in parts for k in (np.argmin(values[p]), np.argmax(values[p]))]
+    return np.unique([0, *ends, len(values) - 1])
+
+
+def _side(name: str) -> str:
+    return {"_l": "left", "_r": "right"}.get(name[-2:], "")
+
+
+def _by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
+    order = list(_JOINTS)
+    joints = dict.fromkeys(sorted({c.joint for c in found}, key=lambda j: order.index(j) if j in order else len(order)))
+    out: dict[str, dict[str, list[Curve]]] = {}
+    for joint in joints:
+        rows: dict[str, list[Curve]] = {}
+        for curve in found:
+            if curve.joint == joint:
+                rows.setdefault(curve.stem, []).append(curve)
+        out[_JOINTS.get(joint, joint)] = rows
+    return out
+
+
+def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:
+    """Tilt, list and rotation (F, 3) [deg] with their standard deviations, from those of a turn about the world's axes.
+
+    R = Rz Rx Ry, so ω = z ż + Rz x ẋ + Rz Rx y ẏ; the three errors are taken as independent.
+    """
+    angles = euler_zxy(y_up.Ts_world_root[:, :3, :3])
+    if not len(angles):
+        return angles, angles
+    c, s = np.cos(angles), np.sin(angles)
+    J = np.zeros((len(angles), 3, 3))
+    J[:, 2, 0] = 1
+    J[:, 0, 1], J[:, 1, 1] = c[:, 0], s[:, 0]
+    J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = -s[:, 0] * c[:, 1], c[:, 0] * c[:, 1], s[:, 1]
+    known = np.isfinite(y_up.dof_std[:, 3:6]).all(axis=1) & (np.abs(c[:, 1]) > 1e-3)
+    std = np.full((len(angles), 3), np.inf)
+    std[known] = np.sqrt((np.linalg.inv(J[known]) ** 2 @ y_up.dof_std[known, 3:6, None] ** 2)[..., 0])
+    return np.degrees(np.unwrap(angles, axis=0)), np.degrees(std)
+
+
+def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dict]:
+    at = thinned(curve.values)
+    ends = np.append(at[1:], len(curve.values))
+    std = np.array([curve.std[a:b].max() for a, b in zip(at, ends)]) if len(at) < len(curve.std) else curve.std
+    t, values, known = times[at], curve.values[at], np.isfinite(std)
+    name, colour = curve.side or "middle", _COLOURS[curve.side]
+    axes = _axes(row)
+    band_t, band = _band(t, values, np.where(known, 2 * std, np.nan))
+    out: list[dict] = []
+    if len(band_t):
+        out.append(_filled(band_t, band, colour, name, axes))
+    told = np.where(known, 2 * std, 0)
+    line = {"x": t, "mode": "lines" if len(t) > 2 else "markers", "name": name, "legendgroup": name, **axes}
+    if known.any():
+        out.append(line | {
+            "y": np.where(known, values, np.nan), "line": {"color": colour, "width": 1.8}, "customdata": told,
+            "hovertemplate": f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}<extra></extra>",
+            "showlegend": legend and row == 0,
+        })  # fmt: skip
+    if not known.all():
+        near = ~known
+        near[:-1] |= ~known[1:]
+        near[1:] |= ~known[:-1]
+        dash = {"left": "dot", "right": "dash"}.get(curve.side, "dot")
+        out.append(line | {
+            "y": np.where(near, values, np.nan), "line": {"color": _GREY, "width": 1.4, "dash": dash},
+            "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}, not observed<extra></extra>", "showlegend": False,
+        })  # fmt: skip
+    return out
+
+
+def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
+    name, colour, axes = curve.side or "middle", _COLOURS[curve.side], _axes(row)
+    mean, out = values.mean(axis=0), []
+    if len(values) >= 3:
+        sd = values.std(axis=0, ddof=1)
+        out.append(_filled(*_band(PERCENT, mean, sd), colour, name, axes))
+    if len(values) <= 8:
+        for cycle in values:
+            out.append({
+                "x": PERCENT, "y": cycle, "mode": "lines", "line": {"color": colour, "width": 0.8}, "opacity": 0.45,
+                "hoverinfo": "skip", "showlegend": False, "legendgroup": name, **axes,
+            })  # fmt: skip
+    unseen = not np.isfinite(curve.std).mean() > 0.5
+    line = {"color": _GREY if unseen else colour, "width": 2.2, **({"dash": "dot"} if unseen else {})}
+    told = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
+    out.append({
+        "x": PERCENT, "y": mean, "mode": "lines", "name": told, "line": line,
+        "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}<extra></extra>", "legendgroup": name,
+        "showlegend": row == 0, **axes,
+    })  # fmt: skip
+    return out
+
+
+def _band(x: NDArray, middle: NDArray, half: NDArray) -> tuple[NDArray, NDArray]:
+    """Outline of a band as closed polygons, one for each run of finite halves, with NaN between them."""
+    known = np.flatnonzero(np.isfinite(half))
+    xs: list[Any] = []
+    ys: list[Any] = []
+    for part in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
+        if len(part):
+            there, back = part, part[::-1]
+            xs += [x[there], x[back], [np.nan]]
+            ys += [middle[there] + half[there], middle[back] - half[back], [np.nan]]
+    return (np.concatenate(xs)[:-1], np.concatenate(ys)[:-1]) if xs else (np.zeros(0), np.zeros(0))
+
+
+def _filled(x: NDArray, y: NDArray, colour: str, name: str, axes: dict) -> dict:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return {
+        "x": x, "y": y, "mode": "none", "fill": "toself", "fillcolor": f"rgba({red},{green},{blue},0.17)",
+        "hoverinfo": "skip", "showlegend": False, "legendgroup": name, **axes,
+    }  # fmt: skip
+
+
+def _range(sides: list[Curve]) -> list[float]:
+    """Of the vertical axis: all values with their usual bands, but a band may not squeeze the curve to a line."""
+    low, high = min(c.values.min() for c in sides), max(c.values.max() for c in sides)
+    least = 10.0 if sides[0].unit == "deg" else 0.05
+    stds = np.concatenate([c.std for c in sides])
+    finite = stds[np.isfinite(stds)]
+    band = 2 * float(np.percentile(finite, 90)) if len(finite) else 0.0
+    pad = max(0.08 * (high - low), 0.3 * least, min(1.15 * band, max(2 * (high - low), 2 * least)))
+    return [low - pad, high + pad]
+
+
+def _axes(row: int) -> dict[str, str]:
+    return {"xaxis": "x", "yaxis": f"y{row + 1}" if row else "y"}
+
+
+def _mark(at: float, colour: str) -> dict:
+    return {
+        "type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
+        "line": {"color": colour, "width": 1.2, "dash": "dash"},
+    }  # fmt: skip
+
+
+def _stacked(
+    traces: list[dict], rows: list[list[Curve]], x: str, ranges: list[Any], *, seeks: bool = False, shapes: Any = ()
+) -> Html:
+    """Plots one below the other on one x axis, each with its name above it."""
+    n, notes = len(rows), []
+    height = _ROW * n + 78
+    gap = 34 / (_ROW * n)
+    tall = (1 - gap * (n - 1)) / n
+    layout: dict[str, Any] = {"margin": {"l": 52, "r": 12, "t": 62, "b": 42}, "shapes": list(shapes)}
+    for row, sides in enumerate(rows):
+        top = 1 - row * (tall + gap)
+        layout[f"yaxis{row + 1}" if row else "yaxis"] = {
+            "domain": [max(0.0, top - tall), top], "anchor": "x", "title": sides[0].unit,
+            **({"range": ranges[row]} if ranges[row] else {}),
+        }  # fmt: skip
+        unseen = [c.side or "all of it" for c in sides if not np.isfinite(c.std).any()]
+        text = f"<b>{sides[0].stem}</b>"
+        text += f"  + {_POSITIVE[sides[0].stem]}" if sides[0].stem in _POSITIVE else ""
+        text += f"  <i>not observed: {' and '.join(unseen)}</i>" if unseen else ""
+        notes.append({
+            "text": text, "x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom",
+            "showarrow": False, "font": {"size": 12.5},
+        })  # fmt: skip
+    layout["xaxis"] = {"title": x, "anchor": f"y{n}" if n > 1 else "y"}
+    layout |= {"annotations": notes, "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1 + 32 / height,
+               "yanchor": "bottom"}}  # fmt: skip
+    label = ", ".join(sides[0].stem for sides in rows)
+    traces = sorted(traces, key=lambda trace: "fill" not in trace)  # bands below all lines
+    return plot(traces, layout, height=height, label=f"{label} over {x.split()[0]}", seeks=seeks)

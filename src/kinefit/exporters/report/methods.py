@@ -1,0 +1,168 @@
+"""What was done, to paste into a paper and to do it again; the body's lengths."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from kinefit.exporters.report import page as p
+from kinefit.exporters.report.fit import UNITS, overall_median, sensor_fits
+from kinefit.exporters.report.moments import listed
+from kinefit.motion import Motion
+
+
+def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
+    """A paragraph for a paper and the same as JSON; only what the motion and its provenance tell."""
+    text = " ".join(methods_sentences(motion, doubtful))
+    return [
+        p.paragraph("To paste into a paper:", small=True), p.quote(text),
+        p.paragraph(
+            "Error bars are standard deviations. In them are the jitter and lasting errors of the keypoints, what "
+            "the cameras' pictures have shifted as a whole, and how sure the body's lengths are; not the scale of the "
+            "calibration, nor errors that all cameras share.", small=True),
+        p.folded("All settings, as JSON", p.code(json.dumps(summary(motion, date), indent=2, ensure_ascii=False))),
+    ]  # fmt: skip
+
+
+def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
+    """The sentences of the methods paragraph."""
+    told, body = motion.provenance, motion.body
+    pixels = [name for name, r in motion.residuals.items() if r.unit == "px"]
+    places = [name for name, r in motion.residuals.items() if r.unit == "m"]
+    out = [
+        f"The motion \"{motion.name}\" ({len(motion)} frames at {motion.rate:g} Hz) was estimated with kinefit "
+        f"{told.get('kinefit', told.get('version', _version()))}."
+    ]  # fmt: skip
+    out += [text for text in (_cameras(told, pixels), _markers(places), _calibration(told)) if text]
+    of = "those found for the subject" if motion.residuals else "given"
+    stature = f" (stature of the model {body.stature:.2f} m)" if body.stature else ""
+    out.append(
+        f"The body model \"{body.name}\" has {len(body.tree.segments)} rigid segments and {len(body.tree.coordinates)} "
+        f"joint coordinates, named and signed as in OpenSim; its lengths are {of}{stature}."
+    )
+    if motion.residuals:
+        out.append("All measurements were fitted together by robust weighted least squares over the joint coordinates.")
+    out += _told_settings(told)
+    for unit in ("px", "m"):
+        median = overall_median(motion, unit)
+        if np.isfinite(median):
+            fits = [f for f in sensor_fits(motion) if f.unit == UNITS[unit][1]]
+            count = sum(f.count for f in fits)
+            left = sum(f.count * f.left_out for f in fits) / max(count, 1)
+            out.append(
+                f"The median residual is {median:.1f} {UNITS[unit][1]} over {count} measured points, of which "
+                f"{100 * left:.1f} % were left out as outliers."
+            )
+    flagged = {0: "No moment was", 1: "One moment was"}.get(doubtful, f"{doubtful} moments were")
+    return [*out, f"{flagged} flagged as doubtful."]
+
+
+def summary(motion: Motion, date: str) -> dict[str, Any]:
+    """What a program needs to know about a motion: numbers of its fit and the whole provenance."""
+    sensors = {
+        f.name: {
+            "median": _number(f.median), "unit": f.unit, "measured_points": f.count,
+            "left_out": round(f.left_out, 4), "shift": [_number(v) for v in f.shift], "swapped_frames": f.swapped,
+        }
+        for f in sensor_fits(motion)
+    }  # fmt: skip
+    return {
+        "name": motion.name, "report_date": date, "kinefit": _version(), "frames": len(motion), "rate_hz": motion.rate,
+        "up": motion.up, "body": motion.body.name, "stature_m": _number(motion.body.stature),
+        "quality_mean": _number(motion.quality.mean()), "quality_lowest": _number(motion.quality.min()),
+        "sensors": sensors, "provenance": _plain(motion.provenance),
+    }  # fmt: skip
+
+
+def lengths_table(motion: Motion) -> p.Html:
+    """Distances from joint to joint; left and right in one row, with deviations where the provenance has them."""
+    body = motion.body
+    stds = motion.provenance.get("length_std_m", {})
+    rows: dict[str, dict[str, str]] = {}
+    for child, parent in enumerate(body.tree.parents):
+        length = float(np.linalg.norm(body.tree.offsets[child]))
+        if parent < 0 or length < 1e-6:
+            continue
+        ends = (body.joints[parent].removeprefix("ground_"), body.joints[child])
+        side = {"_l": "left", "_r": "right"}.get(ends[1][-2:], "middle")
+        name = " to ".join(e[:-2] if e.endswith(("_l", "_r")) else e for e in ends)
+        std = stds.get(f"{body.tree.segments[parent]}-{body.tree.segments[child]}")
+        told = f"{100 * length:.1f}" + (f" ± {100 * std:.1f}" if isinstance(std, float) and np.isfinite(std) else "")
+        rows.setdefault(name, {})[side] = told
+    cells = [(name, *(found.get(side, "") for side in ("left", "middle", "right"))) for name, found in rows.items()]
+    return p.table(["joint to joint [cm]", "left", "middle", "right"], cells)
+
+
+def _cameras(told: Mapping[str, Any], names: list[str]) -> str:
+    if not names:
+        return ""
+    keypoints = [entry for entry in told.get("keypoints", []) if isinstance(entry, Mapping)]
+    kinds = dict.fromkeys(f"{e.get('format', '')} {e.get('set') or ''}".strip() for e in keypoints)
+    accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
+    text = f"2D keypoints {f'({listed([k for k in kinds if k])}) ' if any(kinds) else ''}of {listed(names, 12)}"
+    stated = f" with a stated accuracy of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""
+    return f"{text} entered{stated}."
+
+
+def _markers(names: list[str]) -> str:
+    return f"Markers of {listed(names)} entered." if names else ""
+
+
+def _calibration(told: Mapping[str, Any]) -> str:
+    found = told.get("calibration")
+    if not isinstance(found, Mapping) or "file" not in found:
+        return ""
+    digest = f" (SHA-256 {str(found['sha256'])[:16]}…)" if found.get("sha256") else ""
+    return f"The calibration of the cameras was {found['file']}{digest}."
+
+
+def _told_settings(told: Mapping[str, Any]) -> list[str]:
+    out = []
+    smoothing = told.get("smoothing")
+    if smoothing:
+        how = _listing(smoothing) if isinstance(smoothing, Mapping) else ""
+        out.append(f"The whole take was smoothed in one solve{f' ({how})' if how else ''}{_estimated(smoothing)}.")
+    if isinstance(told.get("tracking"), Mapping):
+        out.append(f"Settings of the tracking: {_listing(told['tracking'])}.")
+    if told.get("height"):
+        out.append(f"The subject's height was given as {told['height']:g} m.")
+    return out
+
+
+def _estimated(smoothing: Any) -> str:
+    """What smoothing found out from the take itself."""
+    if not isinstance(smoothing, Mapping):
+        return ""
+    parts = ["the strength of its prior on accelerations"] if isinstance(smoothing.get("acceleration"), Mapping) else []
+    sigma = smoothing.get("pixel_sigma")
+    values = [v for found in sigma.values() for v in found.values()] if isinstance(sigma, Mapping) else []
+    if values:
+        parts.append(f"the standard deviation of every keypoint (median {np.median(values):.1f} px)")
+    return f"; {listed(parts)} {'was' if len(parts) == 1 else 'were'} estimated from the take" if parts else ""
+
+
+def _listing(settings: Mapping[str, Any]) -> str:
+    def value(v: Any) -> str:
+        return f"{v:.4g}" if isinstance(v, float) else str(v)
+
+    plain = {k.replace("_", " "): v for k, v in settings.items() if not isinstance(v, Mapping | list)}
+    return ", ".join(f"{k} {value(v)}" for k, v in plain.items())
+
+
+def _number(value: Any) -> float | None:
+    return float(f"{float(value):.6g}") if np.isfinite(value) else None
+
+
+def _plain(value: Any) -> Any:
+    return json.loads(p.to_json(value))
+
+
+def _version() -> str:
+    try:
+        return metadata.version("kinefit")
+    except metadata.PackageNotFoundError:  # a checkout that is not installed
+        return "of unknown version"

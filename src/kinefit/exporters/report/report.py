@@ -1,0 +1,261 @@
+"""report.html: one file that tells what came out, how far it can be trusted, and how it was made.
+
+    write_report(motion, "report.html")
+
+Doubtful moments come first. Angles are those of OpenSim in degrees, with bands of ±2 standard deviations; what nothing
+observes is said to be so. Cycles are shown only where the movement repeats itself.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable, Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import write_text
+from kinefit.exporters.report import page as p
+from kinefit.exporters.report.angles import cycle_plots, joint_plots
+from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
+from kinefit.exporters.report.figure import figure
+from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
+from kinefit.exporters.report.methods import lengths_table, methods
+from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubtful_moments, listed, never_observed, plain
+from kinefit.exporters.report.pictures import MOMENTS, report_frames
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
+
+_BUDGET = 40  # pictures at 640 px: about 3 MB; more of them are made smaller
+
+Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
+
+
+def write_report(
+    motion: Motion,
+    path: str | PathLike[str],
+    *,
+    rig: Rig | None = None,
+    pictures: Pictures | None = None,
+    files: Mapping[str, str] | None = None,
+    findings: Iterable[tuple[str, str, str]] = (),
+    date: str | None = None,
+) -> Path:
+    """Write one self-contained HTML page about a motion.
+
+    Parameters
+    ----------
+    motion : Motion
+        What was done is read from its `provenance`.
+    path : path of the page
+    rig : Rig, optional
+        Cameras for the 3D figure, in the motion's world.
+    pictures : {camera: {frame: (H, W, 3) uint8 RGB}}, optional
+        Overlay pictures; those of the frames of `report_frames` find their place.
+    files : {name: what it is}, optional
+        Other results, as links relative to the page.
+    findings : (severity, title, text), optional
+        What else the reader should know first, such as what a check of the take found; severity as in `page.callout`.
+    date : str, optional
+        By default today's. The same motion and date give the same bytes.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ExportError
+        The motion has no frames, or the page cannot be written.
+    """
+    if not len(motion):
+        raise ExportError("a motion without frames has nothing to report", file=path, remedy="Track the take first.")
+    date = date or datetime.date.today().isoformat()
+    moments, shown = doubtful_moments(motion), pictures or {}
+    cycles = find_cycles(motion)
+    width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
+    sections = [
+        _summary(motion, moments, list(findings), date),
+        p.section("Doubtful moments", *_moments(motion, moments, shown, width)),
+        p.section("Moving figure", figure(motion, rig), p.paragraph(
+            "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; grey was not "
+            "seen. Times anywhere on this page, and clicks into plots over time, move the figure there.", small=True)),
+        p.section("Angles", *_angles(motion)),
+        p.section("Cycles", *_cycles(motion, cycles)),
+        p.section("Fit to the measurements", *_fit(motion, moments)),
+    ]  # fmt: skip
+    if shown:
+        sections.append(p.section("Pictures", *_pictures(motion, shown, width)))
+    sections.append(p.section("Methods", *methods(motion, date, len(moments))))
+    if files:
+        rows = [(p.file_link(name), about) for name, about in files.items()]
+        sections.append(p.section("Files", p.table(["file", "what it is"], rows, first_left=2)))
+    write_text(path, p.page(motion.name, sections, subtitle=_subtitle(motion, date)))
+    return Path(path)
+
+
+def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
+    """One sentence on how far the motion can be trusted."""
+    parts = []
+    for unit, told in (("px", "px"), ("m", "mm")):
+        names = [name for name, r in motion.residuals.items() if r.unit == unit and np.isfinite(r.norms).any()]
+        if names:
+            parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {told}")
+    start = " and ".join(parts) or "comes without measurements to compare it with"
+    count = len(moments)
+    if not count:
+        return f"The motion {start}; no doubtful moment."
+    frames = np.zeros(len(motion), bool)
+    for m in moments:
+        frames[m.start : m.stop] = True
+    share = 100 * frames.mean()
+    return f"The motion {start}; {count} doubtful moment{'s' if count > 1 else ''} ({share:.0f}\u00a0% of the frames)."
+
+
+def _subtitle(motion: Motion, date: str) -> str:
+    return f"Motion report, {date}. {len(motion)} frames at {motion.rate:g} Hz, {len(motion) / motion.rate:.2f} s."
+
+
+def _summary(
+    motion: Motion, moments: Sequence[Moment], findings: Sequence[tuple[str, str, str]], date: str
+) -> p.Section:
+    nobody = float(np.mean(motion.quality <= 0))
+    doubtful = float(np.mean(motion.quality < DOUBTFUL))
+    severity = "bad" if nobody > 0.1 or doubtful > 0.5 else "warning" if moments else "good"
+    severity = severity if motion.residuals else "note"
+    notes: list[str] = []
+    if moments:
+        notes.append(p.paragraph("See ", p.link("doubtful-moments", "where and why"), "."))
+    if nobody:
+        notes.append(f"In {100 * nobody:.0f} % of the frames nobody was seen.")
+    parts = [p.callout(severity, trust_sentence(motion, moments), *notes)]
+    parts += [p.callout(severity, title, text) for severity, title, text in findings]
+    shifted = [f for f in sensor_fits(motion) if f.is_shifted]
+    if shifted:
+        told = ", ".join(f"{f.name} ({f.shift[0]:+.1f}, {f.shift[1]:+.1f}) px" for f in shifted)
+        text = (
+            "Much of what is left over is one and the same shift in every frame. This points to the calibration or the "
+            "image size, not to the person: run kinefit check on the take."
+        )
+        parts.append(p.callout("warning", f"Constant shift in {told}.", text))
+    blind = never_observed(motion)
+    if blind:
+        text = "No measurement tells them: what is shown follows from the usual posture and is no result."
+        most = len(blind) > 0.5 * len(motion.body.dof_names)
+        parts.append(p.callout("bad" if most else "note", f"Not observed: {listed(blind, 8)}.", text))
+    body = motion.body
+    facts = {
+        "Date of the report": date, "Duration": f"{len(motion) / motion.rate:.2f} s", "Frames": f"{len(motion)}",
+        "Rate": f"{motion.rate:g} Hz", "Body": f"{body.name}, {len(body.tree.coordinates)} angles",
+        "Sensors": f"{len(motion.residuals)}", "Quality, mean (0–1)": f"{motion.quality.mean():.2f}",
+        "Quality, lowest": f"{motion.quality.min():.2f}",
+    }  # fmt: skip
+    if body.stature:
+        facts["Stature of the body"] = f"{body.stature:.2f} m"
+    return p.section("Summary", *parts, p.facts(facts), p.folded("Lengths of the body", lengths_table(motion)))
+
+
+def _moments(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
+    if not motion.residuals and not moments:
+        return [p.callout("note", "This motion comes without measurements, so nothing tells where it is doubtful.")]
+    if not moments:
+        return [p.callout("good", "None: every frame is supported by its measurements and fits like the others.")]
+    out = []
+    for m in moments[:MOMENTS]:
+        shots = [
+            p.picture(frames[m.worst], caption=f"{camera}, frame {m.worst}", width=width)
+            for camera, frames in pictures.items() if m.worst in frames
+        ]  # fmt: skip
+        severity = "bad" if motion.quality[m.worst] <= 0 else "warning"
+        parts = [" ".join(m.what + m.causes), *([p.gallery(shots, smallest=170)] if shots else [])]
+        out.append(p.callout(severity, _when(motion, m), *parts))
+    if len(moments) > MOMENTS:
+        rest = moments[MOMENTS : MOMENTS + 200]
+        rows = [(_when(motion, m), " ".join(m.what), " ".join(m.causes) or "–") for m in rest]
+        more = f"{len(moments) - MOMENTS} more, less severe"
+        out.append(p.folded(more, p.table(["when", "what", "why"], rows, first_left=3)))
+    return out
+
+
+def _when(motion: Motion, m: Moment) -> p.Html:
+    start, stop = motion.times[m.start], motion.times[m.stop - 1]
+    span = f"{start:.2f} s" if m.stop - m.start == 1 else f"{start:.2f}–{stop:.2f} s"
+    frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
+    who = listed([plain(s) for s in m.segments]) or "whole body"
+    return p.joined(p.moment(motion.times[m.worst], span), f" ({frames}): {who}")
+
+
+def _angles(motion: Motion) -> list[p.Html]:
+    return [
+        p.paragraph(
+            "Names and signs are those of OpenSim's Rajagopal model. The band is ±2 standard deviations of the "
+            "measurement; a grey broken line without a band was not observed in that time."
+        ),
+        p.chooser("Joint", joint_plots(motion)),
+    ]
+
+
+def _cycles(motion: Motion, cycles: Cycles | None) -> list[p.Html]:
+    if cycles is None:
+        text = (
+            "Two or more cycles that last about as long and look alike were not found: neither strides nor another "
+            "movement that repeats itself."
+        )
+        return [p.callout("note", "This take has no repeated cycle.", text)]
+    counts = listed([f"{len(s.spans)} {'' if s.name == 'both' else s.name + ' '}cycles" for s in cycles.sides])
+    if cycles.kind == "gait":
+        text = (
+            f"Gait: {counts}, from heel strike to heel strike (0–100 %), found from how far the heels are ahead of the "
+            "pelvis (Zeni et al. 2008); the broken upright line is where the toes leave the floor. "
+        )
+    else:
+        text = f"A movement that repeats itself: {counts}, from one extreme posture to the next alike. "
+    text += (
+        "The thick line is the mean, thin ones are single cycles; the band is ±1 standard deviation between cycles, "
+        "where there are three or more of them. The cycles' coefficient of multiple correlation is "
+        f"{cycles.likeness:.2f}."
+    )
+    numbers = gait_numbers(motion, cycles)
+    rows = [(name, *(_mean(*v) for v in values)) for name, values in numbers.items()]
+    parts = [p.paragraph(text)]
+    if rows:
+        parts.append(p.table(["mean ± SD", *(s.name for s in cycles.sides)], rows))
+    return [*parts, p.chooser("Joint", cycle_plots(motion, cycles))]
+
+
+def _mean(mean: float, spread: float) -> str:
+    if not np.isfinite(mean):
+        return "–"
+    digits = max(0, 2 - int(np.floor(np.log10(max(abs(mean), 1e-9)))))  # three that count
+    return f"{mean:.{digits}f}" + (f" ± {spread:.{digits}f}" if np.isfinite(spread) else "")
+
+
+def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:
+    text = "Quality is the share of the body that its measurements support; below the dotted line a frame is doubtful."
+    parts = [p.paragraph(text), quality_plot(motion, moments)]
+    if not motion.residuals:
+        return [*parts, p.callout("note", "This motion comes without measurements, so there are no residuals.")]
+    fits, names = sensor_fits(motion), {name for r in motion.residuals.values() for name in r.names}
+    about = (
+        "Residuals are measured minus fitted. A shift is the median residual along an axis: far from zero, it points "
+        "to the calibration. Points left out were too far off to be believed."
+    )
+    return [*parts, p.heading("Sensors"), p.paragraph(about), sensor_table(motion, fits), p.heading("Points"),
+            p.folded("Every point in every sensor", point_table(motion), opened=len(names) <= 40)]  # fmt: skip
+
+
+def _pictures(motion: Motion, pictures: Pictures, width: int) -> list[p.Html]:
+    names = {frame: what for frame, what in report_frames(motion).items() if what != "doubtful"}
+    out = [p.paragraph("The fitted skeleton on the video; rings are keypoints, red crosses those left out.")]
+    for camera, frames in pictures.items():
+        shots = [
+            p.picture(frames[f], caption=f"{what}: frame {f}, {motion.times[f]:.2f} s", width=width)
+            for f, what in sorted(names.items()) if f in frames
+        ]  # fmt: skip
+        if shots:
+            out += [p.heading(camera), p.gallery(shots, smallest=170)]
+    return out

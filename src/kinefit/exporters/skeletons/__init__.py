@@ -1,0 +1,1 @@
+"""Animated skeletons and figures."""

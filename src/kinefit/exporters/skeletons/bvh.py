@@ -1,0 +1,90 @@
+"""BVH (Biovision hierarchy): the fitted skeleton and its motion, for animation programs."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.exporters.atomic import write_text
+from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, slides, turned
+from kinefit.exporters.skeletons.rest import Rest, rest_pose
+from kinefit.motion import Motion
+
+_ROTATIONS = "Zrotation Xrotation Yrotation"
+_POSITIONS = "Xposition Yposition Zposition"
+
+
+def write_bvh(
+    motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up: str = "y", names: str = "bvh",
+    rest: str | None = None,
+) -> None:
+    """Write a motion as BVH.
+
+    Rotations are Euler angles Z, X, Y without jumps. The root has six channels, every other joint three; a joint that
+    slides has six, its position standing instead of its OFFSET.
+
+    Parameters
+    ----------
+    motion : Motion
+    path : path
+    unit : "cm", "m" or "mm"
+        Unit of length in the file; the format does not state it.
+    up : str
+        Vertical axis of the file's world.
+    names : "bvh", "mixamo", "cmu", "opensim", "hanim" or "kinefit"
+        Names of the joints; "bvh": the usual ones (Hips, RightUpLeg ...).
+    rest : "body" or "t", optional
+        Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+
+    Raises
+    ------
+    ExportError
+        Unknown unit, axis, names or rest pose, or the file cannot be written.
+    """
+    body, scale, joints = motion.body, length_factor(unit, UNITS, path), bone_names(motion.body, names, path)
+    pose = rest_pose(body, rest, names, path)
+    Ts = pose.local_poses(turned(motion, up, path))
+    with_position = slides(body)
+    with_position[0] = True
+    degrees = np.degrees(euler_zxy(Ts[..., :3, :3]))
+    columns: list[NDArray] = []
+    order: list[int] = []
+    lines = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
+    for s in order:
+        columns += [scale * Ts[:, s, :3, 3]] * bool(with_position[s]) + [degrees[:, s]]
+    table = np.concatenate(columns, axis=1) + 0.0
+    lines += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}"]
+    row = " ".join(["%.8f"] * table.shape[1])
+    lines += [row % tuple(values) for values in table.tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _hierarchy(
+    body: Body, pose: Rest, names: list[str], with_position: NDArray, scale: float, order: list[int]
+) -> list[str]:
+    """Lines of the hierarchy; fills `order` with the segments in the order of their channels."""
+    tree = body.tree
+    ends = {s: scale * pose.turns[s] @ end for s, end in body.segment_ends().items()}
+
+    def joint(s: int, depth: int) -> list[str]:
+        order.append(s)
+        indent, inner = "\t" * depth, "\t" * (depth + 1)
+        channels = f"6 {_POSITIONS} {_ROTATIONS}" if with_position[s] else f"3 {_ROTATIONS}"
+        lines = [f"{indent}{'JOINT' if depth else 'ROOT'} {names[s]}", f"{indent}{{"]
+        lines += [f"{inner}OFFSET {_numbers(scale * pose.offsets[s])}", f"{inner}CHANNELS {channels}"]
+        children = np.flatnonzero(tree.parents == s)
+        for child in children:
+            lines += joint(int(child), depth + 1)
+        if not len(children):
+            end = _numbers(ends.get(s, np.zeros(3)))
+            lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\tOFFSET {end}", f"{inner}}}"]
+        return [*lines, f"{indent}}}"]
+
+    return joint(0, 0)
+
+
+def _numbers(values: NDArray) -> str:
+    return " ".join(f"{v + 0.0:.8f}" for v in values)

@@ -1,0 +1,263 @@
+"""A marker model from one labelled frame and a marker set (P5 2: "one frame ... that includes full feature points")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.identification.marker_sets import FEWEST, GIVE, MarkerSet
+from kinefit.identification.model.model import MarkerJoint, MarkerModel
+
+NOISE = 0.001
+"""[m] of a measured distance."""
+
+JOINT_SPREAD = 0.02
+"""[m] guess of a virtual joint's spread: body proportions and skin."""
+
+MARKER_SPREAD = 0.01
+"""[m] the same where both segments share a marker."""
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A marker set's segments for the labels that a take really has.
+
+    Parameters
+    ----------
+    names, parents : of the segments; the root first, parent -1
+    members : each (k,) int into the take's labels
+    shared : for each segment, its markers that its parent has too
+    places : (M, 3) [m] of the set, NaN where not known; joints : (S, 3) [m] of the set, NaN where not known
+    unknown : labels that the set does not know, as indexes
+    give : [m] for each member of each segment; ranges : [rad] of each segment's joint; see SetSegment
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    members: tuple[tuple[int, ...], ...]
+    places: NDArray
+    joints: NDArray
+    unknown: tuple[int, ...]
+    give: tuple[tuple[float, ...], ...]
+    ranges: tuple[float, ...]
+
+    def shared(self, s: int) -> tuple[int, ...]:
+        """Markers of a segment that its parent has too."""
+        return () if self.parents[s] < 0 else tuple(m for m in self.members[s] if m in self.members[self.parents[s]])
+
+
+def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
+    """Segments of a set that have a marker of their own among the labels; children of others go to the next ancestor.
+
+    Raises
+    ------
+    ObservationError
+        The set knows fewer than four of the labels, or fewer than half; or the root would have fewer than three.
+    """
+    known = marker_set.match(labels)
+    number = {name: i for i, name in enumerate(known) if name is not None}
+    if len(number) < FEWEST or (2 * len(number) < len(labels) and 2 * len(number) < len(marker_set.labels)):
+        raise ObservationError(
+            f"marker set {marker_set.name} knows {len(number)} of {len(labels)} labels "
+            f"({', '.join(labels[:6])}{' ...' if len(labels) > 6 else ''})",
+            remedy=f"It has: {', '.join(marker_set.labels[:8])} ... Choose another set, or rename the markers.",
+        )
+    members = [tuple(number[m] for m in s.markers if m in number) for s in marker_set.segments]
+    elders: list[set[int]] = []
+    for segment in marker_set.segments:
+        elders.append(set() if segment.parent < 0 else elders[segment.parent] | set(members[segment.parent]))
+    keep = [s for s in range(len(members)) if set(members[s]) - elders[s]]
+    keep = [s for i, s in enumerate(keep) if i or len(members[s]) >= 3] or keep
+    while keep and len(members[keep[0]]) < 3:
+        keep = keep[1:]
+    if not keep:
+        raise ObservationError("no segment has three markers", remedy="A root needs three; add markers to the trunk.")
+    lost = {m for s in range(len(members)) if s not in keep for m in members[s]}
+    lost -= {m for s in keep for m in members[s]}
+    parents = []
+    for i, s in enumerate(keep):
+        p = marker_set.segments[s].parent
+        while p >= 0 and p not in keep:
+            p = marker_set.segments[p].parent
+        parents.append(-1 if i == 0 else keep.index(p) if p >= 0 else 0)
+    places = np.full((len(labels), 3), np.nan)
+    for name, i in number.items():
+        places[i] = marker_set.places[marker_set.labels.index(name)]
+    joints = np.full((len(keep), 3), np.nan)
+    for i, s in enumerate(keep):
+        if marker_set.segments[s].joint is not None:
+            joints[i] = marker_set.segments[s].joint
+    unknown = tuple(sorted({i for i, name in enumerate(known) if name is None} | lost))
+    give = []
+    for segment in (marker_set.segments[s] for s in keep):
+        each = segment.give or (GIVE,) * len(segment.markers)
+        give.append(tuple(g for m, g in zip(segment.markers, each) if m in number))
+    names = tuple(marker_set.segments[s].name for s in keep)
+    own, ranges = tuple(members[s] for s in keep), tuple(marker_set.segments[s].range for s in keep)
+    return Skeleton(names, tuple(parents), own, places, joints, unknown, tuple(give), ranges)
+
+
+def similarity(x: NDArray, y: NDArray, prior: NDArray, scaled: bool = True) -> tuple[float, NDArray, NDArray]:
+    """Scale s, rotation R, translation t with s R x + t = y, least squares; what the points leave open as in `prior`.
+
+    Parameters
+    ----------
+    x, y : (n, 3) [m], n >= 1
+    prior : (3, 3) rotation, weighed so little that it decides only what the points do not
+    """
+    a, b = x - x.mean(0), y - y.mean(0)
+    size = float((a * a).sum())
+    cross = b.T @ a + (1e-4 * size + 1e-12) * prior
+    u, _, vt = np.linalg.svd(cross)
+    d = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    R = (u * d) @ vt
+    scale = float(np.sqrt((b * b).sum() / size)) if scaled and len(x) > 1 and size > 0 else 1.0
+    return scale, R, y.mean(0) - scale * R @ x.mean(0)
+
+
+def place_joints(positions: NDArray, skeleton: Skeleton) -> NDArray:
+    """(S, 3) [m] each segment's joint with its parent in one frame, from the set's places; NaN for the root.
+
+    Every segment is laid onto its markers with its own size and turn (root first, each with the joint its parent
+    gives it); a joint lies in the middle of what parent and child say. Without places: amid the nearest markers.
+    """
+    count = len(skeleton.names)
+    joints = np.full((count, 3), np.nan)
+    fits: list[tuple[float, NDArray, NDArray]] = []
+    for s in range(count):
+        p = skeleton.parents[s]
+        here = [m for m in skeleton.members[s] if np.isfinite(skeleton.places[m]).all()]
+        x, y = skeleton.places[here], positions[here]
+        prior = fits[p] if p >= 0 else (1.0, np.eye(3), np.zeros(3))
+        if p >= 0 and np.isfinite(skeleton.joints[s]).all():
+            joints[s] = prior[0] * prior[1] @ skeleton.joints[s] + prior[2]
+            if len(here) >= 3:
+                scale, R, t = similarity(x, y, prior[1])
+                flat = np.linalg.svd(x - x.mean(0), compute_uv=False)[1] > 0.03  # [m]; else turned about a line
+                own = scale * R @ skeleton.joints[s] + t
+                joints[s] = 0.5 * (joints[s] + own) if flat else joints[s]
+            x, y = np.vstack([x, skeleton.joints[s]]), np.vstack([y, joints[s]])
+        fits.append(similarity(x, y, prior[1]) if len(x) > 1 else prior)
+    for s in range(1, count):
+        if not np.isfinite(joints[s]).all():
+            mine, theirs = positions[list(skeleton.members[s])], positions[list(skeleton.members[skeleton.parents[s]])]
+            gaps = np.linalg.norm(mine[:, None] - theirs, axis=-1)
+            i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
+            joints[s] = 0.5 * (mine[i] + theirs[j])
+    return joints
+
+
+def reach(
+    reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence[MarkerJoint]
+) -> tuple[NDArray, NDArray]:
+    """(M, M) [m] each: least and largest distance of two markers that the tree of segments allows, whatever its pose.
+
+    Within a segment both are the distance itself. Across joints: the largest is the way through the joints; the least
+    is what the longest piece of that way leaves when the others turn against it.
+    """
+    count, size = len(reference), len(members)
+    low, high = np.zeros((count, count)), np.full((count, count), np.inf)
+    mean = np.linalg.norm(reference[:, None] - reference, axis=-1)
+    joint_of = {j.child: j for j in joints}
+
+    def way(s: int) -> list[int]:
+        path = [s]
+        while path[-1] in joint_of:
+            path.append(joint_of[path[-1]].parent)
+        return path
+
+    for a in range(size):
+        for b in range(a, size):
+            up, down = way(a), way(b)
+            if a == b:
+                i = np.ix_(list(members[a]), list(members[a]))
+                low[i], high[i] = mean[i], mean[i]
+                continue
+            common = next(s for s in up if s in down)
+            chain = [(joint_of[s].in_child, joint_of[s].in_parent) for s in up[: up.index(common)]]
+            chain += [(joint_of[s].in_parent, joint_of[s].in_child) for s in down[: down.index(common)]][::-1]
+            inner = [float(np.linalg.norm(k[1] - n[0])) for k, n in pairwise(chain)]
+            first = np.linalg.norm(reference[list(members[a])] - chain[0][0], axis=-1)
+            last = np.linalg.norm(reference[list(members[b])] - chain[-1][1], axis=-1)
+            total = first[:, None] + last + sum(inner)
+            longest = np.maximum(np.maximum(first[:, None], last), max(inner, default=0.0))
+            i, j = np.ix_(list(members[a]), list(members[b])), np.ix_(list(members[b]), list(members[a]))
+            least = np.maximum(2 * longest - total, 0.0)
+            high[i] = np.minimum(high[i], total)
+            low[i] = np.maximum(low[i], least)
+            high[j], low[j] = high[i].T, low[i].T
+    return low, np.maximum(high, low)
+
+
+def guess_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArray) -> NDArray:
+    """(M, M) [m] how much distances give where no training tells: by skin within segments, else as the tree allows."""
+    deviation = (high - low) / np.sqrt(12.0)
+    within = np.full(mean.shape, np.inf)
+    for m, give in zip(skeleton.members, skeleton.give):
+        i, g = np.ix_(list(m), list(m)), np.asarray(give)
+        within[i] = np.minimum(within[i], np.sqrt(NOISE**2 + g[:, None] ** 2 + g**2))
+    deviation = np.where(np.isfinite(within), within, deviation + NOISE)
+    np.fill_diagonal(deviation, 0.0)
+    return deviation
+
+
+def model_from_frame(
+    positions: ArrayLike, labels: Sequence[str], marker_set: MarkerSet, *, name: str = "subject"
+) -> MarkerModel:
+    """A subject's model from one labelled frame.
+
+    Parameters
+    ----------
+    positions : (M, 3) [m], NaN where a marker is not seen: such a marker is left out, and named in the model's gaps
+    labels : (M,)
+    marker_set : MarkerSet
+        A label that it does not know goes to the segment that is nearest; computed points are left out.
+
+    Raises
+    ------
+    ObservationError
+        Shapes do not agree, a label is there twice, the set does not fit the labels, or the root has no three markers.
+    """
+    at = np.asarray(positions, float)
+    if at.shape != (len(labels), 3):
+        raise ObservationError(f"positions have shape {at.shape} for {len(labels)} labels", remedy="Give (M, 3) [m].")
+    real = [i for i, label in enumerate(labels) if not marker_set.is_computed(label) and not label.startswith("*")]
+    seen = [i for i in real if np.isfinite(at[i]).all()]
+    labels, at, gaps = [labels[i] for i in seen], at[seen], tuple(labels[i] for i in real if i not in seen)
+    skeleton = skeleton_of(labels, marker_set)
+    skeleton = adopt(skeleton, np.linalg.norm(at[:, None] - at, axis=-1))
+    places = place_joints(at, skeleton)
+    joints = []
+    for s in range(1, len(skeleton.names)):
+        marker = pivot(skeleton, s, places[s], at)
+        place = places[s] if marker is None else at[marker]
+        spread = JOINT_SPREAD if marker is None else MARKER_SPREAD
+        joints.append(MarkerJoint(skeleton.parents[s], s, place, place, spread, marker))
+    mean = np.linalg.norm(at[:, None] - at, axis=-1)
+    low, high = reach(at, skeleton.members, joints)
+    deviation = guess_deviation(mean, skeleton, low, high)
+    return MarkerModel(
+        name, tuple(labels), at, skeleton.members, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
+    )
+
+
+def pivot(skeleton: Skeleton, s: int, place: NDArray, at: NDArray) -> int | None:
+    """The marker that a segment shares with its parent, the one nearest to their joint; None without one."""
+    shared = skeleton.shared(s)
+    return min(shared, key=lambda m: float(np.linalg.norm(at[m] - place))) if shared else None
+
+
+def adopt(skeleton: Skeleton, cost: NDArray) -> Skeleton:
+    """Markers that the set does not know go to the segment of least mean `cost` (M, M) to two of its markers."""
+    members, give = [list(m) for m in skeleton.members], [list(g) for g in skeleton.give]
+    for i in skeleton.unknown:
+        known = [np.sort(np.nan_to_num(cost[i, list(m)], nan=np.inf))[:2].mean() for m in skeleton.members]
+        best = int(np.argmin(known))
+        members[best].append(i)
+        give[best].append(2 * GIVE)  # not known to be of this segment
+    return replace(skeleton, members=tuple(map(tuple, members)), unknown=(), give=tuple(map(tuple, give)))

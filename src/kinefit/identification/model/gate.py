@@ -1,0 +1,143 @@
+"""The gate on training motion: which joints it did not exercise, and what to record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kinefit.identification.marker_sets import RANGE, MarkerSet, find_marker_set
+from kinefit.identification.model.model import MarkerJoint, MarkerModel
+from kinefit.identification.model.rigid import told
+from kinefit.observations import Markers
+
+ENOUGH = 0.35
+"""Share of a joint's range below which it counts as held still. In takes that trained models well, all joints but the
+wrists had more; walking leaves shoulders, wrists, waist and neck below, standing all."""
+
+ALIKE = 0.01
+"""[m] two segments whose distances agree this well cannot be told apart by themselves: two markers' give."""
+
+_MOTIONS = {
+    "head": "nod, tilt and turn the head as far as it goes",
+    "pelvis": "bend forward and to both sides, and twist the trunk",
+    "upperarm": "swing the straight arm forward, out and overhead, and circle it",
+    "forearm": "bend and stretch the elbow, and turn the palm up and down",
+    "hand": "bend the wrist up, down and to both sides",
+    "thigh": "lift the knee to the chest, and swing the leg out and back",
+    "shank": "bend and stretch the knee all the way",
+    "foot": "point the toes down and up, and circle the foot",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing to know of a training take.
+
+    Parameters
+    ----------
+    kind : "twice" (a label), "still" (a joint), "merged" (segments), "seldom" (a marker), "few" (markers on a segment),
+        "alike" (segments)
+    name : of the segment or label
+    text : what was found
+    remedy : what to record or to change
+    """
+
+    kind: str
+    name: str
+    text: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.text}. {self.remedy}."
+
+
+def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet | None = None) -> list[Finding]:
+    """What the training take leaves open, worst first; empty if nothing.
+
+    Parameters
+    ----------
+    markers : the take from which `model` was learnt, or any other that is to be judged against its labels
+    marker_set : for the full range of each joint; default: the catalogue's set that knows the labels
+    """
+    marker_set = marker_set or find_marker_set(model.labels)
+    full = {s.name: s.range for s in marker_set.segments} if marker_set else {}
+    still = []
+    for joint in model.joints:
+        name = model.names[joint.child]
+        share = told(joint, full.get(name, RANGE))
+        if share < ENOUGH:
+            still.append((share, _still(model, joint, full.get(name, RANGE))))
+    out = [f for _, f in sorted(still, key=lambda pair: pair[0])]
+    return _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+
+
+def _twice(model: MarkerModel) -> list[Finding]:
+    """Labels that the file had twice: its reader told them apart by a suffix."""
+    parts = [(label, *label.rpartition("_")) for label in model.labels]
+    again = [(label, base) for label, base, _, n in parts if n.isdigit() and base in model.labels]
+    text, remedy = "the file has the label {} twice", "Delete one of the two in the recording"
+    return [Finding("twice", label, text.format(base), remedy) for label, base in again]
+
+
+def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> Finding:
+    name, parent = model.names[joint.child], model.names[joint.parent]
+    degrees = [f"{np.degrees(r):.0f}" for r in joint.ranges]
+    motion = _MOTIONS.get(name.removesuffix("_r").removesuffix("_l").replace("_", ""), "turn it about all its axes")
+    side = " (right)" if name.endswith("_r") else " (left)" if name.endswith("_l") else ""
+    return Finding(
+        "still", name, f"turned against {parent} by {degrees[0]}, {degrees[1]} and {degrees[2]} degrees about three "
+        f"axes, of about {np.degrees(full):.0f} about the first", f"Record: {motion}{side}",
+    )
+
+
+def _merged(model: MarkerModel) -> list[Finding]:
+    """Segments longer than a thigh or a trunk of anybody: several that were held together."""
+    out = []
+    for name, members in zip(model.names, model.segments):
+        length = float(model.mean[np.ix_(members, members)].max())
+        if length > 0.75:  # [m] trunk, shoulder to hip, of a very tall man (ANSUR II, 99th percentile and more)
+            text = f"its {len(members)} markers lie up to {length:.2f} m apart: probably several segments in one"
+            out.append(Finding("merged", name, text, "Give a marker set as template, or record all joints moving"))
+    return out
+
+
+def _seldom(markers: Markers, model: MarkerModel) -> list[Finding]:
+    index = {name: i for i, name in enumerate(markers.names)}
+    out = []
+    for label in model.gaps:
+        share = np.isfinite(markers.positions[:, index[label], 0]).mean() if label in index else 0.0
+        text = f"seen in {100 * share:.0f} % of the frames" + ("" if label in model.labels else "; not in the model")
+        out.append(Finding("seldom", label, text, "Record it, or leave the label out"))
+    return out
+
+
+def _few(model: MarkerModel) -> list[Finding]:
+    """Segments whose pose three markers, or two and the joint, do not tell."""
+    out = []
+    joints = {j.child: j.in_child for j in model.joints}
+    for s, (name, members) in enumerate(zip(model.names, model.segments)):
+        points = model.reference[list(members)]
+        points = np.vstack([points, joints[s]]) if s in joints else points
+        flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
+        if len(points) < 3 or flat[1] < 0.02:  # [m] beside one line
+            text = f"{len(members)} markers" + (", nearly on one line with its joint" if len(points) > 2 else "")
+            out.append(Finding("few", name, text, "Add a marker off the line, or expect doubtful names there"))
+    return out
+
+
+def _alike(model: MarkerModel) -> list[Finding]:
+    """Segments (left and right) with the same distances: only the body around them tells which is which."""
+    out = []
+    for a in range(len(model.segments)):
+        for b in range(a):
+            first, second = model.segments[b], model.segments[a]
+            if len(first) != len(second) or len(first) < 2 or set(first) & set(second):
+                continue
+            i, j = np.triu_indices(len(first), 1)
+            d = model.mean[np.ix_(first, first)][i, j] - model.mean[np.ix_(second, second)][i, j]
+            if np.abs(d).max() < ALIKE:
+                text = f"same shape as {model.names[b]} within {1e3 * np.abs(d).max():.0f} mm"
+                remedy = "Move one marker by 3 cm, or wear one more on a side"
+                out.append(Finding("alike", model.names[a], text, remedy))
+    return out

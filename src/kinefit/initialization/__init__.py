@@ -1,0 +1,1 @@
+"""Where a body may be when nothing is known from before."""

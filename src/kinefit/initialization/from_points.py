@@ -1,0 +1,177 @@
+"""A start with no pose given: triangulated points -> bone lengths -> pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences import point_rows, prior_rows
+from kinefit.errors import TrackingError
+from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.rows import AnyRows
+from kinefit.sensors.channels import Channels, exchange
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.losses import geman_mcclure
+
+
+def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float = 30.0) -> NDArray:
+    """(F, K, 3) [m] points of some frames on which two cameras agree, NaN elsewhere; see `triangulated_frame`."""
+    return np.stack(
+        [
+            triangulated_frame(channels, channels.uv[f], channels.confidence[f], max_residual_px=max_residual_px)[0]
+            for f in frames
+        ]
+    )
+
+
+def triangulated_frame(
+    channels: Channels, uv: NDArray, confidence: NDArray, *, max_residual_px: float = 30.0
+) -> tuple[NDArray, NDArray]:
+    """Points (K, 3) [m] of one frame on which two cameras agree, NaN elsewhere; and which sources were exchanged.
+
+    Where exchanging left and right in some sources makes more of them agree, it is done: one source after the other,
+    the best first. (Q,) bool tells which.
+    """
+    swapped = np.zeros(len(channels.sources), bool)
+    best, support = _agreed(channels, uv, confidence, swapped, max_residual_px)
+    while swapped.sum() < (len(swapped) - 1) // 2:
+        trials = []
+        for q in np.flatnonzero(~swapped):
+            trial = swapped.copy()
+            trial[q] = True
+            trials.append((*_agreed(channels, uv, confidence, trial, max_residual_px), trial))
+        x, more, trial = max(trials, key=lambda t: t[1])
+        if more < support + 0.02 * len(channels.points):  # for nothing, believe the detector
+            break
+        best, support, swapped = x, more, trial
+    return best, swapped
+
+
+def _agreed(
+    channels: Channels, uv: NDArray, confidence: NDArray, swapped: NDArray, limit: float
+) -> tuple[NDArray, float]:
+    """Triangulated points of one frame, and the confidence of the views that agree, summed by how well they do."""
+    uv, confidence = exchange(channels, uv, swapped), exchange(channels, confidence, swapped)
+    view = np.full((len(channels.points), len(channels.rig), 2), np.nan)
+    trust = np.zeros(view.shape[:2])
+    use = np.isfinite(uv).all(axis=1) & (confidence > 0.1)
+    view[channels.column[use], channels.camera[use]] = uv[use]
+    trust[channels.column[use], channels.camera[use]] = confidence[use]
+    x, inliers, residual = triangulate_robust(channels.rig, view, trust, max_residual_px=limit)
+    closeness = np.where(inliers, 1.0 - np.square(np.where(inliers, residual, 0.0) / limit), 0.0)
+    return x, float(np.sum(closeness * trust))
+
+
+def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
+    """Pairs of points whose distance no angle changes: (point, point, scale group, distance at rest [m]).
+
+    A point at a joint's centre belongs to both segments there.
+    """
+    tree = body.tree
+    hosts: list[dict[int, NDArray]] = []
+    for s, x in zip(points.segments, points.points, strict=True):
+        here = {int(s): x}
+        if np.linalg.norm(x) < 1e-9 and tree.parents[s] >= 0:
+            here[int(tree.parents[s])] = tree.offsets[s]
+        hosts.append(here)
+    out = []
+    for i in range(len(hosts)):
+        for j in range(i + 1, len(hosts)):
+            for s in hosts[i].keys() & hosts[j].keys():
+                length = float(np.linalg.norm(hosts[i][s] - hosts[j][s]))
+                if length > 0.05:
+                    out.append((i, j, int(body.segment_scale[s]), length))
+    return out
+
+
+def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: float | None = None) -> NDArray:
+    """(G,) scales from the median lengths of bones over frames: x_world (F, K, 3) [m], NaN where unknown.
+
+    Groups without a bone to measure follow the person's height [m] where it is given, else the median of the others.
+
+    Raises
+    ------
+    TrackingError
+        No bone can be measured in any frame.
+    """
+    ratios: dict[int, list[tuple[float, float]]] = {}
+    for i, j, group, length in rigid_pairs(body, points):
+        distances = np.linalg.norm(x_world[:, i] - x_world[:, j], axis=1)
+        if np.isfinite(distances).any():
+            ratios.setdefault(group, []).append((float(np.nanmedian(distances)) / length, length))
+    if not ratios:
+        raise TrackingError(
+            "no bone of the body can be measured: too few keypoints are seen by two cameras at once",
+            remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
+        )
+    means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
+    whole = height / body.stature if height and body.stature else float(np.median(list(means.values())))
+    if not 0.2 < whole < 5.0:
+        raise TrackingError(
+            f"the person would be {float(f'{whole:.2g}'):g} times the body's size: the calibration's unit is wrong",
+            remedy=f"Set unit = {_unit_for(whole)} under [calibration], or correct what stands there.",
+        )
+    return np.array([np.clip(means.get(g, whole), 0.6 * whole, 1.6 * whole) for g in range(len(body.scale_groups))])
+
+
+def _unit_for(times: float) -> str:
+    """The unit that a calibration is probably in whose numbers make a person so many times too large."""
+    units = {"mm": 1e3, "cm": 1e2, "dm": 1e1, "inch": 39.37}
+    name, factor = min(units.items(), key=lambda u: abs(np.log(u[1] / times)))
+    return f'"{name}"' if abs(np.log(factor / times)) < 0.7 else "what its numbers are in"
+
+
+def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
+    """T_world_root (4, 4) that lays the resting body on known points (K, 3) best, trunk before limbs (Kabsch)."""
+    rest, known = body.points_rest(points), np.isfinite(x_world).all(axis=1)
+    depth = np.zeros(len(body.tree.segments))
+    for s in range(1, len(depth)):
+        depth[s] = depth[body.tree.parents[s]] + 1
+    near = np.exp(-np.linalg.norm(rest[:, [0, 2]], axis=1) / 0.2) * np.where(rest[:, 1] < -0.1, 0.05, 1.0)
+    w = np.where(known, near / (1 + 0.2 * depth[points.segments]), 0.0)
+    a, b = rest - w @ rest / w.sum(), np.where(known[:, None], x_world, 0.0)
+    b = b - w @ b / w.sum()
+    u, _, vt = np.linalg.svd((w[:, None] * b).T @ a)
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = w @ np.where(known[:, None], x_world, 0.0) / w.sum() - R @ (w @ rest / w.sum())
+    return T
+
+
+def pose_from_points(
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None
+) -> tuple[BodyState, float]:
+    """State of a body from points (K, 3) [m], and the median distance left [m].
+
+    With no pose given two starts are tried, the usual posture laid on the points and turned about its long axis; the
+    cheaper end wins. `near` is a start that is known to be close, and the only one then.
+
+    Raises
+    ------
+    TrackingError
+        Fewer than six points are known.
+    """
+    known = np.isfinite(x_world).all(axis=1)
+    if known.sum() < 6:
+        raise TrackingError("fewer than six points are known in space", remedy="Start where more cameras see the body.")
+
+    def rows(state: BodyState) -> list[AnyRows]:
+        return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
+
+    starts = (
+        [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
+    )
+    fits = []
+    for start in starts:
+        rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state
+        fits.append(levenberg_marquardt(body, rough, rows, loss=geman_mcclure(), max_iterations=40, tolerance=1e-4))
+    best = min(fits, key=lambda fit: fit.equations.cost)
+    left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
+    return best.state, float(np.median(left))
+
+
+def _turn(angle: float) -> NDArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])

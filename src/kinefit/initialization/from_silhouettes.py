@@ -1,0 +1,93 @@
+"""A pose from silhouettes that are far off: coarse to fine in the image, in reach, and in which way outlines face."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.observations import SilhouetteFrame
+from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.silhouette import SilhouetteMeasurement
+from kinefit.tracking.fused_fit import FusedFit, FusionResult
+
+
+class Level(NamedTuple):
+    """One step from coarse to fine.
+
+    Parameters
+    ----------
+    side : int [px], longer side of the image in which outlines are compared.
+    far, near : float [m], bound of correspondences in the first iteration and in the last.
+    angle : float [rad], largest one between normals of a pair.
+    """
+
+    side: int
+    far: float
+    near: float
+    angle: float
+
+
+LEVELS = (Level(40, 0.8, 0.4, 1.5), Level(80, 0.5, 0.2, 1.4), Level(160, 0.3, 0.1, 1.2), Level(320, 0.15, 0.03, 1.0))
+_GAIN = 0.01  # of overlap that a coarser start must add: what outlines of one pose differ by from level to level
+_PATIENCE = 3  # times as many iterations in each level as a frame of a sequence gets
+
+
+class FarFit(NamedTuple):
+    """What was found from afar: the judged pose, and its overlap 0..1 with the silhouettes (mean IoU)."""
+
+    result: FusionResult
+    overlap: float
+
+
+def coarse_to_fine(
+    body: Body, rig: Rig, frames: Sequence[SilhouetteFrame], state: BodyState, *,
+    accuracy: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
+    smooth: Sequence[Body] = (), settings: FusionSettings | None = None,
+) -> FarFit:  # fmt: skip
+    """Fit silhouettes of one time from a pose that may be tens of degrees off in every joint.
+
+    Coarse levels reach far, but may leave a pose that is near; so it is begun at every level in turn, and what overlaps
+    the silhouettes most is taken.
+
+    Parameters
+    ----------
+    accuracy : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
+    levels : the last one alone is what the tracker does from frame to frame.
+    smooth : the body for each level, such as low-pass approximations of a surface (P1 2.4); default: as it is.
+
+    Raises
+    ------
+    ObservationError
+        No silhouettes, or no levels, or another number of bodies.
+    """
+    if not frames or not levels:
+        raise ObservationError("no silhouettes to fit, or no levels", remedy="Give those of one camera or more.")
+    bodies = tuple(smooth) or (body,) * len(levels)
+    if len(bodies) != len(levels):
+        raise ObservationError(f"{len(bodies)} bodies for {len(levels)} levels", remedy="Give one body for each.")
+    settings = settings or FusionSettings()
+    fits = []
+    for own_body, level in zip(bodies, levels):
+        steps = settings.iterations * _PATIENCE
+        own = replace(
+            settings, outline=level.side, far=level.far, near=level.near, angle=level.angle, iterations=steps
+        )
+        fits.append(FusedFit(own_body, rig, 1.0, dict(accuracy or {}), own, {}))
+    best: FarFit | None = None
+    for first in range(len(levels) - 1, -1, -1):
+        now = state
+        for fit in fits[first:]:
+            result, _ = fit.run(0.0, now, None, fit.measurements(frames, now))
+            now = result.state
+        last = [m for m in fits[-1].measurements(frames, now) if isinstance(m, SilhouetteMeasurement)]
+        overlap = float(np.mean([m.overlap(now) for m in last]))
+        if best is None or overlap > best.overlap + _GAIN:
+            best = FarFit(result, overlap)
+    assert best is not None
+    return best

@@ -1,0 +1,167 @@
+"""Labelled markers on a body of the subject's size: joint angles of every frame (its size: `marker_subject`)."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.errors import TrackingError
+from kinefit.markers.placement import find_placement
+from kinefit.markers.poses import LOSS, POSTURE, bare, columns, sequence_both_ways
+from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.observations import Markers
+from kinefit.smoothing.gaps import bridged
+from kinefit.smoothing.unwrap import unwrap
+from kinefit.solvers.losses import Loss
+from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
+
+_TOLD = 0.35  # [rad] an angle less sure than that is not told by its frame, but by those before and after
+_HELD = 0.1  # [m] likewise for the root
+_PRIOR = 0.95  # share of the usual posture's spread from which an angle is known by that alone
+_MEMORY = 0.3  # [s] in which the velocity of a body that is not seen forgets itself
+_WORSE = 0.3  # standard deviations that a frame's markers may fit worse for following its neighbours
+_OFF = 4.0  # times the take's usual misfit from which a frame is tried anew, from nowhere
+_MOST_RUNS = 50  # of such frames
+
+
+def fit_markers(
+    body: Body,
+    markers: Markers,
+    marker_set: str | PathLike[str] | None = None,
+    *,
+    sigma: ArrayLike = 0.005,
+    loss: Loss = LOSS,
+    limits: bool = True,
+    up: str | None = None,
+) -> Motion:
+    """Motion of a body from labelled markers, each frame from the last, the first with no pose given.
+
+    What a frame does not tell (a limb whose markers are hidden) follows from the frames before and after it, and what
+    no frame tells is as usual for the body; error bars and quality say so.
+
+    Parameters
+    ----------
+    body : Body, of the subject's size, its markers at their own places: from `fit_marker_subject`.
+    markers : Markers
+        Labels may carry a subject's prefix ("Anna:LASI"); labels that the set does not have are left out.
+    marker_set : str
+        Default: the set that shares most labels, of the body's own first.
+    sigma : scalar or (K,) for each marker of the set that is used [m], along each axis.
+    loss : Loss of a marker, so that a wrong label or a ghost does not pull.
+    up : vertical axis of the world; default: the file's where it says so, else the one along which the body stands.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than four labels are known to the body.
+    TrackingError
+        No frame shows enough markers to start from.
+    """
+    labels = {bare(n) for n in markers.names}
+    whole = find_placement(body, labels, marker_set)
+    points = whole.points
+    if np.ndim(sigma) and marker_set is not None and len(np.asarray(sigma)) != len(points):
+        own = body.marker_sets.get(str(marker_set), points)
+        sigma = np.asarray(sigma, float)[[own.index(n) for n in points.names]]
+    x = columns(markers, points.names)
+    sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
+    roots, angles = sequence_both_ways(body, points, x, sigma, loss=loss, limits=limits)
+    roots, angles = _tried_anew(body, points, x, sigma, roots, angles, loss, limits)
+    sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
+    angles = unwrap(body.tree, angles)
+    roots, angles = _bridged(body, points, x, sigma, roots, angles, sure, markers.rate, loss, limits)
+    return _motion(body, markers, points, x, roots, angles, sure, up)
+
+
+def _misfit(body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
+    """(F,) mean misfit of a frame's markers in standard deviations, none counting for more than ten."""
+    off = np.linalg.norm(x - body.trajectories(roots, angles, points), axis=2) / sigma
+    seen = np.isfinite(off)
+    return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+
+
+def _tried_anew(
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray, loss: Loss, limits: bool
+) -> tuple[NDArray, NDArray]:
+    """Frames that fit far worse than the others, fitted from nowhere where that does better."""
+    roots, angles = roots.copy(), angles.copy()
+    misfit = _misfit(body, points, x, sigma, roots, angles)
+    bad = misfit > max(_OFF * float(np.median(misfit)), 3.0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]]))).reshape(-1, 2)
+    for a, b in edges[np.argsort(edges[:, 0] - edges[:, 1], kind="stable")][:_MOST_RUNS]:
+        try:
+            other_roots, other_angles = sequence_both_ways(body, points, x[a:b], sigma, loss=loss, limits=limits)
+        except TrackingError:
+            continue
+        better = _misfit(body, points, x[a:b], sigma, other_roots, other_angles) < 0.9 * misfit[a:b]
+        roots[a:b][better], angles[a:b][better] = other_roots[better], other_angles[better]
+    return roots, angles
+
+
+def _bridged(
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray, sure: Certainty,
+    rate: float, loss: Loss, limits: bool,
+) -> tuple[NDArray, NDArray]:
+    """Poses whose untold angles follow from the frames around them; the others stay as measured."""
+    tree = body.tree
+    lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
+    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), _PRIOR * tree.spread)
+    told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
+    some = told.any(axis=0)
+    if lost.all() or (told[:, some].all() and not lost.any()):
+        return roots, angles
+    frames = np.arange(len(x))
+    meant = angles.copy()
+    for d in np.flatnonzero(some):
+        meant[:, d] = np.interp(frames, frames[told[:, d]], angles[told[:, d], d])
+    held, (roots, _) = roots, bridged(roots, meant, lost, _MEMORY * rate)
+    before, measured = _misfit(body, points, x, sigma, roots, angles), angles
+    roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
+    again = ~lost & ~told[:, some].all(axis=1)
+    for a, b in np.flatnonzero(np.diff(np.concatenate([[0], again.astype(int), [0]]))).reshape(-1, 2):
+        inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
+        fit = fit_sequence(  # the rest of the chain settles about what is now known
+            body, BodyState(roots[a], angles[a]), points, x[a:b], sigma=sigma, loss=loss, limits=limits and inside,
+            posture=POSTURE, usual=meant[a:b],
+        )  # fmt: skip
+        roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
+    worse = again & (_misfit(body, points, x, sigma, roots, angles) > before + _WORSE)
+    roots[worse], angles[worse] = held[worse], measured[worse]
+    return roots, unwrap(tree, angles) if again.any() else angles
+
+
+def _motion(
+    body: Body, markers: Markers, points: PointSet, x: NDArray, roots: NDArray, angles: NDArray, sure: Certainty,
+    up: str | None,
+) -> Motion:
+    tree, segments = body.tree, len(body.tree.segments)
+    dof_std = np.array(sure.dof_std)
+    dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * tree.spread] = np.inf
+    quality = np.stack([_share(sure.factors, points.segments == s) for s in range(segments)], axis=1)
+    bare_segments = ~np.isin(np.arange(segments), points.segments)
+    for s in np.flatnonzero(bare_segments):  # one without markers is known by its neighbours, if it has any beyond
+        beyond = [c for c in np.flatnonzero(tree.parents == s) if not bare_segments[c]]
+        if beyond and tree.parents[s] >= 0:
+            quality[:, s] = np.minimum(quality[:, tree.parents[s]], quality[:, beyond].max(axis=1))
+    values = x - body.trajectories(roots, angles, points)
+    residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
+    return Motion(
+        body=body, rate=markers.rate, times=markers.times, Ts_world_root=roots, angles=angles, dof_std=dof_std,
+        joint_std=sure.joint_std, quality=sure.factors.mean(axis=1), segment_quality=quality,
+        residuals={"markers": residuals}, up=up or markers.up or upright(roots),
+        name=Path(markers.source).stem or "markers",
+    )  # fmt: skip
+
+
+def _share(weights: NDArray, mine: NDArray) -> NDArray:
+    return weights[:, mine].mean(axis=1) if mine.any() else np.zeros(len(weights))
+
+
+def upright(roots: NDArray) -> str:
+    """The world's axis along which the root's own vertical axis points on average."""
+    mean = roots[:, :3, 1].mean(axis=0)
+    return max(UP_AXES, key=lambda axis: float(np.dot(mean, UP_AXES[axis])))

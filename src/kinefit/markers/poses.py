@@ -1,0 +1,102 @@
+"""Poses of a body that wears markers, frame after frame from one that is found with no pose given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.errors import ObservationError, TrackingError
+from kinefit.geometry import se3
+from kinefit.initialization.from_points import aligned_root
+from kinefit.observations import Markers
+from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure
+from kinefit.solvers.sequence import fit_sequence
+
+LOSS = geman_mcclure(5.0)
+"""Of a marker: three residuals in one, which are 1.7 standard deviations long on average."""
+
+POSTURE = 0.1
+"""Share of the posture prior in a frame's fit: enough to decide what the markers leave open."""
+
+_FEWEST = 6  # markers of a frame to start from
+_ROUGH = 0.03  # [m] how far a body that is not yet the subject's may be off
+_NEAR = 0.03  # [m] median distance of a start that needs no other
+
+
+def bare(label: str) -> str:
+    """A label without its subject's prefix: "Anna:LASI" -> "LASI"."""
+    return label.rpartition(":")[2].strip()
+
+
+def columns(markers: Markers, names: Sequence[str]) -> NDArray:
+    """(F, K, 3) [m] the named markers of a recording, NaN for those that it does not have."""
+    labels = [bare(n) for n in markers.names]
+    twice = sorted({n for n in names if labels.count(n) > 1})
+    if twice:
+        raise ObservationError(
+            f"{len(twice)} labels are there for more than one subject: {', '.join(twice[:6])}",
+            file=markers.source or None, remedy="Fit one subject at a time: see `split_people`.",
+        )
+    out = np.full((len(markers), len(names), 3), np.nan)
+    for k, name in enumerate(names):
+        if name in labels:
+            out[:, k] = markers.positions[:, labels.index(name)]
+    return out
+
+
+def sequence_both_ways(
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = LOSS, limits: bool = True
+) -> tuple[NDArray, NDArray]:
+    """Roots (F, 4, 4) and angles (F, D) of all frames, from the one that shows most, onwards and backwards.
+
+    Raises
+    ------
+    TrackingError
+        No frame shows enough markers to start from.
+    """
+    first, state = _start(body, points, x, sigma)
+    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": POSTURE}
+    after = fit_sequence(body, state, points, x[first:], **given)
+    state = BodyState(after.Ts_world_root[0], after.angles[0])
+    before = fit_sequence(body, state, points, x[: first + 1][::-1], **given)
+    roots = np.concatenate([before.Ts_world_root[:0:-1], after.Ts_world_root])
+    return roots, np.concatenate([before.angles[:0:-1], after.angles])
+
+
+def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:
+    """The frame to start from, and its state, found with no pose given: the best of a few that show most.
+
+    The usual posture is laid on the markers, facing either way, and fitted without, then with a robust loss.
+    """
+    count = np.isfinite(x).all(axis=2).sum(axis=1)
+    if not count.max(initial=0) >= _FEWEST:
+        raise TrackingError(
+            f"no frame shows enough markers to start from: {int(count.max(initial=0))} at most",
+            remedy=f"{_FEWEST} markers in one frame are the least.",
+        )
+    most = np.flatnonzero(count == count.max())
+    spread = np.maximum(sigma, _ROUGH)
+    best: tuple[float, int, BodyState] | None = None
+    for frame in most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]:
+        upright, one = aligned_root(body, points, x[frame]), x[frame : frame + 1]
+        fits = []
+        for turn in (np.eye(3), np.diag([-1.0, 1.0, -1.0])):
+            state = body.usual_state(upright @ se3.transform(turn, np.zeros(3)))
+            for loss in (SQUARED, geman_mcclure()):
+                fit = fit_sequence(
+                    body, state, points, one, sigma=spread, loss=loss, posture=1.0, max_iterations=60, tolerance=1e-4
+                )
+                state = BodyState(fit.Ts_world_root[0], fit.angles[0])
+            fits.append((float(fit.costs[0]), state))
+        state = min(fits, key=lambda f: f[0])[1]
+        left = float(np.nanmedian(np.linalg.norm(x[frame] - body.positions(state, points), axis=1)))
+        if best is None or left < best[0]:
+            best = left, int(frame), state
+        if left < _NEAR:
+            break
+    assert best is not None
+    return best[1], best[2]

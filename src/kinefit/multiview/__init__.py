@@ -1,0 +1,1 @@
+"""Several cameras together: people, left and right, noise, observability."""

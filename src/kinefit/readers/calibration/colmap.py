@@ -1,0 +1,162 @@
+"""Cameras of a COLMAP text model: a folder with cameras.txt and images.txt."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError, choices
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import quaternion, rotation_from_quaternion
+from kinefit.readers.calibration.tables import build_camera, rigid
+
+# Parameters of every model, in COLMAP's order.
+_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+_RADTAN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_FISHEYE = ("k1", "k2", "k3", "k4")
+
+Intrinsics = tuple[tuple[int, int], NDArray, NDArray, str]
+
+
+def colmap_cameras(folder: Path) -> list[Camera]:
+    """One camera an image, named after the image; translation in the model's arbitrary unit.
+
+    COLMAP puts the centre of the first pixel at (0.5, 0.5); here it is (0, 0).
+    """
+    intrinsics = _cameras(folder / "cameras.txt")
+    path = folder / "images.txt"
+    images = _lines(path)[::2]  # every other line lists the points of the image above it
+    entries = []
+    for number, line in images:
+        parts = line.split(maxsplit=9)
+        place = f"line {number}"
+        values = _floats(parts[:8], path, place)
+        if len(parts) != 10 or parts[8] not in intrinsics:
+            raise CalibrationError(
+                "not an image of a known camera",
+                file=path,
+                place=place,
+                remedy="Each image needs its line and a line (possibly empty) of points; cameras: "
+                + ", ".join(intrinsics)
+                + ".",
+            )
+        entries.append((place, values, intrinsics[parts[8]], PurePosixPath(parts[9])))
+    names = _names([image for *_, image in entries])
+    cameras = []
+    for name, (place, values, (size, K, k, model), _) in zip(names, entries):
+        quaternion = values[1:5]
+        if not np.linalg.norm(quaternion) > 0:
+            raise CalibrationError("a zero quaternion", file=path, place=place, remedy="Export the model again.")
+        T = rigid(rotation_from_quaternion(quaternion), values[5:8], path, place)
+        cameras.append(build_camera(name, size, K, k, model, T, path))
+    return cameras
+
+
+def _names(images: list[PurePosixPath]) -> list[str]:
+    """Names of the cameras: of the images without folder and ending, where these differ."""
+    stems = [image.stem for image in images]
+    return stems if len(set(stems)) == len(stems) else [str(image.with_suffix("")) for image in images]
+
+
+def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, str]:
+    """cameras.txt and images.txt of a model with the cameras of a rig, by the names of its images; all else is kept.
+
+    A lens that the camera's model cannot hold gets the smallest model that can.
+    """
+    path = folder / "images.txt"
+    images = [(number, line.split(maxsplit=9)) for number, line in _lines(path)[::2]]
+    texts = {name: (folder / name).read_text(encoding="utf-8").splitlines() for name in ("cameras.txt", "images.txt")}
+    owners: dict[str, Camera] = {}
+    for name, (number, parts) in zip(_names([PurePosixPath(parts[9]) for _, parts in images]), images):
+        if name not in rig:
+            continue
+        camera, owner = rig[name], owners.setdefault(parts[8], rig[name])
+        if not (np.array_equal(camera.matrix, owner.matrix) and np.array_equal(camera.distortion, owner.distortion)):
+            raise CalibrationError(
+                f"images {owner.name} and {name} share camera {parts[8]}, but now differ in their lens", file=path,
+                place=f"line {number}", remedy="Give each its own camera in cameras.txt.",
+            )
+        T = camera.T_camera_world
+        pose = [*quaternion(T[:3, :3]), *(T[:3, 3] / metres_per_unit)]
+        texts["images.txt"][number - 1] = " ".join([parts[0], *(repr(float(v)) for v in pose), *parts[8:]])
+    for number, line in _lines(folder / "cameras.txt"):
+        parts = line.split()
+        if parts and parts[0] in owners:
+            texts["cameras.txt"][number - 1] = _camera_line(parts[0], parts[1], owners[parts[0]])
+    return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
+
+
+def _camera_line(number: str, model: str, camera: Camera) -> str:
+    K, k = camera.matrix, camera.distortion
+    fisheye = camera.model == "fisheye"
+    given = {"f": K[0, 0], "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] + 0.5, "cy": K[1, 2] + 0.5}
+    lens = dict(zip(_FISHEYE if fisheye else _RADTAN, k))
+    for name in (model, "OPENCV_FISHEYE") if fisheye else (model, "PINHOLE", "OPENCV", "FULL_OPENCV"):
+        keys = _MODELS[name].split()
+        square = "f" not in keys or given["fx"] == given["fy"]
+        if square and all(key in keys for key, value in lens.items() if value) and ("FISHEYE" in name) == fisheye:
+            break
+    values = [repr(float((given | lens).get(key, 0.0))) for key in keys]
+    return " ".join([number, name, *map(str, camera.size), *values])
+
+
+def _cameras(path: Path) -> dict[str, Intrinsics]:
+    found = {}
+    for number, line in _lines(path):
+        place = f"line {number}"
+        if not line.strip():
+            continue
+        parts = line.split()
+        model = parts[1] if len(parts) > 1 else ""
+        if model not in _MODELS:
+            raise CalibrationError(
+                choices("camera model", model, _MODELS), file=path, place=place, remedy="Undistort to one of these."
+            )
+        names = _MODELS[model].split()
+        values = _floats(parts[2:], path, place)
+        if len(values) != 2 + len(names):
+            raise CalibrationError(
+                f"{len(values) - 2} parameters", file=path, place=place, remedy=f"{model} has: {_MODELS[model]}."
+            )
+        given = dict(zip(names, values[2:]))
+        fx, fy = given.get("f", given.get("fx")), given.get("f", given.get("fy"))
+        K = np.array([[fx, 0, given["cx"] - 0.5], [0, fy, given["cy"] - 0.5], [0, 0, 1]], dtype=float)
+        fisheye = "FISHEYE" in model
+        k = np.array([given.get(key, 0.0) for key in (_FISHEYE if fisheye else _RADTAN)])
+        found[parts[0]] = ((int(values[0]), int(values[1])), K, k, "fisheye" if fisheye else "radtan")
+    return found
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Lines with their numbers, without comments; empty ones kept, as they mean "no points"."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise CalibrationError(
+            "cannot be read as text",
+            file=path,
+            remedy="Convert the model: colmap model_converter --output_type TXT.",
+        ) from None
+    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+
+
+def _floats(parts: list[str], path: Path, place: str) -> NDArray:
+    try:
+        values = np.array([float(part) for part in parts])
+    except ValueError as error:
+        raise CalibrationError(str(error), file=path, place=place, remedy="Export the model again.") from None
+    if not np.isfinite(values).all():
+        raise CalibrationError("a number is not finite", file=path, place=place, remedy="Export the model again.")
+    return values

@@ -1,0 +1,299 @@
+"""Calibrations of cameras: any usual file or folder -> `Rig`; and back, as Pose2Sim TOML."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from contextlib import suppress
+from os import PathLike
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, ExportError, FileError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import log_so3
+from kinefit.readers.calibration.colmap import colmap_cameras
+from kinefit.readers.calibration.qualisys import qualisys_cameras
+from kinefit.readers.calibration.tables import (
+    camera_from_table,
+    camera_tables,
+    read_table,
+    stated_unit,
+    stereo_tables,
+)
+
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}  # [m]
+FORMATS = (
+    "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML, COLMAP text "
+    "(cameras.txt and images.txt)"
+)
+_FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
+
+
+def read_calibration(
+    path: str | PathLike[str],
+    *,
+    unit: str | float = "auto",
+    image_size: tuple[int, int] | None = None,
+    exteriors: bool = True,
+) -> Rig:
+    """Read the cameras of a calibration; its format is recognised from its content.
+
+    Parameters
+    ----------
+    path : file or folder
+        OpenCV YAML/XML/JSON (one file with all cameras; a folder with one file or one folder a camera; a folder with
+        intrinsics.yml and extrinsics.yml), Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML,
+        COLMAP text (the folder). Poses are world to camera. A single camera without a pose becomes the world.
+    unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
+        Unit of length of the file. "auto": what the file states (`unit = "mm"`, alone or under [metadata]), or what
+        its format defines (Qualisys: mm), else metres unless that cannot be.
+    image_size : (width, height) [px], optional
+        Size of the images, for files that do not state it.
+    exteriors : bool
+        False: cameras without a pose are taken too, and stand at the origin.
+
+    Returns
+    -------
+    Rig
+        In metres, pixels with (0, 0) in the centre of the first.
+
+    Raises
+    ------
+    FileError
+        Where the file is missing or of no known format.
+    CalibrationError
+        Where a camera cannot be used: missing key, wrong shape, not finite, wrong unit.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
+    if path.is_dir():
+        return _read_folder(path, unit, image_size, exteriors)
+    if path.name in ("cameras.txt", "images.txt"):
+        return _read_folder(path.parent, unit, image_size, exteriors)
+    text = _read_text(path)
+    kind = recognise(text, path)
+    if kind == "qualisys":
+        cameras = qualisys_cameras(ElementTree.fromstring(text), path)
+        return _rig(cameras, path, "mm" if unit == "auto" else unit)
+    tree = read_table(text, kind, path)
+    tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
+    return _rig_of(tables, path, _chosen_unit(tree, unit), image_size, exteriors)
+
+
+def read_opencv_stereo(
+    intrinsics: str | PathLike[str],
+    extrinsics: str | PathLike[str],
+    *,
+    image_size: tuple[int, int],
+    unit: str | float = "auto",
+    names: tuple[str, str] = ("left", "right"),
+) -> Rig:
+    """Read the pair of files that OpenCV's stereo calibration writes (M1, D1, M2, D2 and R, T).
+
+    The first camera is the world. Its unit is that of the board's squares: give their length in metres as `unit`.
+    """
+    path = Path(intrinsics)
+    tree = _tree(path) | _tree(Path(extrinsics))
+    tables = stereo_tables(tree, path, names)
+    return _rig_of([(name, table, path) for name, table in tables], path, _chosen_unit(tree, unit), image_size)
+
+
+def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
+    """Write a rig as Pose2Sim TOML, in metres; the file appears whole or not at all.
+
+    Raises
+    ------
+    ExportError
+        Where it cannot be written.
+    CalibrationError
+        Where a camera has what the format lacks.
+    """
+    path = Path(path)
+    metadata = '[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n'
+    text = "\n".join([*(_toml(camera, path) for camera in rig), metadata])
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        os.replace(temporary, path)
+    except OSError as error:
+        raise ExportError(
+            f"cannot be written: {error.strerror}", file=path, remedy="Choose a folder that exists and has room."
+        ) from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _toml(camera: Camera, path: Path) -> str:
+    name = json.dumps(camera.name, ensure_ascii=False)
+    if camera.name == "metadata":
+        raise CalibrationError("a camera cannot be called metadata here", file=path, remedy="Rename the camera.")
+    key = camera.name if re.fullmatch(r"[A-Za-z0-9_-]+", camera.name) else name
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    entries = {
+        "name": name,
+        "size": [float(v) for v in camera.size],
+        "matrix": camera.matrix.tolist(),
+        "distortions": (camera.distortion if camera.distortion.size else np.zeros(4)).tolist(),
+        "rotation": log_so3(R).tolist(),
+        "translation": t.tolist(),
+        "fisheye": str(camera.model == "fisheye").lower(),
+    }
+    return f"[{key}]\n" + "".join(f"{entry} = {value}\n" for entry, value in entries.items())
+
+
+def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | None, exteriors: bool) -> Rig:
+    if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
+        return _rig(colmap_cameras(folder), folder, unit)
+    sources = calibration_sources(folder)
+    if len(sources) == 1 and len(sources[0][1]) == 1:
+        return read_calibration(sources[0][1][0], unit=unit, image_size=image_size, exteriors=exteriors)
+    tables, units = [], set()
+    for name, group in sources:
+        tree: dict = {}
+        for file in group:
+            tree |= _tree(file)
+        found = tables_of(tree, name, group[0], exteriors)
+        tables += [(camera, table, group[0]) for camera, table in found]
+        units |= {_chosen_unit(tree, unit)} if found else set()
+    if len(units) > 1:
+        raise CalibrationError(
+            f"its files state different units: {', '.join(sorted(map(str, units)))}",
+            file=folder,
+            remedy="Pass the unit that all of them have.",
+        )
+    return _rig_of(tables, folder, units.pop() if units else unit, image_size, exteriors)
+
+
+def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
+    """Name and files of each camera, or group of cameras, of a file or folder of tables."""
+    if path.is_file():
+        return [(path.stem, [path])]
+    files = _calibration_files(path)
+    if {"intrinsics", "extrinsics"} <= {file.stem for file in files}:
+        return [(path.name, [file for file in files if file.stem in ("intrinsics", "extrinsics")])]
+    if files:
+        return [(file.stem, [file]) for file in files]
+    inner = [(sub.name, _calibration_files(sub)) for sub in sorted(path.iterdir()) if sub.is_dir()]
+    return [(name, group) for name, group in inner if group]
+
+
+def _calibration_files(folder: Path) -> list[Path]:
+    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
+    return sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+
+
+def tables_of(tree: dict, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, dict]]:
+    """All tables of a parsed file that hold a camera, with the camera's name."""
+    if "M1" in tree:
+        return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
+    return camera_tables(tree, name)
+
+
+def _rig_of(
+    tables: list[tuple[str, dict, Path]],
+    path: Path,
+    unit: str | float,
+    image_size: tuple[int, int] | None,
+    exteriors: bool = True,
+) -> Rig:
+    cameras = [
+        camera_from_table(name, table, file, image_size=image_size, pose_needed=exteriors and len(tables) > 1)
+        for name, table, file in tables
+    ]
+    return _rig(cameras, path, unit)
+
+
+def _tree(path: Path) -> dict:
+    text = _read_text(path)
+    kind = recognise(text, path)
+    if kind == "qualisys":
+        raise CalibrationError("a Qualisys file", file=path, remedy="Give the path of this file itself.")
+    return read_table(text, kind, path)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError):
+        raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
+
+
+def recognise(text: str, path: Path) -> str:
+    """Tell "toml", "json", "yaml", "xml" (OpenCV) or "qualisys" from the content."""
+    start = text.lstrip()
+    if start.startswith("<"):
+        try:
+            tag = ElementTree.fromstring(text).tag
+        except ElementTree.ParseError as error:
+            raise CalibrationError(
+                f"broken XML: {error}", file=path, remedy="Export it again; it may be cut."
+            ) from None
+        if tag in ("calibration", "opencv_storage"):
+            return "qualisys" if tag == "calibration" else "xml"
+    elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):
+        return "json"
+    elif start.startswith(("%YAML", "---")):
+        return "yaml"
+    elif re.search(r"^\s*\[", text, re.M) or re.search(r"^\s*[\w-]+\s*=", text, re.M):
+        return "toml"
+    elif re.search(r"^\s*[\w-]+\s*:", text, re.M):
+        return "yaml"
+    raise FileError("not a calibration that kinefit knows", file=path, remedy=f"kinefit reads {FORMATS}.")
+
+
+def _chosen_unit(tree: dict, unit: str | float) -> str | float:
+    return unit if unit != "auto" else (stated_unit(tree) or "auto")
+
+
+def metres_per_unit(tree: dict, unit: str | float, path: Path) -> float:
+    """Metres per unit of length of a parsed file; 1 where nothing tells it."""
+    return _factor(_chosen_unit(tree, unit), path) or 1.0
+
+
+def _factor(unit: str | float, path: Path) -> float | None:
+    """Metres per unit; None for "auto"."""
+    if isinstance(unit, str):
+        if unit == "auto":
+            return None
+        if unit not in UNITS:
+            raise CalibrationError(
+                f"unknown unit of length '{unit}'", file=path, remedy=f"Units: {', '.join(UNITS)}, or metres a unit."
+            )
+        return UNITS[unit]
+    if not (np.isfinite(unit) and unit > 0):
+        raise CalibrationError(f"unit of length {unit}", file=path, remedy="Give a positive number of metres.")
+    return float(unit)
+
+
+def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
+    if factor is None:
+        distance = float(np.linalg.norm(camera.centre_world))
+        if distance > _FARTHEST:
+            raise CalibrationError(
+                f"stands {distance:.0f} from the world's origin, which cannot be metres",
+                file=path,
+                place=f"camera {camera.name}",
+                remedy='Write unit = "mm" under [calibration] in the take (from Python: unit="mm").',
+            )
+        return camera
+    T = camera.T_camera_world.copy()
+    T[:3, 3] *= factor
+    return camera.with_pose(T)
+
+
+def _rig(cameras: list[Camera], path: Path, unit: str | float) -> Rig:
+    if not cameras:
+        raise CalibrationError("no camera in it", file=path, remedy=f"kinefit reads {FORMATS}.")
+    factor = _factor(unit, path)
+    try:
+        return Rig(tuple(_in_metres(camera, factor, path) for camera in cameras))
+    except CalibrationError as error:
+        if error.file is not None:
+            raise
+        raise CalibrationError(error.problem, file=path, place=error.place, remedy=error.remedy) from None

@@ -1,0 +1,278 @@
+"""Calibrations written as another one is: the same file, or folder, with other numbers in it."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import CalibrationError, ExportError, KinefitError, choices
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import log_so3
+from kinefit.readers.calibration.colmap import colmap_texts
+from kinefit.readers.calibration.qualisys import qualisys_text
+from kinefit.readers.calibration.read import (
+    calibration_sources,
+    metres_per_unit,
+    read_calibration,
+    recognise,
+    tables_of,
+)
+from kinefit.readers.calibration.spans import value_span
+from kinefit.readers.calibration.tables import find, read_table
+
+_REMEDY = "Write it as Pose2Sim TOML instead: kinefit.readers.calibration.read.write_calibration."
+
+
+def write_calibration_like(
+    rig: Rig,
+    like: str | PathLike[str],
+    path: str | PathLike[str],
+    *,
+    unit: str | float = "auto",
+    image_size: tuple[int, int] | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write a rig in the format of an existing calibration, and keep everything else that stands there.
+
+    Interiors, distortion and poses of the rig's cameras are replaced, in the file's own unit and notation; other
+    cameras, comments, boards and names stay. What was written is read back and compared before it appears. OpenCV's
+    stereo pair has no place for the pose of its first camera: it is told in that camera's frame, and rectifications
+    (R1 .. Q) in it stay those of the old one.
+
+    Parameters
+    ----------
+    rig : Rig
+        Some or all of the cameras of `like`, by name.
+    like, path : file or folder, as in `read_calibration`
+        `path` becomes what `like` is.
+    unit, image_size : as in `read_calibration`, of `like`.
+    overwrite : bool
+        Whether an existing `path` may be replaced; `like` itself never is.
+
+    Returns
+    -------
+    Path
+        What was written.
+
+    Raises
+    ------
+    CalibrationError
+        A camera that `like` lacks, or something of it that the format cannot hold.
+    ExportError
+        Where `path` exists, or cannot be written.
+    """
+    like, path = Path(like), Path(path)
+    like = like.parent if like.name in ("cameras.txt", "images.txt") else like
+    old = read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
+    for name in rig.names:
+        if name not in old:
+            raise CalibrationError(choices("camera", name, old.names), file=like, remedy="Give the rig these names.")
+    _check_target(like, path, overwrite)
+    texts, rig = _texts(rig, like, unit)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as staging:
+            root = Path(staging) / path.name
+            for relative, text in texts.items():
+                (root / relative).parent.mkdir(parents=True, exist_ok=True)
+                (root / relative).write_bytes(text.encode("utf-8"))
+            _compare(rig, root, like, unit=unit, image_size=image_size)
+            _move(root, path, texts)
+    except OSError as error:
+        raise ExportError(
+            f"cannot be written: {error.strerror or error}", file=path, remedy="Choose a folder that has room."
+        ) from None
+    return path
+
+
+def _check_target(like: Path, path: Path, overwrite: bool) -> None:
+    if path.exists() and path.samefile(like):
+        raise ExportError("this is the calibration to be kept", file=path, remedy="Give another name.")
+    if path.exists() and (not overwrite or path.is_dir() != like.is_dir()):
+        raise ExportError("there is something of this name already", file=path, remedy="Give another name.")
+
+
+def _move(root: Path, path: Path, texts: dict[str, str]) -> None:
+    if path.is_dir():
+        for relative in texts:
+            (path / relative).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(root / relative, path / relative)
+    else:
+        os.replace(root, path)
+
+
+def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
+    """What is read back is what was to be written, or an error says what the format did not hold."""
+    try:
+        back = read_calibration(written, exteriors=False, **reading)
+    except KinefitError as error:
+        raise CalibrationError(
+            f"the rig's numbers do not go into it ({error.problem})", file=like, place=error.place, remedy=_REMEDY
+        ) from None
+    for camera in rig:
+        found = back[camera.name] if camera.name in back else None
+        if found is not None and (found.size, found.model) == (camera.size, camera.model):
+            scale = max(1.0, float(np.abs(camera.T_camera_world[:3, 3]).max()))
+            same = {
+                "matrix": np.allclose(found.matrix, camera.matrix, rtol=1e-9, atol=1e-9),
+                "distortion": np.allclose(_padded(found), _padded(camera), rtol=1e-9, atol=1e-12),
+                "pose": np.allclose(found.T_camera_world, camera.T_camera_world, rtol=0, atol=1e-8 * scale),
+            }
+            lost = [what for what, held in same.items() if not held]
+        else:
+            lost = ["image size or lens model"]
+        if lost:
+            raise CalibrationError(
+                f"its format does not hold the {' and '.join(lost)}",
+                file=like,
+                place=f"camera {camera.name}",
+                remedy=_REMEDY,
+            )
+
+
+def _padded(camera: Camera) -> NDArray:
+    return np.pad(camera.distortion, (0, 8 - camera.distortion.size))
+
+
+def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig]:
+    """Text of each file by its path below `like` ("" for the file itself), and the rig as the format tells it."""
+    if like.is_dir() and ((like / "cameras.txt").exists() or (like / "cameras.bin").exists()):
+        texts = colmap_texts(rig, like, metres_per_unit({}, unit, like))
+        points = like / "points3D.txt"  # COLMAP opens no model without
+        if points.exists():
+            texts["points3D.txt"] = points.read_text(encoding="utf-8")
+        return texts, rig
+    texts = {}
+    for name, group in calibration_sources(like):
+        files = {file: file.read_bytes().decode("utf-8-sig") for file in group}
+        kinds = {file: recognise(text, file) for file, text in files.items()}
+        if "qualisys" in kinds.values():
+            scale = metres_per_unit({"unit": "mm"}, unit, like)
+            files = {file: qualisys_text(rig, text, scale, file) for file, text in files.items()}
+        else:
+            rig = _replace_tables(rig, name, files, kinds, unit)
+        texts |= {"" if file == like else str(file.relative_to(like)): text for file, text in files.items()}
+    return texts, rig
+
+
+def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Path, str], unit: str | float) -> Rig:
+    """Replace the numbers of all cameras of one group of files, in `files`; returns the rig as they tell it."""
+    trees = {file: read_table(text, kinds[file], file) for file, text in files.items()}
+    merged = {key: value for tree in trees.values() for key, value in tree.items()}
+    first = next(iter(files))
+    tables = tables_of(merged, name, first, exteriors=False)
+    if "M1" in merged and tables[0][0] in rig:
+        rig = rig.moved(rig[tables[0][0]].T_camera_world)
+    scale = metres_per_unit(merged, unit, first)
+    places = {at: (file, *spot) for file, tree in trees.items() for at, spot in _places(tree, kinds[file]).items()}
+    edits: dict[Path, list[tuple[int, int, str]]] = {file: [] for file in files}
+    roots = {file: _xml_root(files[file]) for file in files if kinds[file] == "xml"}
+    for camera_name, table in tables:
+        if camera_name not in rig:
+            continue
+        known = places.get(id(find(table, "matrix")))
+        for key, value, new in _entries(rig[camera_name], table, scale):
+            place = places.get(id(value))
+            if place is None and (value is not None or known is None):
+                continue  # the given zero pose of a stereo pair; whatever else is missing shows when it is read back
+            file, word, n = place or known  # type: ignore[misc]
+            if file in roots:
+                _edit_xml(roots[file], word, n, new, None if place else key)
+            else:
+                edits[file] += _edit(files[file], word, n, new, None if place else key, kinds[file])
+    for file, changes in edits.items():
+        for start, stop, text in sorted(changes, reverse=True):
+            files[file] = files[file][:start] + text + files[file][stop:]
+    for file, root in roots.items():
+        files[file] = '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return rig
+
+
+def _places(tree: Any, kind: str) -> dict[int, tuple[str, int]]:
+    """{identity of a list: (its key, how many of that key stand before it)}, in the order of the text."""
+    counts: dict[str, int] = {}
+    out: dict[int, tuple[str, int]] = {}
+
+    def walk(value: Any) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                if not (kind == "toml" and isinstance(inner, dict)):  # its tables have headings, not keys
+                    if isinstance(inner, list):
+                        out[id(inner)] = (key, counts.get(key, 0))
+                    counts[key] = counts.get(key, 0) + 1
+                walk(inner)
+        elif isinstance(value, list):
+            for inner in value:
+                walk(inner)
+
+    walk(tree)
+    return out
+
+
+def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, NDArray]]:
+    """(key for a new entry, what stands there or None, what shall) of each entry of a camera."""
+    T = np.array(camera.T_camera_world)
+    T[:3, 3] /= scale
+    pose = find(table, "pose")
+    k, given = camera.distortion, find(table, "distortion")
+    count = np.size([] if given is None else given)
+    entries = [
+        ("matrix", find(table, "matrix"), _shaped(camera.matrix, find(table, "matrix"))),
+        ("distortions", given, _shaped(np.pad(k, (0, max(0, count - k.size))), given)),
+    ]
+    if given is None and not k.any():
+        entries.pop()
+    if pose is not None:
+        return [*entries, ("pose", pose, T if np.shape(pose) == (4, 4) else T[:3])]
+    rotation, translation = find(table, "rotation"), find(table, "translation")
+    R = T[:3, :3] if rotation is not None and np.size(rotation) == 9 else log_so3(T[:3, :3])
+    return [
+        *entries,
+        ("rotation", rotation, _shaped(R, rotation)),
+        ("translation", translation, _shaped(T[:3, 3], translation)),
+    ]
+
+
+def _shaped(new: ArrayLike, old: Any) -> NDArray:
+    """In the shape of what stood there, if it has as many numbers."""
+    array = np.asarray(new, dtype=float)
+    return array if old is None or np.size(old) != array.size else array.reshape(np.shape(old))
+
+
+def _edit(text: str, word: str, n: int, new: NDArray, key: str | None, kind: str) -> list[tuple[int, int, str]]:
+    """Change of a text that replaces the value of the n-th `word`, or puts a new `key` behind it."""
+    span = value_span(text, word, n)
+    if span is None:
+        return []
+    if key is None:
+        numbers = str(new.ravel().tolist() if span.matrix else new.tolist())
+        return [(span.start, span.stop, numbers if text[span.start] == "[" else f" {numbers}")]
+    start = span.indent.replace("-", " ")
+    named = {"toml": f"{key} = ", "yaml": f"{key}: ", "json": f'"{key}": '}[kind]
+    own_line = not start.strip()
+    between = ("," if kind == "json" or not own_line else "") + (f"\n{start}" if own_line else " ")
+    return [(span.after, span.after, f"{between}{named}{new.tolist()}")]
+
+
+def _xml_root(text: str) -> ElementTree.Element:
+    return ElementTree.fromstring(text, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
+
+
+def _edit_xml(root: ElementTree.Element, word: str, n: int, new: NDArray, key: str | None) -> None:
+    element = list(root.iter(word))[n]
+    numbers = re.sub(r"[\[\],]", " ", str(new.ravel().tolist()))
+    if key is None:
+        data = element.find("data")
+        (element if data is None else data).text = numbers
+    else:
+        parent = next(p for p in root.iter() if element in list(p))
+        added = ElementTree.SubElement(parent, key)
+        added.text, added.tail = numbers, "\n"

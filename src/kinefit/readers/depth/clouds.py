@@ -1,0 +1,225 @@
+"""Clouds of points: PCD (ascii, binary, binary_compressed) and PLY (ascii, binary)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError, FileError
+from kinefit.geometry.camera import Camera
+from kinefit.geometry.se3 import inverse
+from kinefit.readers.depth._kernels_clouds import lzf
+
+ENDINGS = (".pcd", ".ply")
+_REMEDY = "Export it again, as PCD or PLY with x, y and z."
+_CUT = "It is cut: copy it again."
+_PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_MOST = 200_000_000  # points; more is a broken header
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A cloud as a file holds it.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        In the file's own unit and frame; NaN where an organised cloud has no point.
+    shape : (height, width) or None
+        Of the image that an organised cloud was; its points are in row order.
+    T_file_sensor : (4, 4)
+        Pose of the sensor, where the file tells it (PCD's VIEWPOINT); its translation in the file's unit.
+    """
+
+    points: NDArray
+    shape: tuple[int, int] | None
+    T_file_sensor: NDArray
+
+
+def read_cloud(path: str | PathLike[str]) -> Cloud:
+    """Read a PCD or PLY file.
+
+    Raises
+    ------
+    FileError
+        Missing, cut, or of another kind; the message tells what is wrong.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
+    try:
+        if data.startswith(b"ply"):
+            return _ply(data, path)
+        if b"FIELDS" in data[:2000]:
+            return _pcd(data, path)
+    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+        raise FileError(f"its header cannot be understood ({error})", file=path, remedy=_REMEDY) from error
+    raise FileError("neither PCD nor PLY", file=path, remedy=_REMEDY)
+
+
+def _pcd(data: bytes, path: Path) -> Cloud:
+    header: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in header:
+        end = data.find(b"\n", at)
+        if end < 0 or at > 10_000:
+            raise FileError("a PCD header without DATA", file=path, remedy=_REMEDY)
+        words = data[at:end].decode("ascii").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0].upper()] = words[1:]
+    names, sizes, types = header["FIELDS"], [int(s) for s in header["SIZE"]], header["TYPE"]
+    counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
+    width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
+    number = int(header.get("POINTS", [str(width * height)])[0])
+    if not 0 <= number == width * height < _MOST:
+        raise FileError(f"{number} points, but {width} x {height}", file=path, remedy=_REMEDY)
+    kinds = [f"<{_PCD_TYPES[t]}{s}" for t, s in zip(types, sizes, strict=True)]
+    where = [_place(axis, names, path) for axis in "xyz"]
+    body, kind = data[at:], header["DATA"][0]
+    if kind == "ascii":
+        columns = np.cumsum([0, *counts])
+        points = _text(body, number, int(columns[-1]), path)[:, [columns[w] for w in where]]
+    elif kind == "binary":
+        record = np.dtype([(f"f{i}", k, (c,)) for i, (k, c) in enumerate(zip(kinds, counts, strict=True))])
+        table = _binary(body, record, number, path)
+        points = np.stack([table[f"f{w}"][:, 0].astype(float) for w in where], axis=1)
+    elif kind == "binary_compressed":
+        raw = _unpacked(body, path)
+        starts = np.cumsum([0, *(number * s * c for s, c in zip(sizes, counts, strict=True))])
+        if len(raw) < starts[-1]:
+            raise FileError(f"{len(raw)} of {starts[-1]} bytes are there", file=path, remedy=_CUT)
+        arrays = [np.frombuffer(raw, kinds[w], number * counts[w], int(starts[w]))[:: counts[w]] for w in where]
+        points = np.stack([a.astype(float) for a in arrays], axis=1)
+    else:
+        raise FileError(f"DATA {kind}", file=path, remedy="There are: ascii, binary, binary_compressed.")
+    tx, ty, tz, *q = [float(v) for v in header.get("VIEWPOINT", "0 0 0 1 0 0 0".split())]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _rotation(np.array(q)), (tx, ty, tz)
+    return Cloud(points, (height, width) if height > 1 else None, T)
+
+
+def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
+    packed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
+    if len(body) < 8 + packed or size > 64 * _MOST:
+        raise FileError(f"{len(body) - 8} of {packed} bytes are there", file=path, remedy=_CUT)
+    out = np.empty(size, np.uint8)
+    if lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:
+        raise FileError("its compressed data is broken", file=path, remedy="Copy it again, or write it as binary.")
+    return out
+
+
+def _ply(data: bytes, path: Path) -> Cloud:
+    end = data.find(b"\n", data.find(b"end_header"))
+    if b"end_header" not in data or end < 0:
+        raise FileError("a PLY header without end_header", file=path, remedy=_CUT)
+    lines, body = data[:end].decode("ascii").splitlines(), data[end + 1 :]
+    kind = next((line.split()[1] for line in lines if line.startswith("format")), "")
+    elements: list[tuple[str, int, list[list[str]]]] = []
+    for words in (line.split() for line in lines):
+        if words[:1] == ["element"]:
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            elements[-1][2].append(words[1:])
+    name, number, properties = elements[0] if elements else ("", 0, [])
+    if name != "vertex" or any(p[0] == "list" for p in properties) or not 0 <= number < _MOST:
+        raise FileError("its first element is not a plain 'vertex'", file=path, remedy=_REMEDY)
+    where = [_place(axis, [p[1] for p in properties], path) for axis in "xyz"]
+    if kind == "ascii":
+        points = _text(body, number, len(properties), path)[:, where]
+    elif kind in ("binary_little_endian", "binary_big_endian"):
+        order = "<" if kind == "binary_little_endian" else ">"
+        record = np.dtype([(f"f{i}", order + _PLY_TYPES[p[0]]) for i, p in enumerate(properties)])
+        table = _binary(body, record, number, path)
+        points = np.stack([table[f"f{w}"].astype(float) for w in where], axis=1)
+    else:
+        raise FileError(f"format {kind or 'not told'}", file=path, remedy=_REMEDY)
+    return Cloud(points, None, np.eye(4))
+
+
+def _place(axis: str, names: list[str], path: Path) -> int:
+    if axis not in names:
+        raise FileError(f"it has no {axis}, only {', '.join(names)}", file=path, remedy=_REMEDY)
+    return names.index(axis)
+
+
+def _text(body: bytes, rows: int, columns: int, path: Path) -> NDArray:
+    """(rows, columns) numbers; what follows them (faces) is left."""
+    words = body.split(None, rows * columns)[: rows * columns]
+    if len(words) < rows * columns:
+        problem = f"{len(words) // max(columns, 1)} of {rows} points are there"
+        raise FileError(problem, file=path, remedy=_CUT)
+    return np.array(words, dtype="S32").astype(float).reshape(rows, columns)
+
+
+def _binary(body: bytes, record: np.dtype, number: int, path: Path) -> NDArray:
+    if len(body) < number * record.itemsize:
+        problem = f"{len(body) // record.itemsize} of {number} points are there"
+        raise FileError(problem, file=path, remedy=_CUT)
+    return np.frombuffer(body, record, number)
+
+
+def _rotation(q: NDArray) -> NDArray:
+    """Rotation of a quaternion (w, x, y, z)."""
+    length = float(np.linalg.norm(q))
+    if len(q) != 4 or not length > 0.0:
+        raise ValueError(f"VIEWPOINT with the quaternion {q}")
+    w, x, y, z = q / length
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def depth_of(cloud: Cloud) -> NDArray:
+    """(H, W) depth of an organised cloud along its sensor's axis, in its unit; 0 where it has no point."""
+    assert cloud.shape is not None
+    z = in_sensor(cloud)[:, 2].reshape(cloud.shape)
+    return np.where(z > 0.0, z, 0.0)
+
+
+def in_sensor(cloud: Cloud) -> NDArray:
+    """(N, 3) points of a cloud in its sensor's frame, in its unit."""
+    T = inverse(cloud.T_file_sensor)
+    return cloud.points @ T[:3, :3].T + T[:3, 3]
+
+
+def camera_of(cloud: Cloud, name: str, path: str | PathLike[str] | None = None) -> Camera:
+    """The pinhole camera, at the origin, that an organised cloud was seen with: fitted to its points.
+
+    Raises
+    ------
+    CalibrationError
+        Points that do not lie on the rays of a pinhole camera within half a pixel: lens distortion, or no image.
+    """
+    assert cloud.shape is not None
+    height, width = cloud.shape
+    x = in_sensor(cloud)
+    v, u = np.divmod(np.arange(len(x)), width)
+    ok = np.isfinite(x).all(axis=1) & (x[:, 2] > 0)
+    fits, K = [], np.eye(3)
+    for axis, pixel in ((0, u), (1, v)):
+        ray = x[ok, axis] / x[ok, 2]
+        A = np.stack([ray, np.ones(len(ray))], axis=1)
+        if len(ray) < 100 or np.ptp(ray) < 1e-3:
+            raise CalibrationError("too few points to tell the camera", file=path, remedy="Give its intrinsics.")
+        (K[axis, axis], K[axis, 2]), *_ = np.linalg.lstsq(A, pixel[ok], rcond=None)
+        fits.append(np.percentile(np.abs(A @ (K[axis, axis], K[axis, 2]) - pixel[ok]), 99))
+    if max(fits) > 0.5 or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise CalibrationError(
+            f"its points do not lie on the rays of a pinhole camera ({max(fits):.2g} px off)", file=path,
+            remedy="Give intrinsics, or the points as an unorganised cloud (HEIGHT 1).",
+        )  # fmt: skip
+    return Camera(name, (width, height), K)

@@ -1,0 +1,280 @@
+"""Recordings of depth: any usual folder or file -> `DepthVideo`, or `CloudVideo` for points without order."""
+
+from __future__ import annotations
+
+import builtins
+import re
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.observations.depth import CloudVideo, DepthVideo
+from kinefit.readers.depth import clouds
+from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
+from kinefit.readers.depth.streams import bag_source, track_source
+
+FORMATS = (
+    "a folder of 16-bit PNG or TIFF, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
+    "RealSense .bag"
+)
+_PLAUSIBLE = (0.1, 30.0)  # [m] medians of depth: no sensor measures nearer, none shows a person farther away
+_USUAL = (0.4, 6.0)  # [m] where a person stands before a depth sensor
+_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] a count, as sensors and data sets have it
+_RATE = 30.0  # [Hz] of nearly every depth camera, where nothing tells it
+
+
+def read_depth(
+    path: str | PathLike[str],
+    *,
+    sensor: str | None = None,
+    unit: float | None = None,
+    rate: float | None = None,
+    usual_rate: float | None = _RATE,
+    size: tuple[int, int] | None = None,
+    range: tuple[float, float] = (0.0, np.inf),
+    time_unit: float | None = None,
+    time_offset: float = 0.0,
+) -> DepthVideo:
+    """Read depth images; they stay in their files until they are asked for.
+
+    Parameters
+    ----------
+    path : file, folder or pattern (frames/depth_*.png)
+        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), and `times`
+        [s], `unit` [m], `rate` [Hz] as it has), organised PCD, Azure Kinect .mkv, RealSense .bag. Files are taken in
+        the order of the numbers in their names.
+    sensor : str, optional
+        Name of the sensor's camera; default: the name of the file or folder.
+    unit : float [m], optional
+        Of one count; default: what the file tells, else 0.001 for whole numbers and 1 for float.
+    rate : float [Hz], optional
+        Default: what the file tells or its times give.
+    usual_rate : float [Hz] or None
+        Where nothing tells the rate; None: that is an error.
+    size : (width, height) [px], of raw files.
+    range : (near, far) [m]
+        Measurements outside of it are dropped.
+    time_unit : float [s], optional
+        Of the last number in every file's name, where that is the time; default: frames are evenly spaced.
+    time_offset : float [s]
+        Time of the first frame in the take.
+
+    Raises
+    ------
+    FileError
+        Missing, damaged, of another kind, or a library for it is missing.
+    ObservationError
+        A wrong unit, no depth at all or none in `range`, times that do not increase, or a size that does not fit.
+    """
+    path = Path(path)
+    name = sensor or path.stem
+    source = _source(path, name, size)
+    times, rate = _times(source, rate, usual_rate, time_unit, time_offset, path)
+    factor = _factor(unit if unit is not None else source.unit, path)
+    video = DepthVideo(
+        name, rate, times, source.size, _scaled(source.image, factor), float(range[0]), float(range[1]),
+        source.camera, source=str(path),
+    )  # fmt: skip
+    _check_content(video, factor, path)
+    return video
+
+
+def read_clouds(
+    path: str | PathLike[str],
+    *,
+    sensor: str | None = None,
+    unit: float = 1.0,
+    rate: float | None = None,
+    usual_rate: float | None = _RATE,
+    range: tuple[float, float] = (0.0, np.inf),
+    time_unit: float | None = None,
+    time_offset: float = 0.0,
+    T_world_sensor: ArrayLike | None = None,
+    viewpoint: bool = True,
+) -> CloudVideo:
+    """Read clouds of points, PCD or PLY, organised or not: one file, a folder or a pattern of them.
+
+    Parameters
+    ----------
+    path, sensor, rate, usual_rate, time_unit, time_offset : as in `read_depth`
+    unit : float [m] of the files' coordinates
+    range : (near, far) [m] distance from the sensor
+    T_world_sensor : (4, 4) [m], optional
+        Where the sensor stood; default: where the first file tells (VIEWPOINT of a PCD), else at the origin.
+    viewpoint : bool
+        Whether the sensor saw the points from the origin of its frame; False for clouds of several sensors.
+
+    Raises
+    ------
+    FileError, ObservationError
+        As `read_depth`.
+    """
+    path, unit = Path(path), _factor(unit, Path(path))
+    files = _of_ending(listed(path), clouds.ENDINGS)
+    if not files:
+        raise _nothing(path, f"clouds ({', '.join(clouds.ENDINGS)})")
+    name = sensor or path.stem
+    source = DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=tuple(f.name for f in files))
+    times, rate = _times(source, rate, usual_rate, time_unit, time_offset, path)
+    first = clouds.read_cloud(files[0])
+    T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
+    if T_world_sensor is None:
+        T[:3, 3] *= unit
+    video = CloudVideo(
+        name, rate, times, lambda i: clouds.in_sensor(clouds.read_cloud(files[i])) * unit, T, viewpoint,
+        float(range[0]), float(range[1]), source=str(path),
+    )  # fmt: skip
+    points = clouds.in_sensor(first)
+    away = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1) * unit
+    _check_values(away[away > 0.0], unit, video.near, video.far, path, least=0.001)
+    return video
+
+
+def is_unordered(path: Path) -> bool:
+    """Whether a path holds clouds of points without the order of an image."""
+    files = _of_ending(listed(path), clouds.ENDINGS)
+    return bool(files) and clouds.read_cloud(files[0]).shape is None
+
+
+def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
+    files = listed(path)
+    if not files:
+        if path.is_dir():
+            raise _nothing(path, "files")
+        raise FileError("no such file or folder", file=path, remedy=f"Check the path; kinefit reads {FORMATS}.")
+    if len(files) == 1:
+        ending = files[0].suffix.lower()
+        if ending == ".npz":
+            return array_source(files[0])
+        if ending in (".mkv", ".avi", ".mov", ".mp4"):
+            return track_source(files[0], name)
+        if ending == ".bag":
+            return bag_source(files[0], name)
+    if pictures := _of_ending(files, PICTURES):
+        return picture_source(pictures)
+    if pieces := _of_ending(files, clouds.ENDINGS):
+        return _organised(pieces, name)
+    return raw_source(files, size)
+
+
+def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
+    """The files of these kinds; an error where there are two of them."""
+    found = [file for file in files if file.suffix.lower() in endings]
+    kinds = sorted({file.suffix.lower() for file in found})
+    if len(kinds) > 1:
+        raise ObservationError(
+            f"files of several kinds: {', '.join(kinds)}", file=found[0].parent, remedy=f"Name one kind: *{kinds[0]}."
+        )
+    return found
+
+
+def _nothing(path: Path, what: str) -> FileError:
+    return FileError(f"no {what} in it", file=path, remedy=f"kinefit reads {FORMATS}.")
+
+
+def _organised(files: list[Path], name: str) -> DepthSource:
+    first = clouds.read_cloud(files[0])
+    if first.shape is None:
+        raise ObservationError(
+            "a cloud without the order of an image", file=files[0],
+            remedy="Read it with kinefit.read_clouds; a take does so by itself.",
+        )  # fmt: skip
+    return DepthSource(
+        len(files), lambda i: _depth(files[i]), first.shape[::-1], 1.0,
+        camera=clouds.camera_of(first, name, files[0]), names=tuple(f.name for f in files),
+    )  # fmt: skip
+
+
+def _depth(file: Path) -> NDArray:
+    cloud = clouds.read_cloud(file)
+    if cloud.shape is None:
+        raise ObservationError("a cloud without the order of an image", file=file, remedy="Leave this file out.")
+    return clouds.depth_of(cloud)
+
+
+def _times(
+    source: DepthSource, rate: float | None, usual: float | None, time_unit: float | None, time_offset: float,
+    path: Path,
+) -> tuple[NDArray, float]:
+    """Times [s] and rate [Hz] from what is told, by the caller first."""
+    times = source.times
+    if time_unit is not None:
+        numbers = [re.findall(r"\d+", name) for name in source.names]
+        if not numbers or not all(numbers):
+            raise ObservationError("names without a number", file=path, remedy="Leave time_unit out, and give rate.")
+        counts = [int(found[-1]) for found in numbers]
+        times = np.array([count - counts[0] for count in counts], float) * time_unit
+    if not (np.isfinite(time_offset) and (time_unit is None or (np.isfinite(time_unit) and time_unit > 0))):
+        raise ObservationError(f"time unit {time_unit} s, offset {time_offset} s", file=path, remedy="Give seconds.")
+    if rate is not None and not 0 < rate < 1e6:
+        raise ObservationError(f"rate {rate:g} Hz", file=path, remedy="Give frames per second.")
+    if times is None:
+        rate = rate or source.rate or (usual if source.count > 1 else _RATE)
+        if rate is None:
+            raise ObservationError("nothing tells its rate", file=path, remedy="Give rate = ... in frames per second.")
+        return np.arange(source.count) / rate + time_offset, rate
+    steps = np.diff(times)
+    measured = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else None
+    if rate is not None and measured is not None and not 0.9 < rate / measured < 1.1:
+        raise ObservationError(
+            f"the times of its frames say {measured:.4g} Hz, not {rate:g} Hz", file=path,
+            remedy="Leave the rate out, or correct the unit of the times.",
+        )  # fmt: skip
+    if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
+        measured = source.rate  # times are rounded to milliseconds
+    return times + time_offset, rate or measured or source.rate or usual or _RATE
+
+
+def _factor(unit: float, path: Path) -> float:
+    if not (np.isfinite(unit) and unit > 0):
+        raise ObservationError(f"a unit of {unit} m", file=path, remedy="Give metres a count: 0.001 for millimetres.")
+    return float(unit)
+
+
+def _scaled(image: Callable[[int], NDArray], factor: float) -> Callable[[int], NDArray]:
+    return lambda i: image(i) * np.float32(factor)
+
+
+def _check_content(video: DepthVideo, factor: float, path: Path) -> None:
+    """Look at some frames for what no tracking could survive: no depth, a wrong unit, a range that is too narrow."""
+    seen: list[NDArray] = []
+    first = dict.fromkeys(round(k) for k in np.linspace(0, len(video) - 1, 5))
+    for i in (*first, *(k for k in builtins.range(len(video)) if k not in first)):
+        if len(seen) >= len(first) and any(map(len, seen)):
+            break  # the others are looked at only while all are empty
+        image = np.asarray(video.image(i))
+        if image.shape == video.size[::-1]:
+            image = image[::4, ::4] if image.size > 40_000 else image
+            seen.append(image[(image > 0) & np.isfinite(image)])
+        else:
+            video.frame(i)  # tells what is wrong
+    _check_values(np.concatenate(seen), factor, video.near, video.far, path)
+
+
+def _check_values(
+    depth: NDArray, factor: float, near: float, far: float, path: Path, least: float = _PLAUSIBLE[0]
+) -> None:
+    if not len(depth):
+        raise ObservationError(
+            "nothing was measured in any of its frames", file=path,
+            remedy="Was the sensor covered, or are these the infrared pictures?",
+        )  # fmt: skip
+    median = float(np.median(depth))
+    if not least < median < _PLAUSIBLE[1]:
+        likely = [unit for unit in _UNITS if _USUAL[0] < median / factor * unit < _USUAL[1]]
+        told = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
+        what = " (millimetres taken for metres?)" if factor == 1.0 and median > 100 else ""
+        raise ObservationError(
+            f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong", file=path,
+            remedy=f"Write {told} (metres a count).",
+        )  # fmt: skip
+    if not ((depth >= near) & (depth <= far)).any():
+        low, high = np.percentile(depth, (1, 99))
+        raise ObservationError(
+            f"nothing lies within the range of {near:g} to {far:g} m: depths go from {low:.3g} to {high:.3g} m",
+            file=path, remedy="Correct the range, or the unit.",
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""A first take file from a folder."""

@@ -1,0 +1,197 @@
+"""Cameras of a take to be: their videos, what became of the pictures, rate, unit of length and vertical axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from numpy.typing import NDArray
+
+from kinefit.errors import KinefitError, TakeError
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.observations import Keypoints
+from kinefit.readers.guess import views as guess_views
+from kinefit.readers.guess.draft import Draft, Told
+from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
+from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
+from kinefit.readers.guess.names import HOW, Trial, trials
+from kinefit.readers.video import Video
+
+_LABORATORY = (0.2, 15.0)  # [m] from a desk to a sports hall: how far cameras stand from their middle
+
+
+def describe_cameras(
+    draft: Draft, calibration: CalibrationFile, videos: Sequence[Path], keypoints: Sequence[KeypointFile]
+) -> None:
+    """Enter the cameras with their videos and keypoints, and everything that these tell."""
+    rig = calibration.rig
+    usual = [path for path in videos if not OF_CALIBRATION.search(draft.name(path))]
+    chosen = _choose_recording(draft, usual if usual or keypoints else videos, rig)
+    with ExitStack() as stack:
+        opened = {n: stack.enter_context(Video(path)) for n, path in chosen.files.items()} if chosen else {}
+        length = min(map(len, opened.values()), default=0)
+        sources = keypoint_sources(draft, keypoints, rig, length, chosen.place if chosen else "")
+        records = read_sources(draft, sources)
+        names = [name for name in rig.names if name in opened or any(name in record for record in records)]
+        if not names:
+            raise _nothing_fits(draft, calibration, found=bool(sources))
+        first = next((record for record in records if record), {})
+        draft.head["rate"] = draft.tell("rate", _rate(opened, first), "rate")
+        sizes = {name: video.size for name, video in opened.items()}
+        images = _pictures(draft, rig, names, opened, chosen, guess_views.guess_turn(rig, first, sizes))
+        shown: dict[str, ImageFrame] = {}
+        entries = []
+        for source, record in zip(sources, records):
+            frame = guess_views.keypoint_frame(rig, record, images, sizes)
+            if frame is not None and frame.sure == "guess":
+                same = [k for k in keypoints if k.format == next(iter(source.values())).format]
+                frame = _frame_of_static(draft, calibration, videos, same) or frame
+            if record is first and frame is not None and frame.value == "video":
+                shown = images
+            entries.append((source, record, frame))
+        _world(draft, calibration, first, shown)
+        _cut(draft, [*opened.values(), *first.values()])
+        for source, record, frame in entries:
+            keypoint_entries(draft, source, record, frame, images, active=record is first)
+    if missing := [name for name in rig.names if name not in names]:
+        draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: nothing here fits, left out")
+    if opened and not first:
+        draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")
+
+
+def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:
+    """The error of a folder whose files cannot be used with its calibration."""
+    names = ", ".join(calibration.rig.names)
+    remedy = f"Let each file, or its folder, bear the name of its camera: {names}."
+    if found:  # keypoints are there, but none can be read
+        remedy = "; ".join(note.told for note in draft.notes if note.about.startswith("keypoints"))
+    problem = "neither videos nor keypoints can be used with the cameras of the calibration"
+    return TakeError(problem, file=draft.folder, place=draft.name(calibration.path), remedy=remedy)
+
+
+def _cut(draft: Draft, streams: Sequence[Video | Keypoints]) -> None:
+    """Enter the frames that all streams have, where they differ in length."""
+    lengths = sorted({len(stream) for stream in streams})
+    if len(lengths) > 1:
+        listed = ", ".join(map(str, lengths))
+        told = Told((0, lengths[0]), "guess", f"streams of {listed} frames, taken as if they began together")
+        draft.head["frames"] = draft.tell("frames", told, "frames")
+
+
+def _frame_of_static(
+    draft: Draft, calibration: CalibrationFile, videos: Sequence[Path], keypoints: Sequence[KeypointFile]
+) -> Told | None:
+    """Image frame of a detector's keypoints as a static trial tells it, in which they are best."""
+    still = [path for path in videos if STATIC.search(draft.name(path))]
+    points = [k for k in keypoints if STATIC.search(draft.name(k.path))]
+    if not (still and points) or len(still) == len(videos):
+        return None
+    aside = Draft(draft.folder, draft.beside)
+    try:
+        describe_cameras(aside, calibration, still, points)
+    except KinefitError:
+        return None
+    found = next((entry["frame"] for _, entry in aside.keypoints if "frame" in entry), None)
+    if found is None or found.sure == "guess":
+        return None
+    return Told(found.value, "likely", f"as in the static trial, where {found.why}")
+
+
+def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | None:
+    """Videos that were recorded together, told what else there is.
+
+    No static trial, not drawn on by a detector, of most cameras, nearest to the folder, the largest: in this order.
+    """
+    sizes: dict[Path, object] = {}
+    wanted = {camera.name: camera.size for camera in rig}
+    if len(set(wanted.values())) == len(rig):
+        for path in paths:
+            with Video(path) as video:
+                sizes[path] = video.size
+    found, left = trials(paths, draft.folder, rig.names, sizes, wanted)
+    for path in left:
+        draft.note("video", "open", f"{draft.name(path)} fits no camera of the calibration: left out")
+
+    def rank(trial: Trial) -> tuple[bool, bool, int, int, int]:
+        size = sum(path.stat().st_size for path in trial.files.values())
+        drawn, deep = bool(DRAWN_ON.search(trial.place)), trial.place.count("/")
+        return bool(STATIC.search(trial.place)), drawn, -len(trial.files), deep, -size
+
+    found = sorted(found, key=rank)
+    if len(found) > 1:
+        draft.note("video", "guess", f"{found[0].place}: taken, the first or largest of {len(found)} recordings")
+    for trial in found[1:]:
+        still = bool(STATIC.search(trial.place))
+        drawn = "another recording, or what a detector drew" if DRAWN_ON.search(trial.place) else "another recording"
+        what = "a static trial" if still else drawn
+        draft.note("video", "likely" if still else "guess", f"{trial.place}: {what}; kinefit init on its own folder")
+        if still:
+            draft.comments.append(
+                f"subject = \"...\"  # open: take of the static trial {trial.place}, to take bone lengths from"
+            )
+    return found[0] if found else None
+
+
+def _pictures(
+    draft: Draft, rig: Rig, names: Sequence[str], opened: dict[str, Video], chosen: Trial | None, turn: Told
+) -> dict[str, ImageFrame]:
+    """Enter each camera's video and what became of its picture; the image frames that are not the calibration's."""
+    images = {}
+    for name in names:
+        entry = draft.cameras.setdefault(name, {})
+        if name not in opened or chosen is None:
+            continue
+        video, (sure, why) = opened[name], HOW[chosen.how]
+        entry["video"] = Told(video.path, sure, f"{why}; {len(video)} frames")
+        draft.note(f"camera {name}", sure, f"{draft.name(video.path)}: found {why}")
+        relation = guess_views.picture(rig[name].size, video, turn)
+        for key, told in relation.items():
+            entry[key] = draft.tell(f"camera {name}", told, key)
+        if relation:
+            image = str(relation["image"].value) if "image" in relation else ""
+            images[name] = guess_views.image_frame(rig[name].size, video.size, _turn(relation), image)
+    return images
+
+
+def _turn(entry: dict[str, Told]) -> int:
+    return int(str(entry["rotation"].value)) if "rotation" in entry else 0
+
+
+def _rate(opened: dict[str, Video], records: dict[str, Keypoints]) -> Told:
+    rates = sorted(video.rate for video in opened.values())
+    tables = [record.rate for record in records.values() if record.rate != 1.0]
+    if rates and rates[-1] > 1.001 * rates[0]:
+        listed = ", ".join(f"{name} {video.rate:.6g}" for name, video in opened.items())
+        return Told(None, "open", f"videos of different rate: {listed} Hz; resample them: ffmpeg -i IN -r RATE OUT")
+    if rates:
+        return Told(rates[0], "sure", "of the videos")
+    if tables:
+        return Told(round(min(tables), 3), "likely", "median of the table's own times")
+    return Told(None, "open", "nothing here tells the frames per second: write it")
+
+
+def _world(
+    draft: Draft, calibration: CalibrationFile, records: dict[str, Keypoints], images: dict[str, ImageFrame]
+) -> None:
+    """Enter unit and vertical axis of the calibration's world."""
+    person: NDArray | None = None
+    spread = calibration.spread
+    size = Told(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints tell more")
+    if _LABORATORY[0] < spread < _LABORATORY[1]:
+        size = Told("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
+    if len(records) > 1:
+        x, _ = guess_views.meet(calibration.rig, records, images)
+        points = next(iter(records.values())).names
+        size, person = guess_views.guess_unit(x, points), guess_views.up_of_person(x, points)
+    unit = Told(calibration.unit, "guess", "so the cameras stand some metres apart")
+    if unit.value == "auto" and size.value not in (None, "m"):
+        unit = size
+    if unit.value != "auto" and draft.calibration:
+        draft.calibration[1]["unit"] = draft.tell("calibration", unit, "unit")
+    else:
+        told = "as Qualisys defines it" if calibration.is_qualisys else "metres"
+        draft.note("calibration", size.sure, f"unit: {told}{'' if size.value else '?'}: {size.why}")
+    turns = {name: _turn(entry) for name, entry in draft.cameras.items()}
+    up = guess_views.guess_up(calibration.rig, person, turns, qualisys=calibration.is_qualisys)
+    draft.head["up"] = draft.tell("up", up, "up")

@@ -1,0 +1,237 @@
+"""What lies in a folder: calibrations, videos, keypoints, markers; each tried, none changed."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError, KinefitError
+from kinefit.geometry.camera import Rig
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.guess.names import natural
+
+VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
+CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
+MARKERS = {".c3d", ".trc"}
+OF_CALIBRATION = re.compile(
+    r"(?<![a-z])(?:(?:intrinsic|extrinsic|charuco|checker|chess|calib)\w*|board|wand|int|ext)(?![a-z])", re.IGNORECASE
+)
+"""Words in a path that tell recordings made to calibrate cameras."""
+STATIC = re.compile(r"(?<![a-z])(?:static|neutral|[ta][-_ ]?pose)", re.IGNORECASE)
+"""Words in a path that tell a trial in which the person stands still."""
+
+DRAWN_ON = re.compile(r"(?<![a-z])(?:pose|overlay|labell?ed|annotated|results?|debug)(?![a-z])", re.IGNORECASE)
+"""Words in a path that tell videos which a detector has drawn on."""
+
+_RESULTS = ("-kinefit", "-detect")  # folders that kinefit leaves
+_DEEPEST = 6  # folders below the given one
+_LARGEST = 5_000_000  # [bytes] no calibration is larger
+_MANY = 12  # json files of numbered names in one folder are a detector's, not a camera's each
+_JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
+_CALISCOPE = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
+_CALLED = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # a broken file of another name may be anything
+_UNITS = ("mm", "cm", "inch", "dm")
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationFile:
+    """A calibration of several cameras, and the unit of length it was read with."""
+
+    path: Path
+    rig: Rig
+    unit: str = "auto"
+
+    @property
+    def spread(self) -> float:
+        """[m] median distance of its cameras from their middle."""
+        return _spread(self.rig)
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether its name says so."""
+        return any(word in self.path.name.lower() for word in ("refined", "adjusted", "optimi"))
+
+    @property
+    def is_qualisys(self) -> bool:
+        """Whether it is Qualisys', whose worlds are z up."""
+        return self.path.is_file() and "<calibration" in self.path.read_text("utf-8", errors="replace")[:1000]
+
+
+@dataclass(frozen=True)
+class KeypointFile:
+    """Keypoints of one camera (of all cameras: caliscope's table), with the number of frames and points in each."""
+
+    path: Path
+    format: str
+    frames: int
+    points: int
+
+
+def list_files(folder: Path) -> list[Path]:
+    """Files below a folder, in natural order; hidden ones and results of kinefit left out."""
+    found: list[Path] = []
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        depth = len(Path(parent).relative_to(folder).parts)
+        folders[:] = [n for n in folders if not n.startswith(".") and not n.endswith(_RESULTS) and depth < _DEEPEST]
+        found += [Path(parent) / name for name in names if not name.startswith(".")]
+    return sorted(found, key=lambda path: natural(str(path)))
+
+
+def find_calibrations(files: list[Path]) -> tuple[list[CalibrationFile], list[Path], list[KinefitError]]:
+    """All calibrations of two or more cameras among files, by trying to read them.
+
+    Returns
+    -------
+    calibrations; files of a single camera; errors of files that are calibrations but cannot be used.
+    """
+    found: list[CalibrationFile] = []
+    singles: list[Path] = []
+    faults: list[KinefitError] = []
+    detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MANY}
+    for path in files:
+        if not path.name.lower().endswith(CALIBRATIONS) or (path.parent in detectors and _numbered(path)):
+            continue
+        if path.stat().st_size > _LARGEST:
+            continue
+        read = _try(path, faults)
+        if read and len(read.rig) > 1:
+            found.append(read)
+        elif read:
+            singles.append(path)
+    for folder in _folders(files, singles):
+        read = _try(folder, faults)
+        if read and len(read.rig) > 1:
+            found.append(read)
+            faults = [fault for fault in faults if Path(str(fault.file)).parent != folder]
+    return found, singles, faults
+
+
+def _numbered(path: Path) -> bool:
+    return bool(_JSON_NUMBER.search(path.name))
+
+
+def _by_folder(files: list[Path]) -> list[tuple[Path, list[Path]]]:
+    ordered = sorted(files, key=lambda path: str(path.parent))
+    return [(folder, list(group)) for folder, group in groupby(ordered, key=lambda path: path.parent)]
+
+
+def _folders(files: list[Path], singles: list[Path]) -> list[Path]:
+    """Folders that are a calibration as a whole: COLMAP's, intrinsics and extrinsics, one file or folder a camera."""
+    out = []
+    for folder, group in _by_folder(files):
+        names = {path.name for path in group}
+        stems = {path.stem.lower() for path in group}
+        if {"cameras.txt", "images.txt"} <= names or {"intrinsics", "extrinsics"} <= stems:
+            out.append(folder)
+    per_folder = _by_folder(singles)
+    out += [folder for folder, group in per_folder if len(group) > 1]
+    alone = sorted(folder.parent for folder, group in per_folder if len(group) == 1)
+    out += [parent for parent, group in groupby(alone) if len(list(group)) > 1]
+    return list(dict.fromkeys(out))
+
+
+def _try(path: Path, faults: list[KinefitError]) -> CalibrationFile | None:
+    """Read a calibration; without a unit that can be, in the one that puts the cameras most like a laboratory's."""
+    try:
+        return CalibrationFile(path, read_calibration(path))
+    except CalibrationError as error:
+        if "cannot be metres" not in error.problem:
+            if "no camera in it" not in error.problem and (error.place or _CALLED.search(path.name)):
+                faults.append(error)
+            return None
+    except (KinefitError, RecursionError):
+        return None
+    rigs = {unit: read_calibration(path, unit=unit) for unit in _UNITS}
+    unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # [m] usual between cameras and what they see
+    return CalibrationFile(path, rigs[unit], unit)
+
+
+def _spread(rig: Rig) -> float:
+    """[m] median distance of the cameras from their middle."""
+    centres = np.array([camera.centre_world for camera in rig])
+    return float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1))) or 1e-9
+
+
+def find_videos(files: list[Path]) -> list[Path]:
+    """Files that are called videos."""
+    return [path for path in files if path.suffix.lower() in VIDEOS]
+
+
+def find_markers(files: list[Path]) -> list[Path]:
+    """C3D and TRC files."""
+    return [path for path in files if path.suffix.lower() in MARKERS]
+
+
+def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
+    """Keypoints of every format that a take knows; and remarks on what looks like keypoints but is none of these."""
+    found: list[KeypointFile] = []
+    remarks: list[str] = []
+    for folder, group in _by_folder(files):
+        numbered = [path for path in group if _numbered(path)]
+        points = _openpose_points(numbered)
+        if points is not None:
+            found.append(KeypointFile(folder, "openpose", len(numbered), points))
+    for path in files:
+        suffix = path.suffix.lower()
+        shape = _array_shape(path) if suffix == ".npy" else None
+        if shape is not None and len(shape) == 3 and shape[1:] == (33, 3):
+            found.append(KeypointFile(path, "mediapipe", shape[0], 33))
+        elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
+            remarks.append(f"{path.name}: an array of shape {shape}; landmarks are read as (frames, 33, 3)")
+        if suffix == ".csv" and (frames := _caliscope_frames(path)):
+            found.append(KeypointFile(path, "caliscope", frames, 33))
+    return found, remarks
+
+
+class _Person(msgspec.Struct):
+    pose_keypoints_2d: list[float]
+
+
+class _Frame(msgspec.Struct):
+    people: list[_Person]
+
+
+def _openpose_points(numbered: list[Path]) -> int | None:
+    """Points of a person in json files of numbered names; 0: nobody in them; None: no files of OpenPose."""
+    decode = msgspec.json.Decoder(_Frame).decode
+    there = False
+    for path in numbered:
+        try:
+            people = decode(path.read_bytes()).people
+        except (msgspec.DecodeError, OSError):
+            if not there:
+                return None
+            continue
+        there = True
+        if people:
+            return len(people[0].pose_keypoints_2d) // 3
+    return 0 if there else None
+
+
+def _array_shape(path: Path) -> tuple[int, ...] | None:
+    try:
+        array: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    return array.shape if array.dtype.kind in "fiu" else None
+
+
+def _caliscope_frames(path: Path) -> int:
+    """Frames of a table of caliscope that holds points of a body, not of a board; 0 for any other table."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if not set(reader.fieldnames or ()) >= _CALISCOPE:
+                return 0
+            body = [int(row["sync_index"]) for row in reader if not row.get("obj_loc_x")]
+    except (OSError, ValueError, TypeError, UnicodeDecodeError, csv.Error):
+        return 0
+    return max(body) - min(body) + 1 if body else 0

@@ -1,0 +1,157 @@
+"""A first take file from what lies in a folder: what was guessed, and how sure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, KinefitError, TakeError
+from kinefit.readers.guess import files as guess_files
+from kinefit.readers.guess.cameras import describe_cameras
+from kinefit.readers.guess.draft import Draft, Note, Told
+from kinefit.readers.guess.files import STATIC, CalibrationFile
+from kinefit.readers.guess.names import trials
+from kinefit.readers.markers import read_markers
+
+_CALIBRATE = (
+    "Calibrate with a board (kinefit calibrate board) or, where the cameras' interiors are known, from the person "
+    "(kinefit calibrate people); then run kinefit init again."
+)
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A take file that is not yet written: its text (TOML), and what was guessed, line by line."""
+
+    text: str
+    notes: tuple[Note, ...]
+
+
+def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | None = None) -> Guess:
+    """Make the text of a take file from what lies in a folder; writes nothing.
+
+    Parameters
+    ----------
+    folder : path
+        Searched with the folders below it; for a calibration the one above too.
+    beside : path, optional
+        Folder in which the take file will lie, to which its paths are relative. Default: `folder`.
+
+    Raises
+    ------
+    TakeError
+        No such folder; nothing in it that a take is made of; files that fit no camera of the calibration.
+    CalibrationError
+        Videos or keypoints without a calibration.
+    FileError
+        A video that is damaged.
+    """
+    folder = Path(folder).absolute()
+    if not folder.is_dir():
+        raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
+    draft = Draft(folder, Path(beside).absolute() if beside else folder)
+    files = guess_files.list_files(folder)
+    videos, markers = guess_files.find_videos(files), guess_files.find_markers(files)
+    keypoints, remarks = guess_files.find_keypoints(files)
+    for remark in remarks:
+        draft.note("keypoints", "open", remark)
+    if not (videos or keypoints or markers):
+        raise TakeError(
+            f"nothing here that a take is made of, among {len(files)} files", file=folder,
+            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d or .trc.",
+        )
+    if videos or keypoints:
+        calibration = _choose_calibration(draft, files, videos + [k.path for k in keypoints], bool(markers))
+        if calibration is not None:
+            describe_cameras(draft, calibration, videos, keypoints)
+    _describe_markers(draft, markers)
+    draft.comments.append('height = 1.75  # open: the stature in metres, where you know it')
+    return Guess(draft.text(), tuple(draft.notes))
+
+
+def _choose_calibration(
+    draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
+) -> CalibrationFile | None:
+    """The calibration that most files fit; from the folder above where there is none here."""
+    found, singles, faults = guess_files.find_calibrations(files)
+    if not found:
+        found = guess_files.find_calibrations(_above(draft.folder))[0]
+    if not found and markers:
+        draft.note("calibration", "open", f"none, so that videos and keypoints are left out. {_CALIBRATE}")
+        return None
+    if not found and faults:
+        fault = faults[0]
+        raise CalibrationError(
+            f"no calibration can be used: {fault.problem}", file=fault.file, place=fault.place,
+            remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
+        )
+    if not found:
+        alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
+        raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
+
+    def fitting(c: CalibrationFile) -> int:
+        return max((len(t.files) for t in trials(seen, draft.folder, c.rig.names)[0]), default=0)
+
+    def rank(c: CalibrationFile) -> tuple[int, bool, int, str]:
+        return -fitting(c), not c.is_refined, len(Path(draft.name(c.path)).parts), c.path.name
+
+    best, *others = sorted(found, key=rank)
+    why = f"{len(best.rig)} cameras: {', '.join(best.rig.names)}"
+    if others:
+        draft.others = [c.path for c in others]
+        reason = (
+            "more files fit its cameras" if fitting(best) > fitting(others[0])
+            else "its name says that it was refined" if best.is_refined > others[0].is_refined
+            else "it lies nearer"
+        )  # fmt: skip
+        why += f"; taken before {', '.join(map(draft.name, draft.others))}, since {reason}"
+    told = Told(best.path, "likely" if others else "sure", why)
+    draft.note("calibration", told.sure, f"{draft.name(best.path)}: {why}")
+    draft.calibration = best, {"file": told}
+    return best
+
+
+def _above(folder: Path) -> list[Path]:
+    """Files beside a folder, and in folders there that are called after a calibration."""
+    out: list[Path] = []
+    for path in sorted(folder.parent.iterdir()):
+        inside = sorted(path.iterdir()) if path.is_dir() and "calib" in path.name.lower() else [path]
+        out += [file for file in inside if file.is_file()]
+    return out
+
+
+def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
+    """Enter marker files: in use where there is nothing else, else as comments (they may be another tool's results)."""
+    faults: list[KinefitError] = []
+    records = {}
+    for path in files:
+        try:
+            records[path] = read_markers(path)
+        except KinefitError as error:
+            faults.append(error)
+            draft.note("markers", "open", f"{draft.name(path)} left out: {error.problem}")
+    if faults and not records and not draft.cameras:
+        raise TakeError(
+            f"no marker file can be read: {faults[0].problem}", file=faults[0].file, remedy=faults[0].remedy
+        )
+    moving = [path for path in records if not STATIC.search(path.name)]
+    used = next(iter(moving or records), None) if not draft.cameras else None
+    for path, record in records.items():
+        told = Told(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
+        draft.markers.append((path == used, {"file": told}))
+    if used is not None:
+        record = records[used]
+        extent = np.nanmedian(np.nanmax(record.positions, 1) - np.nanmin(record.positions, 1), axis=0)
+        up = Told("xyz"[int(np.nanargmax(extent))], "likely", f"markers spread {np.nanmax(extent):.2f} m along it")
+        up = Told(record.up, "sure", "the file says so") if record.up else up
+        draft.head = {"rate": Told(record.rate, "sure", "of the markers"), "up": draft.tell("up", up, "up")}
+        draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: taken")
+        draft.note("markers", "sure", "kinefit.fit_markers fits a body to them; kinefit track needs cameras")
+    left = len(records) - (used is not None)
+    if left:
+        reason = "results of other programs, or" if draft.cameras else ""
+        draft.note("markers", "guess", f"{left} files stand as comments: {reason} other recordings".replace("  ", " "))

@@ -1,0 +1,112 @@
+"""Keypoints of a take to be: which belong to the videos, their set, their image frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from kinefit.errors import KinefitError, ObservationError
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.observations import Keypoints
+from kinefit.readers.guess import views as guess_views
+from kinefit.readers.guess.draft import Draft, Told
+from kinefit.readers.guess.files import STATIC, KeypointFile
+from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
+from kinefit.readers.keypoints import KEYPOINT_SETS, read_keypoints
+
+Source = dict[str, KeypointFile]  # camera -> its file, of one detector
+
+_SETS = {17: "COCO_17", 25: "BODY_25B", 26: "HALPE_26", 33: "MEDIAPIPE_33"}
+_FORMATS = ("openpose", "mediapipe", "caliscope")  # of several detectors the first: its confidence tells the most
+_SAME_LENGTH = 0.1  # keypoints whose number of frames is farther from the video's are of another recording
+
+
+def keypoint_sources(
+    draft: Draft, found: Sequence[KeypointFile], rig: Rig, frames: int, place: str
+) -> list[Source]:
+    """Keypoints of each detector that belong to the videos: of so many frames (0: there are none) and of that place."""
+    out: list[Source] = []
+    for format in _FORMATS:
+        of = {k.path: k for k in found if k.format == format and k.points}
+        for k in found:
+            if k.format == format and not k.points:
+                draft.note("keypoints", "open", f"{draft.name(k.path)}: nobody is seen in any frame, left out")
+        if format == "caliscope":  # one table of all cameras
+            numbered = [name for name in rig.names if camera_number(name) is not None]
+            groups = [Trial(dict.fromkeys(numbered, path), "number", draft.name(path)) for path in of]
+        else:
+            groups = trials(list(of), draft.folder, rig.names)[0]
+        groups = [trial for trial in groups if len(trial.files) > 1]
+        counts = {trial.place: min(of[path].frames for path in trial.files.values()) for trial in groups}
+
+        def rank(trial: Trial, counts: Mapping[str, int] = counts) -> tuple[bool, bool, int, int]:
+            off = abs(counts[trial.place] - frames) if frames else -counts[trial.place]
+            shared = -common_words(trial.place, place)
+            return bool(STATIC.search(trial.place)), bool(frames) and off > _SAME_LENGTH * frames, shared, off
+
+        for trial in sorted(groups, key=rank)[:1]:
+            if frames and abs(counts[trial.place] - frames) > _SAME_LENGTH * frames:
+                told = f"{counts[trial.place]} frames, the videos have {frames}: of another recording, left out"
+                draft.note("keypoints", "likely", f"{trial.place}: {told}")
+            else:
+                out.append({name: of[path] for name, path in trial.files.items()})
+    return out
+
+
+def read_sources(draft: Draft, sources: Sequence[Source]) -> list[dict[str, Keypoints]]:
+    """Keypoints of every detector and camera, as the files have them; what cannot be read is told and left out."""
+    out = []
+    for source in sources:
+        read: dict[str, Keypoints] = {}
+        for name, file in source.items():
+            try:
+                read[name] = _read(file, name)
+            except KinefitError as error:
+                draft.note(f"keypoints {name}", "open", f"{draft.name(file.path)} left out: {error.problem}")
+        out.append(read)
+    return out
+
+
+def _read(file: KeypointFile, camera: str) -> Keypoints:
+    """Keypoints of a camera; where no rate is told, at 1 Hz."""
+    if file.format == "openpose":
+        if file.points not in _SETS:
+            raise ObservationError(f"{file.points} points; there are sets of {', '.join(map(str, _SETS))}")
+        record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=_SETS[file.points])
+        if file.points == 25 and (name := guess_views.guess_body_25(record)) != record.keypoint_set:
+            record = replace(record, keypoint_set=name, names=KEYPOINT_SETS[name])
+    else:
+        rate = None if file.format == "caliscope" else 1.0
+        record = read_keypoints(file.path, format=file.format, camera=camera, rate=rate)
+    if guess_views.looks_normalised(record):
+        raise ObservationError("its coordinates run from 0 to 1, not over pixels: multiply by width and height")
+    return record
+
+
+def keypoint_entries(
+    draft: Draft, source: Source, records: Mapping[str, Keypoints], frame: Told | None,
+    images: Mapping[str, ImageFrame], *, active: bool,
+) -> None:
+    """Enter the tables [[keypoints]] of one detector; as comments unless it is the one to use.
+
+    Parameters
+    ----------
+    frame : in which image the coordinates are, for the cameras in `images`.
+    """
+    if not records:
+        return
+    format = next(iter(source.values())).format
+    what = f"{format}, {', '.join(sorted({r.keypoint_set for r in records.values()}))}, {len(records)} cameras"
+    told = f"{what}: taken" if active else f"{what}: left as comments, as one detector is enough to begin with"
+    draft.note("keypoints", "sure" if active else "guess", told)
+    if frame is not None:
+        draft.tell(f"keypoints, {format}", frame, "frame")
+    for name, record in records.items():
+        entry = {"camera": Told(name), "file": Told(source[name].path), "format": Told(format)}
+        if format == "openpose":
+            of_two = source[name].points == 25  # BODY_25 and BODY_25B
+            why = f"{source[name].points} points" + ", told by where neck and hips lie" * of_two
+            entry["set"] = Told(record.keypoint_set, "likely" if of_two else "sure", why)
+        if frame is not None and name in images:
+            entry["frame"] = frame
+        draft.keypoints.append((active, entry))

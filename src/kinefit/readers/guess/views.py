@@ -1,0 +1,300 @@
+"""What pictures and keypoints tell: black bars, the image frame of keypoints, the vertical, the unit of length."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.motion import UP_AXES
+from kinefit.observations import Keypoints
+from kinefit.readers.guess.draft import Told
+from kinefit.readers.video import Video
+
+Size = tuple[int, int]
+
+_BLACK = 32  # of 255: a row three quarters of which are darker is a bar's; compression smears edges into bars
+_LOOKED_AT = 5  # pictures of a video
+_FRAMES = 60  # of the keypoints, spread over the recording
+_CONFIDENT = 0.3
+_AGREE = 0.03  # two cameras agree on a point within this share of the picture's diagonal
+_SAME_ASPECT = 0.002
+_OUTSIDE = 0.005  # more points than this beside a picture are no slips of a detector
+_BETTER = 0.8  # a few pixels of shift are lost in a detector's noise and a calibration's bias; more than this is not
+_BONES = {  # [m] in a person of 1.75 m (Winter 2009, table 4.1: shares of the stature)
+    ("shoulder", "elbow"): 0.186 * 1.75, ("elbow", "wrist"): 0.146 * 1.75, ("hip", "knee"): 0.245 * 1.75,
+    ("knee", "ankle"): 0.246 * 1.75, ("shoulder", "hip"): 0.288 * 1.75,
+}  # fmt: skip
+_UNITS = {"m": 1.0, "dm": 10.0, "inch": 39.37, "cm": 100.0, "mm": 1000.0}
+_UNIT_TOLERANCE = 1.45  # people differ by 1.25 in size, detectors and half-seen bones add to it
+
+
+def is_turned(calibrated: Size, size: Size) -> bool:
+    """Whether one of two pictures stands and the other lies."""
+    return (size[0] - size[1]) * (calibrated[0] - calibrated[1]) < 0
+
+
+def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, Size]) -> Told:
+    """Turn [deg], clockwise, of the pictures that stand where the calibration's lie: 90 or 270.
+
+    By the keypoints, which meet in space only after the right one; without any, so that people stand upright in a
+    world whose vertical is one of its axes, not the reverse of one.
+
+    Parameters
+    ----------
+    records : {camera: Keypoints} as the files have them.
+    sizes : {camera: (width, height) [px]} of the videos, turned ones and others.
+    """
+    turned = [name for name, size in sizes.items() if is_turned(rig[name].size, size)]
+    misses, seen = {}, [name for name in turned if name in records]
+    for degrees in (90, 270) if seen and len(records) > 1 else ():
+        images = {n: image_frame(rig[n].size, sizes[n], degrees, "scaled") for n in seen}
+        x, residual = meet(rig, records, images)
+        found = np.isfinite(x).all(-1).sum()
+        misses[degrees] = float(np.median(residual[np.isfinite(residual)])) / found if found else np.inf
+    if misses and min(misses.values()) < _BETTER * max(misses.values()):
+        best = min(misses, key=lambda degrees: misses[degrees])
+        return Told(best, "likely", f"so that the keypoints of the cameras meet, not if turned by {360 - best}")
+    for degrees in (90, 270):
+        axis, angle = nearest_axis(up_of_cameras(rig, dict.fromkeys(turned, degrees)))
+        if not axis.startswith("-") and angle < 30:
+            return Told(degrees, "guess", f"so that people stand upright, {axis} being up; else {360 - degrees}")
+    return Told(90, "guess", "clockwise or counterclockwise: try 90, then 270")
+
+
+def picture(calibrated: Size, video: Video, turn: Told) -> dict[str, Told]:
+    """How a video's picture came about from the calibration's: `image` and `rotation` of a `[[camera]]`.
+
+    Parameters
+    ----------
+    calibrated : (width, height) [px]
+    video : Video
+    turn : of `guess_turn`, for a picture that is turned.
+    """
+    size, out = video.size, {}
+    told = f"the video has {size[0]}x{size[1]} px, the calibration {calibrated[0]}x{calibrated[1]}"
+    turned = calibrated
+    if is_turned(calibrated, size):
+        turned = calibrated[::-1]
+        out["rotation"] = Told(turn.value, turn.sure, f"{told}; {turn.why}")
+    if size == turned:
+        return out
+    if abs(size[0] * turned[1] / (size[1] * turned[0]) - 1) < _SAME_ASPECT:
+        return out | {"image": Told("scaled", "sure", f"{told}: the same shape")}
+    bars, expected = black_bars(video), _letterbox_bars(turned, size)
+    fits = np.all(np.abs(np.subtract(bars, expected)) <= np.maximum(2, 0.2 * np.asarray(expected)))
+    if fits:
+        return out | {"image": Told("letterboxed", "sure", f"{told}, and it has black bars of {max(bars)} px")}
+    if max(expected) < 2:
+        return out | {"image": Told("letterboxed", "likely", f"{told}: nearly the same shape")}
+    return out | {"image": Told("scaled", "guess", f"{told}, and it has no black bars; it may have been cut instead")}
+
+
+def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> ImageFrame:
+    """Map of a picture that was turned clockwise, then "scaled" or "letterboxed" (or neither)."""
+    frame = ImageFrame.rotated(calibrated, degrees)
+    turned = calibrated if degrees % 180 == 0 else calibrated[::-1]
+    make = {"scaled": ImageFrame.scaled, "letterboxed": ImageFrame.letterboxed}.get(image)
+    return frame.then(make(turned, size)) if make else frame
+
+
+def black_bars(video: Video) -> tuple[int, int]:
+    """Width [px] of the dark bars (left or right, above or below), the smaller of both sides."""
+    numbers = np.unique(np.linspace(0, len(video) - 1, _LOOKED_AT).astype(int))
+    brightest = np.max([video.read(int(i)) for i in numbers], axis=0).max(axis=2)
+    columns, rows = (np.percentile(brightest, 75, axis=axis) > _BLACK for axis in (0, 1))
+    return _dark_ends(columns), _dark_ends(rows)
+
+
+def _dark_ends(bright: NDArray) -> int:
+    at = np.flatnonzero(bright)
+    return int(min(at[0], len(bright) - 1 - at[-1])) if len(at) else 0
+
+
+def _letterbox_bars(calibrated: Size, size: Size) -> tuple[int, int]:
+    s = min(size[0] / calibrated[0], size[1] / calibrated[1])
+    return round(0.5 * (size[0] - s * calibrated[0])), round(0.5 * (size[1] - s * calibrated[1]))
+
+
+def one_person(record: Keypoints, frames: NDArray) -> NDArray:
+    """(F, K, 2) [px] points of the largest surely seen person in some frames; NaN where unseen."""
+    points, confidence = record.points[frames], record.confidence[frames]
+    points = np.where((confidence > _CONFIDENT)[..., None], points, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # all of nobody is NaN
+        extent = np.linalg.norm(np.nanmax(points, axis=2) - np.nanmin(points, axis=2), axis=-1)
+    score = np.nan_to_num(extent) * np.isfinite(points[..., 0]).sum(-1)
+    return points[np.arange(len(frames)), np.argmax(score, axis=1)]
+
+
+def spread_frames(count: int) -> NDArray:
+    """Frames of a recording, spread over it."""
+    return np.unique(np.linspace(0, count - 1, _FRAMES).astype(int))
+
+
+def looks_normalised(record: Keypoints) -> bool:
+    """Whether coordinates run from 0 to 1 rather than over pixels."""
+    return bool(np.nanmax(np.abs(record.points)) <= 2.0)
+
+
+def guess_body_25(record: Keypoints) -> str:
+    """BODY_25 or BODY_25B, which both have 25 points: where neck and hips lie among the points tells it."""
+    points = one_person(record, spread_frames(len(record)))
+
+    def off(middle: int, left: int, right: int) -> NDArray:
+        width = np.linalg.norm(points[:, left] - points[:, right], axis=-1) + 1.0
+        return np.linalg.norm(points[:, middle] - 0.5 * (points[:, left] + points[:, right]), axis=-1) / width
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        plain = np.nanmedian(np.stack([off(1, 2, 5), off(8, 9, 12)]))  # Neck, MidHip
+        later = np.nanmedian(np.stack([off(17, 5, 6), off(0, 1, 2)]))  # UpperNeck, nose between the eyes
+    return "BODY_25" if plain < later else "BODY_25B"
+
+
+def keypoint_frame(
+    rig: Rig, records: Mapping[str, Keypoints], images: Mapping[str, ImageFrame], sizes: Mapping[str, Size]
+) -> Told | None:
+    """Whether keypoints are in pixels of the "video" or of the "calibration", where the two differ; None: nowhere.
+
+    Parameters
+    ----------
+    records : {camera: Keypoints} as the files have them.
+    images : {camera: ImageFrame} of the cameras whose picture is not the calibration's.
+    sizes : {camera: (width, height) [px] of the video}
+    """
+    images = {name: image for name, image in images.items() if name in records}
+    if not images:
+        return None
+    for name in images:
+        points = records[name].points[records[name].confidence > _CONFIDENT]
+        outside = {
+            frame: float(np.any((points > np.add(size, 0.5)) | (points < -1.5), axis=-1).mean()) if len(points) else 0.0
+            for frame, size in (("video", sizes[name]), ("calibration", rig[name].size))
+        }
+        for frame, other in (("calibration", "video"), ("video", "calibration")):
+            if outside[other] > _OUTSIDE > outside[frame]:
+                share = f"{100 * outside[other]:.1f} % of the points of {name} lie outside the {other}'s picture"
+                return Told(frame, "sure" if outside[other] > 10 * _OUTSIDE else "likely", share)
+    medians = {}
+    for frame in ("video", "calibration"):
+        residual = meet(rig, records, images if frame == "video" else {})[1]
+        medians[frame] = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
+    if not np.isfinite(list(medians.values())).all():
+        return Told("video", "guess", "detectors run on the video; too little is seen to check it")
+    best, other = sorted(medians, key=lambda name: medians[name])
+    why = f"the cameras agree to {medians[best]:.1f} px, to {medians[other]:.1f} px if in the {other}'s"
+    if medians[best] < _BETTER * medians[other]:
+        return Told(best, "likely", why)
+    return Told("video", "guess", f"detectors run on the video; both fit alike ({why})")
+
+
+def meet(
+    rig: Rig, records: Mapping[str, Keypoints], images: Mapping[str, ImageFrame] | None = None
+) -> tuple[NDArray, NDArray]:
+    """Where the keypoints of the cameras meet in some frames.
+
+    Parameters
+    ----------
+    images : {camera: ImageFrame} of the cameras whose keypoints are not in the calibration's image.
+
+    Returns
+    -------
+    x_world : (F, K, 3) [m], NaN where no two cameras agree; residual_px : (F, K, C) [px].
+    """
+    rig = rig.select(tuple(records))
+    frames = spread_frames(min(len(record) for record in records.values()))
+    views = []
+    for name, record in records.items():
+        image, seen = (images or {}).get(name), one_person(record, frames)
+        views.append(image.to_calibration(seen) if image else seen)
+    points = np.stack(views, axis=2)  # (F, K, C, 2)
+    limit = _AGREE * max(float(np.hypot(*camera.size)) for camera in rig)
+    flat = points.reshape(-1, *points.shape[2:])
+    x, inliers, residual = triangulate_robust(rig, flat, max_residual_px=limit)
+    residual = np.where(inliers, residual, np.nan)
+    return x.reshape(*points.shape[:2], 3), residual.reshape(points.shape[:3])
+
+
+def guess_unit(x: NDArray, names: Sequence[str]) -> Told:
+    """Unit of the calibration's length from the size of the person seen, (F, K, 3) in that unit."""
+    ratios = []
+    for (a, b), length in _BONES.items():
+        for side in ("left", "right"):
+            i, j = _point(names, side, a), _point(names, side, b)
+            if i is not None and j is not None:
+                ratios += (np.linalg.norm(x[:, i] - x[:, j], axis=-1) / length).tolist()
+    seen = np.array(ratios)[np.isfinite(ratios)]
+    if len(seen) < 20:
+        return Told(None, "open", "too few points meet in space to tell the person's size")
+    ratio = float(np.median(seen))
+    unit = min(_UNITS, key=lambda u: abs(np.log(ratio / _UNITS[u])))
+    if abs(np.log(ratio / _UNITS[unit])) < np.log(_UNIT_TOLERANCE):
+        height = 1.75 * ratio / _UNITS[unit]
+        return Told(unit, "likely", f"a person so long in the limbs would be {height:.2f} m tall")
+    return Told(None, "open", f"in metres the person would be {1.75 * ratio:.3g} m tall: no usual unit")
+
+
+def up_of_person(x: NDArray, names: Sequence[str]) -> NDArray | None:
+    """(3,) direction from hips to shoulders, or from ankles to hips, median over frames; None where not seen."""
+    for low, high in (("hip", "shoulder"), ("ankle", "hip"), ("hip", "ear"), ("elbow", "shoulder")):
+        at = {
+            (side, joint): _point(names, side, joint) for side in ("left", "right") for joint in (low, high)
+        }
+        if None in at.values():
+            continue
+        ways = sum(x[:, at[side, high]] - x[:, at[side, low]] for side in ("left", "right"))
+        ways = ways[np.isfinite(ways).all(-1)]  # type: ignore[index]
+        if len(ways) >= 3:
+            way = np.median(ways / np.linalg.norm(ways, axis=1, keepdims=True), axis=0)
+            return way / np.linalg.norm(way)
+    return None
+
+
+def up_of_cameras(rig: Rig, turns: Mapping[str, int] | None = None) -> NDArray:
+    """(3,) mean direction that points up in the cameras' pictures: cameras mostly stand upright.
+
+    Parameters
+    ----------
+    turns : {camera: clockwise turn [deg] of its picture against the calibration's}, optional
+    """
+    up_camera = {0: (0, -1, 0), 90: (-1, 0, 0), 180: (0, 1, 0), 270: (1, 0, 0)}
+    ways = [np.array(up_camera[(turns or {}).get(c.name, 0)]) @ c.T_camera_world[:3, :3] for c in rig]
+    mean = np.sum(ways, axis=0)
+    return mean / (np.linalg.norm(mean) or 1.0)
+
+
+def nearest_axis(way: NDArray) -> tuple[str, float]:
+    """Axis of the world nearest to a direction, and the angle to it [deg]."""
+    name = max(UP_AXES, key=lambda axis: float(np.dot(UP_AXES[axis], way)))
+    return name, float(np.degrees(np.arccos(np.clip(np.dot(UP_AXES[name], way), -1, 1))))
+
+
+def guess_up(rig: Rig, person: NDArray | None, turns: Mapping[str, int], *, qualisys: bool) -> Told:
+    """The vertical axis of the calibration's world from its format, the person and the cameras."""
+    cameras, tilt = nearest_axis(up_of_cameras(rig, turns))
+    votes = {"the cameras stand upright": cameras}
+    if person is not None:
+        axis, lean = nearest_axis(person)
+        votes, tilt = {"the person stands so": axis} | votes, min(tilt, lean)
+    if qualisys:
+        votes = {"Qualisys' worlds are z up": "z"} | votes
+    why, axis = next(iter(votes.items()))
+    against = [f"{reason} would give {other}" for reason, other in votes.items() if other != axis]
+    if against:
+        return Told(axis, "guess", f"{why}; but {', '.join(against)}")
+    leaning = f", {tilt:.0f} degrees off the axis: the world may lean" if tilt > 15 else ""
+    sure = "guess" if tilt > 30 else "sure" if len(votes) > 1 and tilt < 20 else "likely"
+    return Told(axis, sure, f"{' and '.join(votes)}{leaning}")
+
+
+def _point(names: Sequence[str], side: str, joint: str) -> int | None:
+    """Index of a joint's point under a detector's spelling: "LHip", "left_hip"."""
+    for spelled in (f"{side}_{joint}", f"{side[0].upper()}{joint.capitalize()}"):
+        if spelled in names:
+            return list(names).index(spelled)
+    return None

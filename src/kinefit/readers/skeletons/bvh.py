@@ -1,0 +1,310 @@
+"""BVH (Biovision hierarchy): a skeleton and its motion."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike, fspath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError
+from kinefit.observations import SkeletonMotion
+from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text
+
+UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
+"""Metres per unit that "auto" chooses from: mm, cm, inch, the unit of CMU's ASF files, m."""
+
+_STATURE, _LEAST, _LARGEST = 1.7, 1.0, 2.2  # [m]; from a child of six upwards
+_HEAD_TO_ANKLE = 0.85  # length of the chain of bones from the head's joint to the ankle, as a part of the stature
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: str
+    parent: int
+    offset: tuple[float, ...]
+    channels: tuple[str, ...]  # such as "xposition", in the file's order
+
+
+def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str = "auto") -> SkeletonMotion:
+    """Read a BVH file.
+
+    Rotation channels multiply from left to right in the order in which the file lists them. Position channels
+    hold the joint's place instead of its OFFSET in some programs' files and the way from its OFFSET in others';
+    taken is whichever the values are nearer to (for the root: in height). The rest pose is that of all angles
+    zero, which need not be one that a person can take.
+
+    Parameters
+    ----------
+    path : path
+    unit : float [m] or "auto"
+        Metres per unit of length of the file, which BVH does not state. "auto" takes the one of `UNITS` that
+        gives the skeleton the most human stature (within 1.0 to 2.2 m, nearest to 1.7 m). The unit taken is
+        stated in the motion's `source`.
+    up : "x", "y", "z" or "auto"
+        Vertical axis of the file's world. "auto" takes the axis along which, on average, the head is above the
+        feet; "y", as is usual, where the names do not tell head and feet.
+
+    Returns
+    -------
+    SkeletonMotion
+        In the file's world. A frame time that is a whole rate (or one / 1.001) rounded gives that rate exactly.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, truncated, not BVH, holds anything but finite numbers where numbers belong, or
+        if no unit makes it human and none was given.
+    """
+    text = read_text(path, "BVH")
+    if up not in ("x", "y", "z", "auto"):
+        raise FileError(f"up {up!r} is not an axis", file=path, remedy='Give "x", "y", "z" or "auto".')
+    hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
+    joints = _read_hierarchy(hierarchy, path)
+    if not motion:
+        raise FileError("holds no MOTION section", file=path, remedy="Export the skeleton with its motion.")
+    channels = sum(len(joint.channels) for joint in joints)
+    rate, values = _read_motion(motion[0], channels, hierarchy.count("\n") + 1, path)
+
+    names = tuple(joint.name for joint in joints)
+    parents = [joint.parent for joint in joints]
+    offsets = np.array([joint.offset for joint in joints])
+    scale = _human_unit(names, parents, offsets, path) if unit == "auto" else _given_unit(unit, path)
+    Ts_world_joint = joint_poses(parents, _local_poses(joints, values))
+    if up == "auto":
+        up = _up_axis(names, Ts_world_joint[..., :3, 3])
+    Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
+    Ts_world_joint[..., :3, 3] *= scale
+    return SkeletonMotion(
+        names=names,
+        parents=np.array(parents),
+        offsets=offsets * scale,
+        rate=rate,
+        Ts_world_joint=Ts_world_joint,
+        up=up,
+        source=f"{fspath(path)} (unit {scale:.6g} m)",
+    )
+
+
+def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
+    """Joints and end sites in the order of the file, parents first."""
+    tokens = [(word, n) for n, line in enumerate(text.split("\n"), 1) for word in re.findall(r"[{}]|[^\s{}]+", line)]
+    if not tokens or tokens[0][0].upper() != "HIERARCHY":
+        raise FileError("does not begin with HIERARCHY", file=path, place="line 1", remedy="Give a BVH file.")
+    joints: list[_Joint] = []
+    open_joints: list[dict] = []  # the nesting of braces: name, parent, and what is known so far
+    at = 1
+
+    def fault(problem: str, line: int) -> FileError:
+        return FileError(problem, file=path, place=f"line {line}", remedy="Export the file again.")
+
+    def take(count: int) -> list[str]:
+        nonlocal at
+        if at + count > len(tokens):
+            raise fault("the hierarchy ends in the middle", tokens[-1][1])
+        at += count
+        return [word for word, _ in tokens[at - count : at]]
+
+    while at < len(tokens):
+        line = tokens[at][1]
+        (word,) = take(1)
+        match word.upper():
+            case "ROOT" | "JOINT" | "END" as kind:
+                words = []
+                while (next_word := take(1)[0]) != "{":
+                    words.append(next_word)
+                if (kind == "ROOT") != (not open_joints) or (kind == "ROOT" and joints):
+                    raise fault(f"{kind} {' '.join(words)} stands where none may stand", line)
+                parent = open_joints[-1]["index"] if open_joints else -1
+                if parent is None:
+                    raise fault("a joint stands before its parent's OFFSET", line)
+                taken = {joint.name for joint in joints}
+                name = _end_name(joints[parent].name, taken) if kind == "END" else " ".join(words)
+                if not name or name in taken:
+                    raise fault(f"the joint name '{name}' is missing or taken", line)
+                open_joints.append({"name": name, "parent": parent, "end": kind == "END", "index": None})
+            case "OFFSET" if open_joints and open_joints[-1]["index"] is None:
+                offset = tuple(parse_numbers(take(3), file=path, line=line))
+                open_joints[-1]["index"] = len(joints)
+                joints.append(_Joint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
+            case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
+                count = take(1)[0]
+                channels = tuple(word.lower() for word in take(int(count) if count.isdecimal() else 0))
+                if (
+                    not count.isdecimal()
+                    or len(set(channels)) < len(channels)
+                    or not all(re.fullmatch("[xyz](position|rotation)", channel) for channel in channels)
+                ):
+                    raise fault(f"CHANNELS {count} {' '.join(channels)} is not a list of that many channels", line)
+                joint = joints[open_joints[-1]["index"]]
+                joints[open_joints[-1]["index"]] = _Joint(joint.name, joint.parent, joint.offset, channels)
+            case "}" if open_joints and open_joints[-1]["index"] is not None:
+                open_joints.pop()
+            case _:
+                raise fault(f"'{word}' stands where it may not stand", line)
+    if open_joints or not joints:
+        raise fault("the hierarchy ends in the middle", tokens[-1][1])
+    return joints
+
+
+def _end_name(parent: str, taken: set[str]) -> str:
+    name, count = f"{parent}_end", 1
+    while name in taken:
+        count += 1
+        name = f"{parent}_end{count}"
+    return name
+
+
+def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str]) -> tuple[float, NDArray]:
+    """Rate [Hz] and values (F, C); `line` is the number of the line on which `text` begins."""
+    lines = [(n, content) for n, content in enumerate(text.split("\n"), line) if content.strip()]
+    found = []
+    for i, pattern in enumerate((r"\s*Frames\s*:\s*(\d+)\s*", r"\s*Frame\s+Time\s*:\s*(\S+)\s*")):
+        match = re.fullmatch(pattern, lines[i][1], flags=re.I) if i < len(lines) else None
+        if match is None:
+            raise FileError(
+                f"the line '{('Frames:', 'Frame Time:')[i]} ...' is missing or not a number",
+                file=path,
+                place=f"line {lines[i][0] if i < len(lines) else line}",
+                remedy="Export the motion again.",
+            )
+        found.append(match[1])
+    frames, rows = int(found[0]), lines[2:]
+    (frame_time,) = parse_numbers([found[1]], file=path, line=lines[1][0])
+    if frame_time <= 0 or frames == 0:
+        raise FileError(
+            "the frame time is not positive" if frames else "the motion has no frames",
+            file=path,
+            place=f"line {lines[1 if frames else 0][0]}",
+            remedy="Export the motion again.",
+        )
+    values: list[list[float]] = []
+    for n, row in rows:
+        numbers = parse_numbers(row.split(), file=path, line=n)
+        if len(numbers) != channels:
+            raise FileError(
+                f"{len(numbers)} values for {channels} channels",
+                file=path,
+                place=f"line {n}",
+                remedy="If it is the last line the file was cut off: export it again, or delete the line and set "
+                f"'Frames: {len(values)}'.",
+            )
+        values.append(numbers)
+    if len(values) != frames:
+        raise FileError(
+            f"{len(values)} frames where {frames} are announced",
+            file=path,
+            place=f"line {rows[-1][0] if rows else lines[1][0]}",
+            remedy=f"Export it again, or set 'Frames: {len(values)}' on line {lines[0][0]}.",
+        )
+    return _exact_rate(frame_time, found[1]), np.array(values)
+
+
+def _exact_rate(frame_time: float, printed: str) -> float:
+    """[Hz] The whole rate, or whole / 1.001, whose frame time rounds to the one printed; else its reciprocal."""
+    decimals = len(printed.partition(".")[2]) if "e" not in printed.lower() else 15
+    for step in (1.0, 1.0 / 1.001):
+        rate = max(round(1.0 / frame_time / step), 1) * step
+        if abs(1.0 / rate - frame_time) <= 0.6 * 10.0**-decimals and abs(rate * frame_time - 1.0) < 1e-3:
+            return rate
+    return 1.0 / frame_time
+
+
+def _local_poses(joints: Sequence[_Joint], values: NDArray) -> NDArray:
+    """(F, J, 4, 4) pose of every joint in its parent's frame, lengths in the file's unit."""
+    Ts_parent_joint = np.zeros((len(values), len(joints), 4, 4))
+    Ts_parent_joint[..., 3, 3] = 1.0
+    at = 0
+    for i, joint in enumerate(joints):
+        columns = values[:, at : at + len(joint.channels)]
+        at += len(joint.channels)
+        turns = [k for k, channel in enumerate(joint.channels) if channel.endswith("rotation")]
+        Ts_parent_joint[:, i, :3, :3] = euler_rotations(
+            np.radians(columns[:, turns]), [joint.channels[k][0] for k in turns]
+        )
+        Ts_parent_joint[:, i, :3, 3] = joint.offset
+        shifts = [k for k, channel in enumerate(joint.channels) if channel.endswith("position")]
+        axes = ["xyz".index(joint.channels[k][0]) for k in shifts]
+        offset = np.array(joint.offset)[axes]
+        added = i > 0 and _is_added(columns[:, shifts], offset)
+        Ts_parent_joint[:, i, axes, 3] = columns[:, shifts] + (offset if added else 0.0)
+    return Ts_parent_joint
+
+
+def _is_added(positions: NDArray, offset: NDArray) -> bool:
+    """Whether position channels (F, P) are the way from the OFFSET (P,) rather than a place near it."""
+    from_origin = np.median(np.linalg.norm(positions, axis=1))
+    return bool(from_origin <= np.median(np.linalg.norm(positions - offset, axis=1)))
+
+
+def _root_shift(root: _Joint, values: NDArray, up: str) -> NDArray:
+    """(3,) the root's OFFSET where its position channels are to be added to it, else zero."""
+    shift = np.zeros(3)
+    height = [k for k, channel in enumerate(root.channels) if channel == f"{up}position"]
+    if _is_added(values[:, height], np.array(root.offset)[["xyz".index(up)] * len(height)]):
+        axes = ["xyz".index(channel[0]) for channel in root.channels if channel.endswith("position")]
+        shift[axes] = np.array(root.offset)[axes]
+    return shift
+
+
+def _given_unit(unit: float | str, path: str | PathLike[str]) -> float:
+    try:
+        value = float(unit)
+    except ValueError:
+        value = math.nan
+    if not (value > 0 and math.isfinite(value)):
+        raise FileError(f"unit {unit!r} is not a length", file=path, remedy='Give metres per unit, or "auto".')
+    return value
+
+
+def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]) -> float:
+    """The unit of `UNITS` in which the skeleton is most human.
+
+    Measured along the bones from head to ankle, which no pose changes; by the extent of the rest pose where the
+    names do not tell head and feet.
+    """
+    head, feet = _landmarks(names)
+    if head is not None and feet:
+        chains = [set(_chain(head, parents)) ^ set(_chain(foot, parents)) for foot in feet]
+        lengths = np.linalg.norm(offsets, axis=1)
+        height = float(np.mean([lengths[list(chain)].sum() for chain in chains])) / _HEAD_TO_ANKLE
+    else:
+        rest = np.array(offsets)
+        for joint, parent in enumerate(parents):
+            rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
+        height = float(np.ptp(rest, axis=0).max())
+    unit = min(UNITS, key=lambda u: abs(height * u - _STATURE))
+    if not _LEAST <= height * unit <= _LARGEST:
+        raise FileError(
+            f"the skeleton is {height:.4g} units tall: in no usual unit is that a person",
+            file=path,
+            remedy="Give the unit in metres (unit=0.01 for centimetres).",
+        )
+    return unit
+
+
+def _landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
+    """Joint of the head and those of the feet, as far as the names tell."""
+    heads = [i for i, name in enumerate(names) if "head" in name.lower()]
+    feet = [i for i, name in enumerate(names) if re.search("foot|ankle", name.lower()) and not name.endswith("_end")]
+    return (heads[0] if heads else None), feet
+
+
+def _chain(joint: int, parents: Sequence[int]) -> list[int]:
+    """The joint and its ancestors."""
+    chain = []
+    while joint >= 0:
+        chain.append(joint)
+        joint = parents[joint]
+    return chain
+
+
+def _up_axis(names: Sequence[str], positions: NDArray) -> str:
+    head, feet = _landmarks(names)
+    if head is None or not feet:
+        return "y"
+    return "xyz"[int(np.argmax((positions[:, head] - positions[:, feet].mean(axis=1)).mean(axis=0)))]

@@ -1,0 +1,1 @@
+"""Take files and everything that they name."""

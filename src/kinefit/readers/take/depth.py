@@ -1,0 +1,123 @@
+"""Depth sensors of a take: their recordings, and the cameras that they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, KinefitError, TakeError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations.depth import CloudVideo, DepthVideo
+from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
+from kinefit.readers.take.file import DepthEntry, Take
+
+_SAME = 0.01  # rates that differ by less are one
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSensors:
+    """What the depth sensors of a take saw.
+
+    Parameters
+    ----------
+    depth : tuple of DepthVideo
+    clouds : tuple of CloudVideo
+    cameras : tuple of Camera, of all depth videos
+    """
+
+    depth: tuple[DepthVideo, ...] = ()
+    clouds: tuple[CloudVideo, ...] = ()
+    cameras: tuple[Camera, ...] = ()
+
+    def notes(self, rate: float) -> tuple[str, ...]:
+        """What is worth saying of their time beside that of the take: other rates, frames that are missing."""
+        told = []
+        for video in (*self.depth, *self.clouds):
+            if abs(video.rate / rate - 1.0) > _SAME:
+                told.append(
+                    f"depth {video.sensor} has {video.rate:.4g} Hz, the take {rate:.4g} Hz: "
+                    "each depth image counts at the step nearest to it"
+                )
+            if len(video.gaps):
+                first = int(video.gaps[0])
+                gap = video.times[first] - video.times[first - 1]
+                told.append(
+                    f"depth {video.sensor} lacks frames in {len(video.gaps)} places, the first before frame {first} "
+                    f"({gap:.3g} s instead of {1.0 / video.rate:.3g} s)"
+                )
+        return tuple(told)
+
+
+def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> DepthSensors:
+    """Read all `[[depth]]` of a take; `rates` [Hz] of its other streams, for recordings that do not tell theirs.
+
+    Raises
+    ------
+    CalibrationError
+        Nothing tells a sensor's intrinsics, or its images have another size than its calibration.
+    TakeError, ObservationError, FileError
+        As `read_depth`, with the sensor's name.
+    """
+    depth, clouds, cameras = [], [], []
+    for entry in take.depth:
+        usual = take.rate or next(iter(rates.values()), None)
+        try:
+            if is_unordered(entry.file):
+                clouds.append(_clouds(entry, rig, usual))
+                continue
+            depth.append(_video(entry, usual))
+            cameras.append(_camera(entry, depth[-1], rig))
+        except KinefitError as error:
+            place = ", ".join(part for part in (f"depth {entry.name}", error.place) if part)
+            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
+    return DepthSensors(tuple(depth), tuple(clouds), tuple(cameras))
+
+
+def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVideo:
+    camera = entry.camera or entry.name
+    clouds = read_clouds(
+        entry.file, sensor=entry.name, unit=entry.unit or 1.0, rate=entry.rate, usual_rate=rate,
+        range=entry.range or (0.0, np.inf), time_unit=entry.time_unit, time_offset=entry.time_offset,
+        T_world_sensor=rig[camera].T_world_camera if rig is not None else None,
+    )  # fmt: skip
+    return replace(clouds, on_body=entry.on_body)
+
+
+def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
+    given: dict[str, Any] = {"sensor": entry.name, "unit": entry.unit, "size": entry.size}
+    video = read_depth(
+        entry.file, rate=entry.rate, usual_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,
+        time_offset=entry.time_offset, **given,
+    )  # fmt: skip
+    background = read_depth(entry.background, **given) if entry.background is not None else None
+    return replace(video, background=background, on_body=entry.on_body)
+
+
+def _camera(entry: DepthEntry, video: DepthVideo, rig: Rig | None) -> Camera:
+    """The sensor's camera: of the calibration, of its intrinsics in the take, or of the recording itself."""
+    if rig is not None:
+        camera = replace(rig[entry.camera or entry.name], name=entry.name)
+        if camera.size != video.size:
+            raise CalibrationError(
+                f"its images have {video.size[0]}x{video.size[1]} px, its calibration is of {camera.size}",
+                remedy="Calibrate it at the size that it records in.",
+            )  # fmt: skip
+        return camera
+    if entry.intrinsics is not None:
+        fx, fy, cx, cy = entry.intrinsics
+        camera = Camera(entry.name, video.size, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry.distortion)  # type: ignore[arg-type]
+        if not (0 < cx < video.size[0] and 0 < cy < video.size[1]):
+            raise TakeError(
+                f"principal point ({cx:g}, {cy:g}) outside of {video.size[0]}x{video.size[1]} px",
+                remedy="Give intrinsics = [fx, fy, cx, cy] of images of this size.",
+            )  # fmt: skip
+        return camera
+    if video.camera is None:
+        raise CalibrationError(
+            "nothing tells its intrinsics",
+            remedy="Write intrinsics = [fx, fy, cx, cy] [px], or add [calibration] with a camera of this name.",
+        )  # fmt: skip
+    return replace(video.camera, name=entry.name)

@@ -1,0 +1,232 @@
+"""Reading of everything that a take names, and the check that it fits together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.observations import CloudVideo, DepthVideo, Keypoints, Markers, SilhouetteVideo
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.keypoints import read_keypoints
+from kinefit.readers.markers import read_markers
+from kinefit.readers.take.depth import load_depth
+from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
+from kinefit.readers.take.silhouettes import load_silhouettes
+from kinefit.readers.video import Video, check_rates, common_frames
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Everything that the sensors of a take saw.
+
+    Parameters
+    ----------
+    rate : float [Hz]
+    frames : (start, stop)
+        Steps of the common time that every camera's streams have; t = step / rate.
+    rig : Rig or None
+        The take's cameras, in its order, then its depth sensors; None where there are none.
+    keypoints : tuple of Keypoints
+        In the order of `take.keypoints`, all cut to `frames`, in the image frame of the calibration.
+    markers : tuple of Markers
+        In the order of `take.markers`, whole, at their own rates.
+    videos : {camera: Path}
+    images : {camera: ImageFrame}
+        How the video's picture of each camera relates to the calibration's.
+    depth : tuple of DepthVideo
+        In the order of `take.depth`, whole, at their own rates; those whose files are images.
+    clouds : tuple of CloudVideo
+        Those whose files are points without order.
+    silhouettes : tuple of SilhouetteVideo
+        In the order of `take.silhouettes`, whole, at their own rates.
+    notes : tuple of str
+        What is worth saying: depth of another rate, frames that are missing.
+    """
+
+    rate: float
+    frames: tuple[int, int]
+    rig: Rig | None
+    keypoints: tuple[Keypoints, ...]
+    markers: tuple[Markers, ...]
+    videos: dict[str, Path]
+    images: dict[str, ImageFrame]
+    depth: tuple[DepthVideo, ...] = ()
+    clouds: tuple[CloudVideo, ...] = ()
+    silhouettes: tuple[SilhouetteVideo, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
+    """Read everything that a take names, and check that it fits together.
+
+    Parameters
+    ----------
+    exteriors : bool
+        Whether the calibration must tell where cameras stand; without, one that it puts nowhere stands at the origin.
+
+    Raises
+    ------
+    CalibrationError
+        A camera without calibration; a picture of another size than the calibration's where the take does not tell how.
+    ObservationError
+        Streams of different length or rate, with each stream's; and what the readers of the files raise.
+    FileError
+        A file that is damaged.
+    """
+    rig = _read_rig(take, exteriors)
+    rates: dict[str, float] = {"take": take.rate} if take.rate else {}
+    lengths: dict[str, int] = {}
+    offsets: dict[str, float] = {}
+    sizes: dict[str, tuple[int, int]] = {}
+    for entry in take.cameras:
+        if entry.video is not None:
+            with Video(entry.video) as video:
+                stream = f"video {entry.name}"
+                rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
+                sizes[entry.name] = video.size
+    images = {entry.name: _image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
+    keypoints, markers = [], tuple(read_markers(entry.file, unit=entry.unit) for entry in take.markers)
+    for number, source in enumerate(take.keypoints):
+        keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
+        stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
+        rates[stream], lengths[stream], offsets[stream] = read.rate, len(read), read.time_offset
+    sensors = load_depth(take, rig, rates)
+    silhouettes = load_silhouettes(take, rig, images, rates)
+    for outlines in silhouettes:
+        stream = f"silhouettes {outlines.sensor}"
+        rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
+    recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
+    if not (lengths or markers or recordings):
+        remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
+        raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
+    check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
+    own = [*(recording.rate for recording in recordings), *(m.rate for m in markers)]
+    rate = take.rate or next(iter(rates.values()), None) or own[0]
+    if lengths:
+        frames = common_frames(lengths, offsets, rate, take.frames, file=take.path)
+    elif recordings:
+        frames = take.frames or _span(recordings, rate)
+    else:
+        frames = take.frames or (0, max(round(len(m) * rate / m.rate) for m in markers))
+    _check_depth(recordings, frames, rate, take)
+    cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
+    return Observations(
+        rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
+        markers=markers,
+        keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
+        videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
+        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes, notes=sensors.notes(rate),
+    )
+
+
+def _span(recordings: Sequence[DepthVideo | CloudVideo], rate: float) -> tuple[int, int]:
+    """Steps from the first depth image of any sensor to the last."""
+    first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
+    return round(float(first) * rate), round(float(last) * rate) + 1
+
+
+def _check_depth(
+    recordings: Sequence[DepthVideo | CloudVideo], frames: tuple[int, int], rate: float, take: Take
+) -> None:
+    """Refuse depth that was not recorded at the time of the rest."""
+    for recording in recordings:
+        first, last = float(recording.times[0]), float(recording.times[-1])
+        if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
+            raise ObservationError(
+                f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
+                f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,
+                place=f"depth {recording.sensor}", remedy="Correct its time_offset, its rate, or frames.",
+            )
+
+
+def _read_rig(take: Take, exteriors: bool) -> Rig | None:
+    if take.calibration is None or not (take.cameras or take.depth):
+        return None
+    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, exteriors=exteriors)
+    names = [entry.name for entry in take.cameras] + [entry.camera or entry.name for entry in take.depth]
+    for name in names:
+        if name not in rig:
+            raise CalibrationError(
+                choices("calibration of camera", name, rig.names), file=take.calibration.file,
+                remedy=f"Correct the camera's name in {take.path.name}, or calibrate this camera too.",
+            )
+    return rig.select(tuple(dict.fromkeys(names)))
+
+
+def _image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
+    """How the picture of a camera relates to the calibration's; an error proposes the line to write."""
+    assert rig is not None
+    if video_size and entry.size and entry.size != video_size:
+        raise TakeError(
+            f"size = {list(entry.size)}, but the video has {video_size[0]}x{video_size[1]}", file=take.path,
+            place=f"camera {entry.name}", remedy="Leave size out where there is a video.",
+        )
+    calibrated = rig[entry.name].size
+    turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]
+    size = video_size or entry.size or turned
+    frame = ImageFrame.rotated(calibrated, entry.rotation)
+    if entry.image == "scaled":
+        return frame.then(ImageFrame.scaled(turned, size))
+    if entry.image == "letterboxed":
+        return frame.then(ImageFrame.letterboxed(turned, size))
+    if size == turned:
+        return frame
+    ratio = size[0] * turned[1] / (size[1] * turned[0])
+    line = (
+        "rotation = 90 (or 270)" if size == turned[::-1]
+        else 'image = "scaled"' if abs(ratio - 1) < 0.002
+        else 'image = "letterboxed" (bars were added) or image = "scaled" (it was stretched)'
+    )
+    raise CalibrationError(
+        f"the picture has {size[0]}x{size[1]} px, but the calibration is of {calibrated[0]}x{calibrated[1]} px",
+        file=take.path, place=f"camera {entry.name}", remedy=f"Tell how the picture came about: {line}.",
+    )
+
+
+def _read_keypoints(
+    source: KeypointsEntry, image: ImageFrame, take: Take, rates: Mapping[str, float], number: int
+) -> Keypoints:
+    place = f"[[keypoints]] {number + 1}, camera {source.camera}"
+    same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
+    if source.frame is None and not same and source.format != "detect":
+        raise TakeError(
+            "the video's picture is not the calibration's, and it is not told in which the keypoints are",
+            file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
+        )
+    offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
+    if source.format == "detect":
+        file = source.file or detections_file(take.path, source.camera)
+        return read_detections(file).keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
+    rate = source.rate or rates.get(f"video {source.camera}") or take.rate
+    if rate is None:
+        raise TakeError("nothing tells the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
+    assert source.file is not None
+    options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
+    return read_keypoints(
+        source.file, format=source.format, camera=source.camera, rate=rate,
+        image_frame=image if source.frame == "video" and not same else None,
+        time_offset=offset, **options,
+    )
+
+
+def _cut(keypoints: Keypoints, frames: tuple[int, int], used: tuple[int, int] | None) -> Keypoints:
+    """Frames at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
+    begin = frames[0] - round(keypoints.time_offset * keypoints.rate)
+    rows = slice(begin, begin + frames[1] - frames[0])
+    points, confidence = keypoints.points[rows], keypoints.confidence[rows]
+    if used is not None:
+        steps = np.arange(*frames)
+        unused = (steps < used[0]) | (steps >= used[1])
+        points, confidence = np.array(points), np.array(confidence)
+        points[unused], confidence[unused] = np.nan, 0.0
+    return replace(
+        keypoints, points=points, confidence=confidence,
+        time_offset=keypoints.time_offset + begin / keypoints.rate,
+    )

@@ -1,0 +1,141 @@
+"""Silhouettes in files: masks as pictures, and those of the built-in detector."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
+from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.observations import Detections, SilhouetteVideo
+from kinefit.readers.depth.images import listed
+from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.take.file import SilhouetteEntry, Take
+
+_PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
+
+
+def read_silhouettes(
+    path: Path, *, camera: str, rate: float, size: tuple[int, int], image_frame: ImageFrame | None = None,
+    time_offset: float = 0.0,
+) -> SilhouetteVideo:  # fmt: skip
+    """Masks in a folder of pictures, or of a pattern such as "masks/*.png", one a frame; white is the body.
+
+    Parameters
+    ----------
+    camera : str
+    rate : float [Hz]
+    size : (width, height) [px] of the calibration's image.
+    image_frame : ImageFrame, optional
+        From the calibration's image to the masks'; default: they are the same.
+    time_offset : float [s] of the first mask.
+
+    Raises
+    ------
+    FileError
+        No pictures, or one that cannot be read.
+    ObservationError
+        A mask of another size.
+    """
+    files = [file for file in listed(path) if file.suffix.lower() in _PICTURES]
+    if not files:
+        raise FileError("no pictures of masks", file=path, remedy="Give a folder or pattern of PNG files, one a frame.")
+    wanted = _picture_size(files[0], size, image_frame)
+
+    def image(i: int) -> NDArray:
+        mask = _mask(files[i])
+        if mask.shape[::-1] != wanted:
+            problem = f"the mask has {mask.shape[1]}x{mask.shape[0]} px, not {wanted[0]}x{wanted[1]}"
+            raise ObservationError(problem, file=files[i], remedy="All masks of a camera are of its picture's size.")
+        return in_calibration(mask, size, image_frame)
+
+    times = time_offset + np.arange(len(files)) / rate
+    return SilhouetteVideo(camera, rate, times, size, image, str(path))
+
+
+def load_silhouettes(
+    take: Take, rig: Rig | None, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
+) -> tuple[SilhouetteVideo, ...]:
+    """All `[[silhouette]]` of a take that are in files, masks and the detector's; `rates` [Hz] of its other streams.
+
+    Raises
+    ------
+    TakeError
+        Nothing tells the rate, or the picture in which masks are.
+    KinefitError
+        As `read_silhouettes`, with the camera's name.
+    """
+    out = []
+    for entry in take.silhouettes:
+        if entry.format == "background":
+            continue
+        try:
+            out.append(_silhouettes(entry, take, rig, images[entry.camera], rates))
+        except KinefitError as error:
+            place = ", ".join(part for part in (f"silhouette of camera {entry.camera}", error.place) if part)
+            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
+    return tuple(out)
+
+
+def _silhouettes(
+    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float]
+) -> SilhouetteVideo:
+    assert rig is not None
+    camera = next(c for c in take.cameras if c.name == entry.camera)
+    same = np.allclose(frame.T_image_calibration, np.eye(3), atol=1e-9)
+    size, offset = rig[entry.camera].size, camera.time_offset
+    rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
+    if entry.format == "masks":
+        if rate is None:
+            raise TakeError("nothing tells the rate", remedy="Write rate = ... into [take].")
+        if entry.frame is None and not same:
+            problem = "the video's picture is not the calibration's, and it is not told in which the masks are"
+            raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
+        assert entry.file is not None
+        return read_silhouettes(
+            entry.file, camera=entry.camera, rate=rate, size=size,
+            image_frame=frame if entry.frame == "video" and not same else None, time_offset=offset,
+        )  # fmt: skip
+    found = read_detections(entry.file or detections_file(take.path, entry.camera))
+    times = offset + np.arange(len(found)) / found.rate
+    return SilhouetteVideo(
+        entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source
+    )
+
+
+def _everybody(found: Detections, i: int) -> NDArray:
+    """All people of one picture: which of them is the body is told by where it is thought to be."""
+    out = np.zeros(found.size[::-1], bool)
+    for person in range(found.points.shape[1]):
+        mask = found.mask(i, person)
+        if mask is not None:
+            out |= mask
+    return 255 * out.astype(np.uint8)
+
+
+def _picture_size(file: Path, size: tuple[int, int], frame: ImageFrame | None) -> tuple[int, int]:
+    """Size of the masks: of the calibration's image, or of another one that a frame leads to."""
+    return size if frame is None else _mask(file).shape[::-1]
+
+
+def _mask(file: Path) -> NDArray:
+    mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if mask is None:
+        raise FileError("not a picture, or damaged", file=file, remedy="Write it again, as an 8-bit PNG.")
+    if mask.ndim == 3:
+        mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(axis=2)
+    if mask.dtype != np.uint8:
+        mask = np.where(mask > 0, 255, 0).astype(np.uint8)
+    return 255 * mask if mask.max(initial=0) == 1 else mask
+
+
+def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | None) -> NDArray:
+    """A mask (H, W) uint8 of the delivered picture in the calibration's image of `size` (width, height)."""
+    if frame is None or np.allclose(frame.T_image_calibration, np.eye(3), atol=1e-9):
+        return mask
+    T = frame.T_image_calibration[:2]
+    return np.asarray(cv2.warpAffine(mask, T, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))

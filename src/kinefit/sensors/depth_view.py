@@ -1,0 +1,192 @@
+"""One person in one depth image, small: what a search for the posture compares poses with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Camera
+from kinefit.sensors import _kernels_depth_view as kernels
+
+_LENS = 300.0  # [px] of the camera that a cloud is looked at with
+_JUMP = 0.10  # [m] between neighbouring pixels that belong together: less than from an arm to the trunk behind it
+UNKNOWN = 0.5  # trust that a pixel without any measurement is empty: background out of range, or a hole
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth image cut to one person and made small.
+
+    Parameters
+    ----------
+    T_view_world : (4, 4) [m]
+    lens : (4,) [px] fx, fy, cx, cy of the small image, without distortion.
+    observed : (h, w) float32 [m] depth of the person, 0 elsewhere.
+    behind : (h, w) float32 [m] depth of anything else that was measured, inf for nothing.
+    trust : (h, w) float32 in 0..1, how sure it is that the person is not at a pixel where it was not observed:
+        1 where something else was measured, 0 beside the sensor's image.
+    points : (h, w, 3) [m] in the world, 0 where the person was not observed.
+    """
+
+    T_view_world: NDArray
+    lens: NDArray
+    observed: NDArray
+    behind: NDArray
+    trust: NDArray
+    points: NDArray
+
+    @property
+    def seen(self) -> NDArray:
+        """(h, w) bool, where the person was observed."""
+        return self.observed > 0
+
+    @property
+    def cloud(self) -> NDArray:
+        """(N, 3) [m] the person's points in the world."""
+        return self.points[self.seen]
+
+    @property
+    def viewpoint(self) -> NDArray:
+        """(3,) [m] the sensor in the world."""
+        return -self.T_view_world[:3, :3].T @ self.T_view_world[:3, 3]
+
+    @property
+    def thickness(self) -> NDArray:
+        """(h, w) [m] distance of every seen pixel to the person's outline."""
+        inside = cv2.distanceTransform(self.seen.astype(np.uint8), cv2.DIST_L2, 3)
+        return inside * self.observed / self.lens[0]
+
+
+def view_of(
+    depth: NDArray, person: NDArray, camera: Camera, *, pixels: int = 72, width: float = 0.022, margin: float = 0.3
+) -> DepthView:
+    """The part of a depth image about a person.
+
+    Parameters
+    ----------
+    depth : (H, W) [m], 0 where nothing was measured
+    person : (H, W) bool
+    camera : Camera of the depth image
+    pixels : int, longer side of the view without its margin, at most
+    width : float [m] of a pixel, at least: a wrist is two wide
+    margin : float
+        Added on every side, as a share of the longer side: where a limb may be sought and was not seen.
+    """
+    rays = camera.ray_table[:, person & (depth > 0)]
+    low, high = np.nanmin(rays, axis=1), np.nanmax(rays, axis=1)
+    longer = max(float((high - low).max()), 1e-3)
+    low, high = low - margin * longer, high + margin * longer
+    focal = min(pixels / longer, float(np.median(depth[person & (depth > 0)])) / width)
+    w, h = (np.ceil(focal * (high - low)).astype(int) + 1).tolist()
+    lens = np.array([focal, focal, -focal * low[0], -focal * low[1]])
+    i, j = np.mgrid[0:h, 0:w]
+    x_view = np.stack([(j - lens[2]) / focal, (i - lens[3]) / focal, np.ones((h, w))], axis=-1)
+    uv = camera.project(x_view @ camera.T_world_camera[:3, :3].T + camera.centre_world)
+    inside = np.isfinite(uv).all(axis=-1)
+    column, row = (np.rint(np.where(inside, uv[..., k], -1.0)).astype(int) for k in (0, 1))
+    inside &= (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    measured = np.where(inside, depth[row, column], 0.0)
+    own = person[row, column] & (measured > 0)
+    observed = np.where(own, measured, 0.0)
+    behind = np.where(~own & (measured > 0), measured, np.inf)
+    trust = np.where(inside, np.where(measured > 0, 1.0, UNKNOWN), 0.0)
+    x = x_view * observed[..., None]
+    points = np.where(own[..., None], x @ camera.T_world_camera[:3, :3].T + camera.centre_world, 0.0)
+    observed, behind, trust = (np.ascontiguousarray(a, np.float32) for a in (observed, behind, trust))
+    return DepthView(np.array(camera.T_camera_world), lens, observed, behind, trust, np.ascontiguousarray(points))
+
+
+def splat(points: NDArray, camera: Camera) -> tuple[NDArray, Camera]:
+    """A depth image (h, w) [m] that a cloud (N, 3) [m] of the world would have made, coarse enough to be closed.
+
+    Returns it with its camera.
+    """
+    x = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    uv = camera.project(points)
+    ok = np.isfinite(uv).all(axis=1) & (x[:, 2] > 0)
+    extent = np.ptp(uv[ok], axis=0) if ok.any() else np.ones(2)
+    # two to three points a pixel of the box that the cloud fills by a third or so
+    factor = min(1.0, float(np.sqrt(max(ok.sum(), 1) / max(extent.prod(), 1.0))))
+    size = max(int(camera.size[0] * factor), 8), max(int(camera.size[1] * factor), 8)
+    small = camera.scaled(size)
+    uv = np.rint(small.project(points[ok])).astype(int)
+    inside = (uv >= 0).all(axis=1) & (uv < size).all(axis=1)
+    depth = np.full((size[1], size[0]), np.inf)
+    np.minimum.at(depth, (uv[inside, 1], uv[inside, 0]), x[ok][inside, 2])
+    return np.where(np.isfinite(depth), depth, 0.0), small
+
+
+def geodesic_ends(view: DepthView, centre: NDArray, *, count: int = 7, least: float = 0.15) -> NDArray:
+    """(E, 3) [m] ends of the limbs: the points farthest from `centre` (3,) along the surface, one after the other.
+
+    Accumulative geodesic extrema (Plagemann et al., ICRA 2010): every end found becomes a source itself. Parts that
+    are cut off by holes are joined over their narrowest gap. An end nearer than `least` [m] to the others is none.
+    """
+    seen, points = view.seen, view.points
+    if not seen.any():
+        return np.empty((0, 3))
+    distance = np.full(seen.shape, np.inf)
+    away = np.where(seen, np.linalg.norm(points - centre, axis=-1), np.inf)
+    distance[np.unravel_index(np.argmin(away), seen.shape)] = 0.0
+    kernels.spread(points, seen, _JUMP, distance)
+    _bridge(points, seen, distance)
+    ends: list[NDArray] = []
+    while len(ends) < count:
+        far = np.where(seen & np.isfinite(distance), distance, -1.0)
+        at = np.unravel_index(np.argmax(far), seen.shape)
+        if far[at] < least:
+            break
+        ends.append(points[at])
+        distance[at] = 0.0
+        kernels.spread(points, seen, _JUMP, distance)
+    return np.array(ends).reshape(-1, 3)
+
+
+def _bridge(points: NDArray, seen: NDArray, distance: NDArray) -> None:
+    """Reach the parts that are cut off: from the nearest point that is reached, straight through the air."""
+    for _ in range(8):
+        inside, outside = np.nonzero(seen & np.isfinite(distance)), np.nonzero(seen & ~np.isfinite(distance))
+        if not len(outside[0]):
+            return
+        a, b = points[inside], points[outside]
+        a_some = a[:: max(len(a) // 400, 1)]
+        gaps = np.linalg.norm(b[:, None] - a_some[None], axis=-1)
+        k, m = np.unravel_index(np.argmin(gaps), gaps.shape)
+        start = distance[inside][:: max(len(a) // 400, 1)][m]
+        distance[outside[0][k], outside[1][k]] = start + gaps[k, m]
+        kernels.spread(points, seen, _JUMP, distance)
+
+
+def outside(view: DepthView, x_world: NDArray) -> tuple[NDArray, NDArray]:
+    """How far points (N, 3) [m] lie outside the person's outline, (N,) [m] across the line of sight; 0 within it.
+
+    And how sure it is, (N,) in 0..1: 0 beside the sensor's image and behind what else was measured.
+    """
+    x = x_world @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
+    z = np.maximum(x[:, 2], 1e-3)
+    column, row = (np.rint(view.lens[k] * x[:, k] / z + view.lens[2 + k]).astype(int) for k in (0, 1))
+    h, w = view.observed.shape
+    inside = (x[:, 2] > 1e-3) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    gap = cv2.distanceTransform((~view.seen).astype(np.uint8), cv2.DIST_L2, 3)[row, column]
+    trust = np.where(inside & (x[:, 2] < view.behind[row, column]), view.trust[row, column], 0.0)
+    # the outline itself runs half a pixel before the first pixel without the person
+    return np.maximum(gap - 0.5, 0.0) * z / view.lens[0], trust
+
+
+def camera_at(x_world: NDArray, viewpoint: NDArray | None) -> Camera:
+    """A camera at a viewpoint (3,) [m] that looks at points (N, 3) [m]; 3 m before them along z where there is none."""
+    middle = np.median(x_world, axis=0)
+    eye = middle - np.array((0.0, 0.0, 3.0)) if viewpoint is None else np.asarray(viewpoint, float)
+    z = (middle - eye) / max(float(np.linalg.norm(middle - eye)), 1e-9)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z])
+    T[:3, 3] = -T[:3, :3] @ eye
+    K = np.array([[_LENS, 0, 319.5], [0, _LENS, 319.5], [0, 0, 1.0]])
+    return Camera("cloud", (640, 640), K, T_camera_world=T)

@@ -1,0 +1,94 @@
+"""What a tracker needs of a body's surface, made once: samples, a mesh, and room to draw it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.morphing import MorphedPose, Morphing
+from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
+from kinefit.correspondences.depth_image import SurfaceSamples
+from kinefit.correspondences.rims import RimFinder
+from kinefit.errors import BodyError
+from kinefit.geometry.camera import Camera
+from kinefit.rendering import Canvas, scaled
+from kinefit.sensors.visibility import Layers
+
+_COLUMNS = 160  # of the image in which the body's own hidden parts are found: a forearm at 3 m is four pixels wide
+
+
+class Surface:
+    """A body's surface, for one tracker at a time.
+
+    Parameters
+    ----------
+    body : Body with surfaces
+    count : int, samples of its surface.
+
+    Attributes
+    ----------
+    samples : SurfaceSamples
+    mesh : BodyMesh of its simple surfaces, for depth
+    morphing : Morphing, its skin (the mesh, where it has none) and what changes that, for outlines
+    areas : (S,) [m²] of each segment
+    judged : the state that was drawn segment by segment last, in all cameras
+
+    Raises
+    ------
+    BodyError
+        A body without surfaces.
+    """
+
+    def __init__(self, body: Body, count: int) -> None:
+        if not body.surfaces:
+            remedy = "Depth needs some; see the catalogue's bodies."
+            raise BodyError(f"body '{body.name}' has no surfaces", remedy=remedy)
+        self.body, self.morphing = body, Morphing(body)
+        self.mesh = self.morphing.mesh if isinstance(self.morphing.mesh, BodyMesh) else body_mesh(body)
+        points, normals, segment = sample(body, count)
+        self.samples = SurfaceSamples(segment, points.T, normals.T)
+        corners = self.mesh.vertices[self.mesh.faces]
+        twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self.areas = 0.5 * np.bincount(self.mesh.face_segment, twice, len(body.tree.segments))
+        self.judged: BodyState | None = None
+        self._posed: tuple[BodyState, NDArray] | None = None
+        self._pose: MorphedPose | None = None
+        self._canvases: dict[Camera, Canvas] = {}
+        self._rims: dict[Camera, RimFinder] = {}
+        self._layers: dict[Camera, Layers] = {}
+
+    def posed(self, state: BodyState) -> NDArray:
+        """(V, 3) [m] its mesh in the world; kept for the state that was asked for last."""
+        if self.mesh is self.morphing.mesh:
+            return self.pose(state).vertices
+        if self._posed is None or self._posed[0] is not state:
+            self._posed = state, self.mesh.posed(self.body.tree.forward(state.T_world_root, state.angles)[0])
+        return self._posed[1]
+
+    def pose(self, state: BodyState) -> MorphedPose:
+        """Its skin in the world, morphed; kept for the state that was asked for last."""
+        if self._pose is None or self._pose.state is not state:
+            pose = self.morphing.pose(state)
+            assert pose.vertices is not None  # now, and not by several threads
+            self._pose = pose
+        return self._pose
+
+    def depth(self, vertices_world: NDArray, camera: Camera) -> NDArray:
+        """(h, w) [m] its own depth in a camera, small, inf where it is not; overwritten by the next call for it."""
+        small = scaled(camera, min(_COLUMNS / camera.size[0], 1.0))
+        if camera not in self._canvases:
+            self._canvases[camera] = Canvas(small.size)
+        return self._canvases[camera].draw_for(small, vertices_world, self.mesh.faces, cull=True).depth
+
+    def rims(self, camera: Camera) -> RimFinder:
+        """What finds its outline in a camera, with room for this camera alone."""
+        if camera not in self._rims:
+            self._rims[camera] = RimFinder(self.morphing.mesh, next(iter(self._rims.values()), None))
+        return self._rims[camera]
+
+    def layers(self, camera: Camera) -> Layers:
+        """Room to draw it segment by segment."""
+        if camera not in self._layers:
+            self._layers[camera] = Layers(self.body, camera, mesh=self.mesh)
+        return self._layers[camera]

@@ -1,0 +1,132 @@
+"""Which segments a depth image speaks for, which against, and which it does not show.
+
+Every segment is drawn by itself, so that at each pixel the foremost segment and what would be seen without it are
+known. A measurement supports a segment only where the body without it would not explain it as well: an arm that has
+slipped into the trunk agrees with the trunk's surface, but nothing that was measured needs it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.surfaces import BodyMesh, body_mesh
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.rendering import Canvas, scaled
+from kinefit.sensors import _kernels_visibility as kernels
+from kinefit.sensors.evidence import Evidence
+
+COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
+FEWEST = 16  # pixels of a whole outline: fewer tell less of a segment
+DEVIATIONS = 3.0  # of a measurement that agrees
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentVerdict:
+    """What a depth image says of each segment.
+
+    Parameters
+    ----------
+    counts : (S, 6) int, pixels of each segment
+        its whole outline; foremost and supported by a measurement that nothing else of the body explains; supported,
+        but explained without it; empty: something was measured behind; covered: something was measured in front;
+        unknown: no measurement.
+    """
+
+    counts: NDArray
+
+    @property
+    def supported(self) -> NDArray:
+        """(S,) pixels that speak for a segment and for nothing else."""
+        return self.counts[:, kernels.ALONE]
+
+    @property
+    def seen(self) -> NDArray:
+        """(S,) pixels that speak for or against a segment, or might as well be another's."""
+        return self.counts[:, [kernels.ALONE, kernels.SHARED, kernels.EMPTY]].sum(axis=1)
+
+    @property
+    def covered(self) -> NDArray:
+        """(S,) share in 0..1 of a segment's foremost pixels that something else hides."""
+        return self.counts[:, kernels.COVERED] / np.maximum(self.counts[:, 1:].sum(axis=1), 1)
+
+    @property
+    def evidence(self) -> Evidence:
+        """For and against each segment, in outlines of it."""
+        whole = np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        return Evidence(self.supported / whole, (self.seen - self.supported) / whole)
+
+
+class Layers:
+    """Room to draw a body segment by segment, made once for a body and a size of image.
+
+    Parameters
+    ----------
+    body : Body with surfaces
+    camera : Camera of the depth images
+    mesh : BodyMesh of the body, made where it is not given.
+    """
+
+    def __init__(self, body: Body, camera: Camera, *, mesh: BodyMesh | None = None) -> None:
+        self.mesh = mesh = body_mesh(body) if mesh is None else mesh
+        self.camera = scaled(camera, min(COLUMNS / camera.size[0], 1.0))
+        self.canvas = Canvas(self.camera.size)
+        width, height = self.camera.size
+        self.front, self.behind = np.empty((2, height, width), np.float32)
+        self.owner = np.empty((height, width), np.int32)
+        self.counts = np.empty((len(body.tree.segments), kernels.COUNTS), np.int64)
+        self._parts = [_part(mesh, s) for s in np.unique(mesh.segment)]
+
+    def draw(self, vertices_world: NDArray) -> None:
+        """Draw the body's mesh (V, 3) [m]: `front`, `behind`, `owner`, and each segment's outline in `counts`."""
+        self.front.fill(np.inf)
+        self.behind.fill(np.inf)
+        self.counts.fill(0)
+        for s, vertices, faces in self._parts:
+            shown = self.canvas.draw_for(self.camera, vertices_world[vertices], faces, cull=True)
+            flat = (image.reshape(-1) for image in (self.front, self.behind, self.owner))
+            kernels.add_layer(shown.depth.reshape(-1), s, *flat, self.counts)
+
+
+def _part(mesh: BodyMesh, segment: int) -> tuple[int, slice, NDArray]:
+    """A segment's run of vertices and its faces, counted within the run (a body's mesh may hold it in several)."""
+    own = np.flatnonzero(mesh.segment == segment)
+    first, last = int(own[0]), int(own[-1]) + 1
+    return int(segment), slice(first, last), np.ascontiguousarray(mesh.faces[mesh.face_segment == segment] - first)
+
+
+def judge_segments(
+    vertices_world: NDArray, layers: Layers, depth: NDArray, camera: Camera, *,
+    noise: tuple[float, float] = (0.002, 0.002), slack: float = 0.015,
+) -> SegmentVerdict:  # fmt: skip
+    """Judge every segment of a body by one depth image.
+
+    Parameters
+    ----------
+    vertices_world : (V, 3) [m] its mesh in the pose to be judged.
+    layers : Layers of this body and camera; overwritten.
+    depth : (H, W) [m]
+        0 where nothing was measured; negative where it is known to be something else's, see `Background`.
+    noise : a [m] and b [1/m] of a depth's standard deviation a + b z².
+    slack : float [m]
+        What a pose and a shape may be off and still count as right, along the line of sight and across it.
+
+    Raises
+    ------
+    ObservationError
+        An image of another size than the camera's.
+    """
+    if depth.shape != (camera.size[1], camera.size[0]):
+        problem = f"a depth image of {depth.shape[1]}x{depth.shape[0]} px, camera {camera.name} has {camera.size}"
+        raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
+    layers.draw(vertices_world)
+    width, height = layers.camera.size
+    kernels.judge(
+        layers.front, layers.behind, layers.owner, depth, camera.size[0] / width, camera.size[1] / height,
+        camera.matrix[0, 0], slack, DEVIATIONS * noise[0], DEVIATIONS * noise[1], layers.counts,
+    )  # fmt: skip
+    return SegmentVerdict(layers.counts.copy())

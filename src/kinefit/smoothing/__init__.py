@@ -1,0 +1,1 @@
+"""A whole take at once: smoother, process noise, gaps, contacts, uncertainty."""

@@ -1,0 +1,256 @@
+"""How lively a person is and how noisy a detector: estimated from the take that is smoothed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.sensors.channels import Channels
+from kinefit.smoothing.foot_contacts import Contacts
+from kinefit.smoothing.unwrap import boxes
+from kinefit.solvers.losses import Loss
+from kinefit.solvers.seen_points import SeenPoints
+from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
+
+INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
+_RAYLEIGH = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ²
+_LOOK = 0.25  # [s] for which a detector errs alike, so that its frames count as one look at a point
+_SAMPLES = 30.0  # looks at a point that count as much as all the others of its source together
+_FRAMES = 10.0  # changes of a degree of freedom that count as much as what was assumed of it
+_SETTLED = 0.05  # relative change of all estimates below which they are left
+_BURST = 0.15  # [s] over which a limb is taken to be equally lively: half of a quick reach or step
+
+
+@dataclass(frozen=True, eq=False)
+class Strength:
+    """What a take tells of itself.
+
+    Parameters
+    ----------
+    acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation.
+    sigma : (N,) [px] noise of every channel at full confidence.
+    """
+
+    acceleration: NDArray
+    sigma: NDArray
+
+    def change(self, other: Strength) -> float:
+        """Largest relative difference of anything in it."""
+        pairs = zip(*((s.acceleration, s.sigma) for s in (self, other)), strict=True)
+        return max(float(np.abs(np.log(a / b)).max()) for a, b in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothTake:
+    """Measurements of all frames as used (left and right put right), and states to start from.
+
+    `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): how much livelier
+    than usual each degree of freedom is.
+    """
+
+    body: Body
+    channels: Channels
+    points: PointSet
+    uv: NDArray
+    confidence: NDArray
+    roots: NDArray
+    angles: NDArray
+    told: NDArray
+    live: NDArray
+    dt: float
+    loss: Loss
+    memory: tuple[float, float]
+    contacts: Contacts | None = None
+
+    def part(self, frames: slice) -> SmoothTake:
+        """A stretch of it."""
+        cut = {name: getattr(self, name)[frames] for name in ("uv", "confidence", "roots", "angles", "told", "live")}
+        return replace(self, **cut, contacts=self.contacts and self.contacts.part(frames))
+
+    def seen(self, sigma: NDArray) -> SeenPoints:
+        """Its pixels and contacts as the solver takes them; sigma (N,) [px]."""
+        out = SeenPoints(
+            self.channels.rig, self.points, self.channels.camera, self.uv, self.confidence / np.square(sigma), self.loss
+        )
+        if self.contacts is None:
+            return out
+        held = self.contacts
+        return replace(out, anchored=held.points, anchors=held.places, anchor_weight=held.weight)
+
+    def fitted(self, roots: NDArray, angles: NDArray) -> NDArray:
+        """(T, N, 2) [px] where the points are seen."""
+        x = self.body.trajectories(roots, angles, self.points)
+        out = np.empty((*x.shape[:2], 2))
+        for c, camera in enumerate(self.channels.rig):
+            mine = self.channels.camera == c
+            out[:, mine] = camera.project(x[:, mine].reshape(-1, 3)).reshape(len(x), -1, 2)
+        return out
+
+    def factors(self, sigma: NDArray, fitted: NDArray) -> NDArray:
+        """(T, N) robust factor of every channel, 0 where unseen."""
+        r2 = np.square(self.uv - fitted).sum(axis=2)
+        used = (self.confidence > 0) & np.isfinite(r2)
+        s2 = np.where(used, self.confidence * r2 / np.square(sigma), 0.0)
+        return np.where(used, self.loss.factor(s2), 0.0)
+
+    def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
+        """All frames together, from where they are."""
+        lower, upper, usual = boxes(self.body.tree, self.angles)
+        never = ~self.told.any(axis=0)  # stays at the usual posture
+        lower[:, never] = upper[:, never] = usual[:, never]
+        prior = MotionPrior(strength.acceleration, self.memory, self.dt, usual, self.body.tree.spread, self.live)
+        make = self.seen(strength.sigma).equations(self.body)
+        fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=(lower, upper), tolerance=tolerance)
+        return fit, posterior(self.body, fit)
+
+
+def estimate(
+    takes: list[SmoothTake], settings_start: tuple[float, float], rounds: int
+) -> tuple[Strength, list[SmoothTake], int]:
+    """Accelerations, liveliness and pixel noise at which neither changes any more (empirical Bayes, MacKay 1992).
+
+    With γ = Σ (1 − var(r)/a²), how many of the changes r the pixels tell of, a² = Σ r² / γ; and likewise for pixels.
+
+    Parameters
+    ----------
+    takes : parts of one take.
+    settings_start : [m/s²], [rad/s²] accelerations of the root and of the angles to start from.
+    rounds : int, at most.
+
+    Returns
+    -------
+    strength, the parts as fitted last with their liveliness, and how many rounds it took
+    """
+    body, channels, n = takes[0].body, takes[0].channels, takes[0].body.tree.n_dofs
+    start = np.where(np.arange(n) < 3, *settings_start)
+    strength, groups, limb, count = Strength(start, np.array(channels.sigma)), alike(body), limbs(body), 0
+    takes = list(takes)
+    while count < rounds:
+        count += 1
+        squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
+        for i, take in enumerate(takes):
+            fit, post = take.fit(strength, tolerance=1e-3)
+            of_r, of_gamma = _changes(take, fit, post)
+            squares, informed = squares + (of_r / np.square(take.live)).sum(axis=0), informed + of_gamma.sum(axis=0)
+            live = _liveliness(body, take.dt, of_r, of_gamma)
+            level += (of_gamma * np.log(live)).sum(axis=0)
+            takes[i] = replace(take, roots=fit.roots, angles=fit.angles, live=live)
+            told.append(_pixels(takes[i], strength, post))
+        level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # the accelerations have it
+        takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
+        acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
+        looks = min(takes[0].dt / _LOOK, 1.0)
+        r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
+        found = Strength(acceleration, _noise(channels, r2, variance, looks))
+        change = found.change(strength)
+        strength = found
+        if change < _SETTLED:
+            break
+    return strength, takes, count
+
+
+def enliven(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
+    """The same take with its liveliness, where the rest is known."""
+    for _ in range(rounds):
+        fit, post = take.fit(strength, tolerance=1e-3)
+        live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
+        take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
+    return take
+
+
+def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray, NDArray]:
+    """(T, n) squares of r over what is usual of them, and how far the pixels tell of each, 0..1; zero where unknown."""
+    squares, informed = np.zeros((2, *take.live.shape))
+    _, weight = fit.prior.rows(len(fit.changes))
+    squares[2:-1] = np.square(fit.changes[2:]) * fit.prior.weight
+    informed[2:-1] = np.maximum(1.0 - post.change_variance[2:] * weight[2:], 0.0)
+    never = 6 + np.flatnonzero(~take.told.any(axis=0))
+    squares[:, never] = informed[:, never] = 0.0
+    return squares, informed
+
+
+def _liveliness(body: Body, dt: float, squares: NDArray, informed: NDArray) -> NDArray:
+    """(T, n) how much more than usual each limb accelerates at a time, over all its degrees of freedom together."""
+    reach = max(int(np.ceil(3.0 * _BURST / dt)), 1)
+    bell = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) * dt / _BURST))
+    limb = limbs(body)
+    out = np.ones(squares.shape)
+    for one in np.unique(limb):
+        mine = limb == one
+        near = [np.convolve(v[:, mine].sum(axis=1), bell)[reach:-reach] for v in (squares, informed)]
+        log = 0.5 * np.log((near[0] + _FRAMES) / (near[1] + _FRAMES))
+        out[:, mine] = np.exp(log)[:, None]
+    return out
+
+
+def limbs(body: Body) -> NDArray:
+    """(n,) int: degrees of freedom between two forks of the tree: trunk, head, each arm, each leg."""
+    tree = body.tree
+    children = np.bincount(np.maximum(tree.parents, 0), minlength=len(tree.segments))
+    children[0] -= 1  # the root is no child of its own
+    out = np.zeros(len(tree.segments), int)
+    for s in range(1, len(out)):
+        parent = tree.parents[s]
+        out[s] = out[parent] if children[parent] == 1 else s
+    return np.concatenate([np.zeros(6, int), out[tree.owners]])
+
+
+def alike(body: Body) -> NDArray:
+    """(n,) int: degrees of freedom that are as lively as each other: the root's shift, its turn, both sides."""
+    known: dict[str, int] = {}
+    names = ["shift"] * 3 + ["turn"] * 3
+    names += [c[:-2] if c.endswith(("_l", "_r")) else c for c in body.tree.coordinates]
+    return np.array([known.setdefault(name, len(known)) for name in names])
+
+
+def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: NDArray) -> NDArray:
+    """(n,) by what factor each should change: to start (n,), where the take tells little."""
+    squares, informed = np.bincount(groups, squares)[groups], np.bincount(groups, informed)[groups]
+    own = 0.5 * np.log(np.maximum(squares, 1e-12) / np.maximum(informed, 1e-12))
+    share = informed / (informed + _FRAMES)
+    return np.asarray(np.exp(share * own + (1.0 - share) * np.log(start)))
+
+
+def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray]:
+    """(T, N) squared residuals [px²] at full confidence, NaN for outliers, and the variance of the fit there [px²]."""
+    fitted = take.fitted(take.roots, take.angles)
+    inside = take.factors(strength.sigma, fitted) > INLIER
+    r2 = take.confidence * np.square(take.uv - fitted).sum(axis=2)
+    variance = take.seen(strength.sigma).variance(take.body, take.roots, take.angles, post.frames).sum(axis=2)
+    return np.where(inside, r2, np.nan), np.where(inside, take.confidence * variance, np.nan)
+
+
+def _noise(channels: Channels, r2: NDArray, variance: NDArray, looks: float) -> NDArray:
+    """(N,) [px] noise of every channel at full confidence, points of one source and name (either side) together.
+
+    Parameters
+    ----------
+    r2, variance : from `_pixels`; looks : independent looks that one frame amounts to.
+    """
+    lowest = np.minimum(channels.column, channels.column[channels.partner])
+    out = np.array(channels.sigma)
+    for q in range(len(channels.sources)):
+        mine = channels.source == q
+        whole = _deviation(r2[:, mine], variance[:, mine])
+        if not np.isfinite(whole):
+            continue
+        for k in np.unique(lowest[mine]):
+            members = mine & (lowest == k)
+            count = looks * float(np.isfinite(r2[:, members]).sum())
+            own = _deviation(r2[:, members], variance[:, members]) if count else whole
+            share = count / (count + _SAMPLES)
+            out[members] = np.exp(share * np.log(max(own, 0.25 * whole)) + (1 - share) * np.log(whole))
+    return out
+
+
+def _deviation(r2: NDArray, variance: NDArray) -> float:
+    """[px] from what is left over and what of the error the fit followed; NaN where nothing is seen."""
+    known = np.isfinite(r2)
+    if not known.any():
+        return float("nan")
+    middle = float(np.median(r2[known])) / _RAYLEIGH
+    followed = 0.5 * float(np.median(variance[known]))
+    return float(np.sqrt(middle + min(followed, middle)))

@@ -1,0 +1,119 @@
+"""Error bars that are true: jitter as the fit's own covariance has it, errors that do not average out, and the shape.
+
+A fit takes every error for new in every frame. An error e that lasts goes through to the pose whole, by δ = P Jᵀ W e
+with P the covariance of one frame on its own, however many frames are smoothed together. With δ also the answer to a
+change of the shape θ (bone lengths, places of points), the pose being fitted anew,
+
+    Cov = C + P (Jᵀ W Σ W J + Σ_c s_c s_cᵀ) P + D Σ_θ Dᵀ,        D = −P H_qθ
+
+where C is the smoothed fit's covariance, Σ the variance of every channel's drift and s_c = Jᵀ W 1_c · shift that of a
+camera as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
+from kinefit.sensors.channels import Channels
+from kinefit.solvers.equations import inverse
+from kinefit.solvers.shape import ShapeParameters, shape_parameters
+from kinefit.subject.keypoints import Subject
+from kinefit.tracking.tracker import FrameResult
+
+_MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
+_ANYWHERE = 1.0  # [m, rad] spread of a root that nothing holds, as a prior
+
+
+@dataclass(frozen=True, eq=False)
+class Lasting:
+    """What no smoothing takes away, of one frame.
+
+    Parameters
+    ----------
+    dofs : (n, n) [m, rad] covariance of the degrees of freedom.
+    joints : (S, 3) [m²] variance of the joint centres along the world's axes.
+    """
+
+    dofs: NDArray
+    joints: NDArray
+
+
+def with_lasting_errors(
+    frames: Sequence[FrameResult], subject: Subject, channels: Channels, rate: float
+) -> tuple[list[FrameResult], DetectorNoise]:
+    """The same results with the standard deviations that lasting errors and the shape add; and the noise found.
+
+    Parameters
+    ----------
+    frames : results of neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
+    subject : with the shape that the take told; without one it is taken for exact.
+    channels : of the subject's points.
+    """
+    body = subject.body
+    factor, values = np.stack([r.factor for r in frames]), np.stack([r.uv - r.fitted for r in frames])
+    seen = float(np.mean(np.sum(factor > 0, axis=1)))
+    hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
+    noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
+    if subject.shape is None or subject.covariance is None:
+        parameters = shape_parameters(body, channels.points, np.ones(len(body.scale_groups)), 0.1, 0.01)
+        theta, Sigma = parameters.mean, np.zeros((len(parameters.mean),) * 2)
+    else:
+        parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
+    weights = _pooled(np.stack([r.weight for r in frames]), round(_TIED * rate))
+    out = []
+    for result, weight in zip(frames, weights, strict=True):
+        more = lasting(parameters, theta, Sigma, channels, result.state, weight, noise)
+        out.append(replace(
+            result,
+            dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(more.dofs), 0.0)),
+            joint_std=np.sqrt(np.square(result.joint_std) + more.joints),
+        ))  # fmt: skip
+    return out, noise
+
+
+def _pooled(weights: NDArray, half: int) -> NDArray:
+    """Weights (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
+    total = np.concatenate([np.zeros((1, weights.shape[1])), np.cumsum(weights, axis=0)])
+    frames = np.arange(len(weights))
+    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(weights))
+    return np.maximum(total[high] - total[low], 0.0) / (high - low)[:, None]
+
+
+def lasting(
+    parameters: ShapeParameters, theta: NDArray, Sigma_shape: NDArray, channels: Channels, state: BodyState,
+    weight: NDArray, noise: DetectorNoise,
+) -> Lasting:
+    """Covariance of one frame's pose from drift, camera shifts and shape.
+
+    Parameters
+    ----------
+    parameters, theta : of the shape; Sigma_shape (p, p) their covariance.
+    weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
+    """
+    tree = parameters.body.tree
+    n = tree.n_dofs
+    J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
+    Jq = J[:, :, :n].reshape(-1, n)
+    each = np.repeat(weight, 2)
+    H = (Jq * each[:, None]).T @ J.reshape(len(each), -1)
+    alone = inverse(H[:, :n] + np.diag(np.concatenate([np.full(6, _ANYWHERE**-2), np.square(1.0 / tree.spread)])))
+    last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
+    meat = last.T @ last
+    for q, shift in enumerate(noise.shift):
+        mine = np.where(channels.source == q, weight, 0.0)
+        push = np.einsum("k,kin->in", mine, J[:, :, :n]) * shift[:, None]
+        meat += push.T @ push
+    answer = -alone @ H[:, n:]
+    dofs = alone @ meat @ alone
+    moves, stretch = parameters.joint_moves(theta, state)
+    whole = moves @ answer + stretch
+    joints = np.sum((moves @ dofs) * moves, axis=-1) + np.sum((whole @ Sigma_shape) * whole, axis=-1)
+    return Lasting(dofs + answer @ Sigma_shape @ answer.T, np.maximum(joints, 0.0))
+

@@ -1,0 +1,1 @@
+"""Who is seen: size and shape of a person."""

@@ -1,0 +1,141 @@
+"""Overlays show the fit where the camera sees it."""
+
+from dataclasses import replace
+
+import av
+import cv2
+import numpy as np
+import pytest
+from tests.exporters.synthetic import a_camera, smooth_motion
+
+from kinefit.errors import ExportError
+from kinefit.exporters import draw_overlay, write_montage, write_overlay
+from kinefit.exporters.pictures.drawing import bones
+from kinefit.exporters.pictures.overlay import nearest_frame
+from kinefit.exporters.skeletons.tubes import CENTRE, LEFT, RIGHT
+from kinefit.geometry.camera import ImageFrame
+from kinefit.readers.video import Video
+
+CAMERA = a_camera("cam 0", 0.3)
+GREY = np.full((480, 320, 3), 90, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    motion = smooth_motion(12, turns=0.1)
+    still = np.zeros_like(motion.angles)
+    return replace(motion, angles=still, segment_quality=np.ones_like(motion.segment_quality))
+
+
+def a_video(path, size, frames):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=60)
+        (stream.width, stream.height), stream.pix_fmt = size, "bgr0"
+        for i in range(frames):
+            image = np.full((size[1], size[0], 3), 60 + i, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24").reformat(format="bgr0")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def at(image, uv):
+    u, v = np.rint(uv).astype(int)
+    return image[v, u].astype(int)
+
+
+def test_bones_lie_where_the_camera_sees_them_in_the_colour_of_their_side(motion):
+    image = draw_overlay(GREY, replace(motion, residuals={}), 3, CAMERA)
+    body = motion.body
+    cases = {("r_hip", "r_knee"): RIGHT, ("l_elbow", "l_wrist"): LEFT, ("sacroiliac", "hip_centre"): CENTRE}
+    for names, colour in cases.items():
+        a, b = CAMERA.project(motion.positions(body.landmarks.select(names))[3])
+        assert np.abs(at(image, 0.5 * a + 0.5 * b) - colour).max() < 25, names
+    assert (GREY == 90).all()
+
+
+def test_bones_reach_from_joint_to_joint_and_to_the_ends(motion):
+    points, owners, colours = bones(motion.body)
+    assert len(points) == 2 * len(owners) == 2 * len(colours)
+    leaves = [s for s in range(20) if not np.any(motion.body.tree.parents == s)]
+    assert len(owners) == 19 + len(leaves)
+    assert list(owners) == sorted(owners)
+
+
+def test_a_lens_bends_bones_and_other_pictures_are_met(motion):
+    frame = ImageFrame.letterboxed(CAMERA.size, (400, 500))
+    grey = np.full((500, 400, 3), 90, np.uint8)
+    image = draw_overlay(grey, replace(motion, residuals={}), 0, CAMERA, image_frame=frame)
+    a, b = motion.positions(motion.body.landmarks.select(("r_knee", "r_ankle")))[0]
+    assert np.abs(at(image, frame.from_calibration(CAMERA.project(0.5 * (a + b)))) - RIGHT).max() < 25
+
+
+def test_lost_segments_turn_grey_and_are_named(motion, monkeypatch):
+    told = []
+    put = cv2.putText
+    monkeypatch.setattr(cv2, "putText", lambda image, text, *a: told.append(text) or put(image, text, *a))
+    quality = np.array(motion.segment_quality)
+    quality[3, motion.body.tree.segment("thigh_r")] = 0
+    draw_overlay(GREY, replace(motion, segment_quality=quality), 3, CAMERA)
+    draw_overlay(GREY, motion, None, CAMERA, label="frame 99")
+    swapped = replace(motion.residuals["cam 0"], swapped=np.ones(12, bool), weights=np.zeros((12, 25)))
+    draw_overlay(GREY, replace(motion, quality=np.zeros(12)), 5, CAMERA, residuals=swapped)
+    norms = motion.residuals["cam 0"].norms[3]
+    assert told[0] == "cam 0   frame 3"
+    assert f"median {np.nanmedian(norms):.1f}, mean {np.nanmean(norms):.1f} px" in told[1]
+    assert told[2] == "lost: thigh_r"
+    assert told[3:5] == ["cam 0   frame 99", "no motion here"]
+    assert "0 points" in told[6] and "left out" in told[6] and "put right" in told[7] and told[8] == "not tracked"
+
+
+def test_keypoints_are_rings_and_outliers_crosses(motion):
+    r = motion.residuals["cam 0"]
+    far = np.full_like(r.measured, np.nan)
+    far[:, 0], far[:, 1] = (40, 400), (280, 400)
+    weights = np.ones_like(r.weights)
+    weights[:, 1] = 0
+    r = replace(r, measured=far, values=np.zeros_like(far), weights=weights)
+    image = draw_overlay(GREY, motion, 0, CAMERA, residuals=r)
+    ring, cross = image[390:411, 30:51].reshape(-1, 3).astype(int), image[390:411, 270:291].reshape(-1, 3).astype(int)
+    assert ((ring[:, 0] > 180) & (ring[:, 1] > 180) & (ring[:, 2] < 140)).any()  # yellow
+    assert ((cross[:, 0] > 180) & (cross[:, 1] < 110)).any()  # red
+    assert not ((cross[:, 0] > 180) & (cross[:, 1] > 180)).any()
+
+
+def test_points_behind_the_camera_and_far_away_are_left_out(motion):
+    behind = CAMERA.with_pose(np.diag([-1.0, 1, -1, 1]) @ CAMERA.T_camera_world)
+    image = draw_overlay(GREY, replace(motion, residuals={}), 0, behind)
+    assert (image[100:] == 90).all()
+
+
+@pytest.mark.parametrize("size", [(320, 480), (321, 481)])
+def test_every_picture_is_in_the_video(tmp_path, motion, size):
+    path = a_video(tmp_path / "in.mkv", size, 10)
+    done = []
+    with Video(path) as video:
+        write_overlay(motion, CAMERA, video, tmp_path / "out.mp4", time_offset=2.0, progress=done.append)
+    assert done == list(range(1, 11))
+    with Video(tmp_path / "out.mp4") as out:
+        assert len(out) == 10 and out.size == (320, 480) and out.rate == pytest.approx(60)
+        for i in (0, 9):
+            image = out.read(i).astype(int)
+            assert np.abs(image[-20:, :40] - (60 + i)).mean() < 8
+            a, b = CAMERA.project(motion.positions(motion.body.landmarks.select(("r_hip", "r_knee")))[i])
+            patch = at(image, 0.5 * (a + b))
+            assert patch[0] > patch[2] + 40  # orange
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.mkv", "out.mp4"]
+
+
+def test_frames_are_matched_by_time(motion):
+    assert nearest_frame(motion, 2.0) == 0 and nearest_frame(motion, 2.0 + 3.4 / 60) == 3
+    assert nearest_frame(motion, 1.9) is None and nearest_frame(motion, 3.0) is None
+    assert nearest_frame(smooth_motion(0), 0.0) is None
+
+
+def test_montage_puts_pictures_side_by_side(tmp_path):
+    images = {"a": np.full((40, 20, 3), (255, 0, 0), np.uint8), "b": np.full((80, 60, 3), (0, 0, 255), np.uint8)}
+    write_montage(images, tmp_path / "a.png", height=80, gap=10)
+    back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    assert back.shape == (80, 40 + 10 + 60, 3)
+    assert (back[5, 5] == (255, 0, 0)).all() and (back[5, 45] == 255).all() and (back[5, 100] == (0, 0, 255)).all()
+    with pytest.raises(ExportError, match="no pictures"):
+        write_montage({}, tmp_path / "b.png")

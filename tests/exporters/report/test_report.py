@@ -1,0 +1,394 @@
+"""The report tells what is doubtful first, why, and never more than the motion knows."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.exporters.report.test_cycles import walk
+from tests.exporters.report.test_page import own, plots
+from tests.exporters.synthetic import a_camera, smooth_motion
+
+from kinefit.bodies import load_body
+from kinefit.errors import ExportError
+from kinefit.exporters.report.angles import _band, _root_turns, curves, thinned
+from kinefit.exporters.report.fit import overall_median, sensor_fits
+from kinefit.exporters.report.methods import lengths_table, methods_sentences
+from kinefit.exporters.report.moments import doubtful_moments, frame_residuals, listed, never_observed, stretches
+from kinefit.exporters.report.pictures import close_up, report_frames
+from kinefit.exporters.report.report import trust_sentence, write_report
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Residuals
+from kinefit.simulation import cut, known_motion
+
+F = 80
+
+
+def good_motion(frames=F, offsets=((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))):
+    """A motion that three cameras see well: residuals of about 3 px, nothing doubtful."""
+    rng = np.random.default_rng(3)
+    motion = smooth_motion(frames)
+    points = motion.body.keypoints("BODY_25B")
+    residuals = {}
+    for k, offset in enumerate(offsets):
+        values = rng.normal(0, 2.5, (frames, len(points), 2)) + offset
+        seen = a_camera(f"cam{k}", 0.7 * k).project(motion.positions(points))
+        residuals[f"cam{k}"] = Residuals(
+            points.names, points.segments, values, np.ones(values.shape[:2]), "px", seen, np.zeros(frames, bool)
+        )
+    return replace(
+        motion, residuals=residuals, quality=np.full(frames, 0.9), dof_std=np.full_like(motion.dof_std, 0.02),
+        segment_quality=np.ones_like(motion.segment_quality), joint_std=np.full_like(motion.joint_std, 0.008),
+        times=np.arange(frames) / 60.0,
+    )  # fmt: skip
+
+
+def changed(motion, name, rows, columns, value):
+    """The motion with part of one of its arrays set."""
+    array = np.array(getattr(motion, name))
+    array[rows, columns] = value
+    return replace(motion, **{name: array})
+
+
+def changed_residuals(motion, camera, rows, columns, **values):
+    """The motion with part of a camera's residuals set."""
+    r = motion.residuals[camera]
+    arrays = {name: np.array(getattr(r, name)) for name in values}
+    for name, value in values.items():
+        arrays[name][(rows, columns) if arrays[name].ndim > 1 else rows] = value
+    return replace(motion, residuals={**motion.residuals, camera: replace(r, **arrays)})
+
+
+def segment(motion, name):
+    return motion.body.tree.segments.index(name)
+
+
+def columns_of(motion, name):
+    return np.flatnonzero(np.asarray(motion.residuals["cam0"].segments) == segment(motion, name))
+
+
+def page_of(motion, tmp_path, **options):
+    return write_report(motion, tmp_path / "report.html", date="2026-01-01", **options).read_text("utf-8")
+
+
+# Doubtful moments
+
+
+def test_a_good_motion_has_no_doubtful_moment():
+    assert doubtful_moments(good_motion()) == ()
+    assert trust_sentence(good_motion(), ()).endswith("no doubtful moment.")
+
+
+def test_a_lost_segment_is_told_with_the_cameras_that_saw_it():
+    motion = changed(good_motion(), "segment_quality", slice(20, 30), segment(good_motion(), "shank_l"), 0.0)
+    hidden = columns_of(motion, "shank_l")
+    for camera in ("cam0", "cam1"):
+        motion = changed_residuals(motion, camera, slice(20, 30), hidden, values=np.nan, weights=0.0)
+    (moment,) = doubtful_moments(motion)
+    assert (moment.start, moment.stop, moment.segments) == (20, 30, ("shank_l",))
+    assert moment.what == (
+        "No measurement supports left shank: the pose follows from what is next to it and from earlier frames.",
+    )
+    assert moment.causes == ("Only cam2 saw it.",)
+
+
+def test_outliers_and_exchanged_sides_are_told_as_causes():
+    motion = replace(good_motion(), quality=np.where((np.arange(F) >= 40) & (np.arange(F) < 46), 0.3, 0.9))
+    motion = changed_residuals(motion, "cam1", slice(40, 46), slice(None), weights=0.0, values=2.0)
+    motion = changed_residuals(motion, "cam1", slice(42, 44), None, swapped=True)
+    (moment,) = doubtful_moments(motion)
+    assert moment.what == ("The measurements support only 30 % of the body at worst.",)
+    assert moment.causes == (
+        "33 % of its keypoints were left out as outliers, most of them in cam1.",
+        "The detector took left for right in cam1 (put right).",
+    )
+
+
+def test_a_stretch_without_anybody_comes_first():
+    motion = good_motion()
+    quality = np.full(F, 0.9)
+    quality[10:30], quality[50:52] = 0.0, 0.4
+    moments = doubtful_moments(replace(motion, quality=quality))
+    assert [(m.start, m.stop) for m in moments] == [(10, 30), (50, 52)]
+    assert "Nothing of the person was seen" in moments[0].what[0]
+
+
+def test_a_wide_error_bar_counts_where_it_is_usually_narrow():
+    motion = good_motion()
+    hand, head = segment(motion, "hand_r"), segment(motion, "head")
+    wide = changed(motion, "joint_std", slice(5, 9), hand, 0.1)
+    (moment,) = doubtful_moments(wide)
+    assert moment.segments == ("hand_r",) and (moment.start, moment.stop) == (5, 9)
+    assert moment.what == ("The place of right hand is uncertain: up to ±35 cm (2 σ).",)
+    always = changed(motion, "joint_std", slice(None), head, 0.1)
+    assert doubtful_moments(always) == ()
+    unbounded = changed(motion, "joint_std", slice(5, 9), hand, np.inf)
+    assert "nothing bounds it" in doubtful_moments(unbounded)[0].what[0]
+
+
+def test_frames_that_fit_worse_than_the_others_are_named_with_their_camera():
+    motion = changed_residuals(good_motion(), "cam2", slice(33, 36), slice(None), values=20.0)
+    (moment,) = doubtful_moments(motion)
+    assert (moment.start, moment.stop) == (33, 36)
+    assert re.fullmatch(r"The body lies 28 px beside what cam2 saw \(usually \d\)\.", moment.what[0])
+
+
+def test_what_happens_at_once_is_one_moment_and_near_ones_are_joined():
+    motion = good_motion()
+    for name in ("hand_r", "forearm_r"):
+        motion = changed(motion, "segment_quality", [20, 21, 23, 24], segment(motion, name), 0.0)
+    (moment,) = doubtful_moments(motion)
+    assert (moment.start, moment.stop) == (20, 25) and set(moment.segments) == {"hand_r", "forearm_r"}
+    assert "right forearm and right hand" in moment.what[0]
+
+
+def test_what_concerns_the_whole_body_at_once_is_one_moment():
+    motion = replace(good_motion(), quality=np.where((np.arange(F) >= 40) & (np.arange(F) < 60), 0.3, 0.9))
+    for start in (41, 52):
+        motion = changed_residuals(motion, "cam2", slice(start, start + 2), slice(None), values=float(start - 21))
+    (moment,) = doubtful_moments(motion)
+    assert (moment.start, moment.stop) == (40, 60) and len(moment.what) == 2
+    assert re.match(r"The body lies 44 px beside what cam2 saw", moment.what[1])
+
+
+def test_coordinates_without_any_measurement_are_named():
+    motion = good_motion()
+    std = np.array(motion.dof_std)
+    std[:, 6 + motion.body.tree.coordinate("wrist_dev_l")] = np.inf
+    std[:10, 6 + motion.body.tree.coordinate("knee_angle_l")] = np.inf
+    assert never_observed(replace(motion, dof_std=std)) == ("wrist_dev_l",)
+
+
+def test_stretches_and_lists():
+    flags = np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
+    assert stretches(flags) == [(0, 1), (2, 4), (7, 8)]
+    assert stretches(flags, gap=2) == [(0, 4), (7, 8)]
+    assert stretches(np.zeros(5, bool)) == []
+    assert listed(["a"]) == "a" and listed(["a", "b", "c"]) == "a, b and c"
+    assert listed(list("abcdefg")) == "a, b, c, d and 3 more"
+
+
+# Fit
+
+
+def test_numbers_of_a_sensor_are_those_of_its_residuals():
+    motion = changed_residuals(good_motion(), "cam0", slice(0, 8), slice(None), values=np.nan, weights=0.0)
+    motion = changed_residuals(motion, "cam0", slice(8, 16), slice(None), weights=0.0)
+    fit = sensor_fits(motion)[0]
+    norms = np.linalg.norm(motion.residuals["cam0"].values[8:], axis=-1)
+    assert fit.median == pytest.approx(np.median(norms)) and fit.most == pytest.approx(np.percentile(norms, 95))
+    assert fit.seen == pytest.approx(0.9) and fit.left_out == pytest.approx(8 / 72) and fit.count == norms.size
+    assert overall_median(motion) == pytest.approx(np.nanmedian([r.norms for r in motion.residuals.values()]))
+    assert np.isnan(frame_residuals(motion.residuals["cam0"])[:8]).all()
+
+
+def test_a_constant_shift_points_to_the_calibration(tmp_path):
+    shifted = [f.is_shifted for f in sensor_fits(good_motion(offsets=((0, 0), (-14, 3), (0.5, 0))))]
+    assert shifted == [False, True, False]
+    text = page_of(good_motion(offsets=((0, 0), (-14, 3), (0, 0))), tmp_path)
+    assert re.search(r"Constant shift in cam1 \(-1\d\.\d, \+\d\.\d\) px", text) and "kinefit check" in text
+    assert "Constant shift" not in page_of(good_motion(), tmp_path)
+
+
+# Angles
+
+
+def test_the_root_turns_have_the_deviations_of_a_turn_about_the_worlds_axes():
+    motion = smooth_motion(6)
+    std = np.array([0.01, 0.02, 0.03])
+    motion = replace(motion, dof_std=np.concatenate([np.zeros((6, 3)), np.tile(std, (6, 1)), motion.dof_std[:, 6:]], 1))
+    angles, found = _root_turns(motion)
+    columns = []
+    for axis in np.eye(3):
+        both = []
+        for step in (1e-6, -1e-6):
+            T = motion.Ts_world_root.copy()
+            T[:, :3, :3] = se3.exp_so3(step * axis) @ T[:, :3, :3]
+            both.append(_root_turns(replace(motion, Ts_world_root=T))[0])
+        columns.append((both[0] - both[1]) / 2e-6)
+    expected = np.sqrt(np.sum((np.stack(columns, -1) * std) ** 2, axis=-1))
+    assert np.allclose(found, expected, rtol=1e-5)
+    assert angles.shape == (6, 3)
+    blind = np.array(motion.dof_std)
+    blind[2, 4] = np.inf
+    assert np.isinf(_root_turns(replace(motion, dof_std=blind))[1][2]).all()
+
+
+def test_all_coordinates_are_there_in_degrees():
+    motion = smooth_motion(20)
+    found = {c.name: c for c in curves(motion)}
+    assert len(found) == 6 + len(motion.body.tree.coordinates)
+    d = motion.body.tree.coordinate("knee_angle_r")
+    knee = found["knee_angle_r"]
+    assert np.allclose(knee.values, np.degrees(np.unwrap(motion.angles[:, d]))) and knee.side == "right"
+    assert np.allclose(knee.std, np.degrees(motion.dof_std[:, 6 + d])) and knee.joint == "knee"
+
+
+def test_thinning_keeps_the_extremes():
+    rng = np.random.default_rng(0)
+    values = rng.normal(0, 1, 10_000)
+    values[[1234, 8765]] = 50, -50
+    at = thinned(values, 1000)
+    assert len(at) <= 1002 and {0, 1234, 8765, 9999} <= set(at.tolist()) and np.all(np.diff(at) > 0)
+    assert np.array_equal(thinned(values[:900], 1000), np.arange(900))
+
+
+def test_a_band_leaves_out_what_nothing_observes():
+    x, y = _band(np.arange(6.0), np.zeros(6), np.array([1, 1, np.nan, np.nan, 2, 2.0]))
+    assert x.tolist()[:4] == [0, 1, 1, 0] and np.isnan(x[4]) and x.tolist()[5:] == [4, 5, 5, 4]
+    assert y.tolist()[:4] == [1, 1, -1, -1] and y.tolist()[5:] == [2, 2, -2, -2]
+    assert len(_band(np.arange(2.0), np.zeros(2), np.full(2, np.nan))[0]) == 0
+
+
+# The page
+
+
+def test_the_page_has_its_parts_and_no_address_and_no_nan(tmp_path):
+    motion = replace(smooth_motion(60), name="a walk")
+    text = page_of(motion, tmp_path, rig=Rig((a_camera("cam 0", 0.0),)), files={"motion.npz": "everything"})
+    titles = re.findall(r"<h2>([^<]*)</h2>", text)
+    assert titles == ["Summary", "Doubtful moments", "Moving figure", "Angles", "Cycles", "Fit to the measurements",
+                      "Methods", "Files"]  # fmt: skip
+    assert "://" not in own(text) and "<h1>a walk</h1>" in text and 'href="motion.npz"' in text
+    assert plots(text)  # json.loads of the tests takes NaN; the text has none
+    assert not re.search(r"\bNaN\b|\bInfinity\b|>nan|>inf", own(text).split("<script>")[0])
+
+
+def test_the_same_motion_gives_the_same_bytes(tmp_path):
+    image = np.random.default_rng(0).integers(0, 255, (90, 60, 3)).astype(np.uint8)
+    pages = []
+    for name in ("a", "b"):
+        pictures = {"cam0": dict.fromkeys(report_frames(smooth_motion(30)), image)}
+        path = write_report(smooth_motion(30), tmp_path / name / "r.html", date="x", pictures=pictures)
+        pages.append(path.read_bytes())
+    assert pages[0] == pages[1]
+
+
+def test_doubt_comes_before_results_and_names_its_severity(tmp_path):
+    bad = replace(good_motion(), quality=np.zeros(F), segment_quality=np.zeros((F, 20)))
+    text = page_of(bad, tmp_path, findings=[("warning", "Found by the check", "cam0 is late")])
+    assert '<div class="callout bad">' in text and "In 100 % of the frames nobody was seen." in text
+    assert text.index("Found by the check") < text.index('id="doubtful-moments"') < text.index('id="angles"')
+    assert '<div class="callout good">' in page_of(good_motion(), tmp_path)
+
+
+def test_a_walk_has_cycles_and_another_motion_none(tmp_path):
+    text = page_of(walk(), tmp_path)
+    assert "Gait: " in text and "stride time [s]" in text and "stride length [m]" in text
+    text = page_of(good_motion(), tmp_path)
+    assert "This take has no repeated cycle." in text and "cycle [%]" not in text
+
+
+def everything_inf(motion):
+    return replace(motion, dof_std=np.inf * motion.dof_std, joint_std=np.inf * motion.joint_std)
+
+
+def nothing_seen(motion):
+    gone = {n: replace(r, values=r.values * np.nan, weights=0 * r.weights, measured=r.measured * np.nan)
+            for n, r in motion.residuals.items()}  # fmt: skip
+    return replace(motion, residuals=gone)
+
+
+def a_still_arm(motion):
+    body = load_body("arm")
+    return known_motion(body, 60.0, np.tile(np.eye(4), (30, 1, 1)), np.zeros((30, len(body.tree.coordinates))))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda m: cut(m, 0, 1), "1 frames at 60 Hz"), (lambda m: cut(m, 0, 2), "2 frames"),
+        (lambda m: replace(m, residuals={}), "comes without measurements"), (everything_inf, "Not observed: root_tx"),
+        (nothing_seen, "nothing seen"), (a_still_arm, "comes without measurements"),
+    ],
+)  # fmt: skip
+def test_poor_motions_have_a_page_that_says_so(tmp_path, change, told):
+    text = page_of(change(good_motion()), tmp_path)
+    assert told in text and plots(text)
+    assert not re.search(r"\bNaN\b|>nan|>inf| nan ", own(text).split("<script>")[0])
+
+
+def test_what_nothing_observes_has_no_band_and_is_grey(tmp_path):
+    for motion, has_band in ((everything_inf(good_motion()), False), (good_motion(), True)):
+        drawn = [plot for plot in plots(page_of(motion, tmp_path)) if "layout" in plot]
+        hip = next(plot for plot in drawn if "hip_flexion" in json.dumps(plot["layout"]))
+        assert any("fill" in trace for trace in hip["data"]) is has_band
+        assert ("not observed: " in hip["layout"]["annotations"][0]["text"]) is not has_band
+
+
+def test_a_motion_without_frames_is_refused_and_nothing_is_left(tmp_path):
+    names = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
+    motion = good_motion()
+    empty = replace(motion, residuals={}, **{name: getattr(motion, name)[:0] for name in names})
+    with pytest.raises(ExportError, match="without frames"):
+        write_report(empty, tmp_path / "report.html")
+    assert not list(tmp_path.iterdir())
+    assert report_frames(empty) == {} and never_observed(empty) == ()
+
+
+@pytest.mark.slow
+def test_a_long_take_stays_small(tmp_path):
+    assert write_report(smooth_motion(10_000), tmp_path / "r.html", rig=None).stat().st_size < 8e6
+
+
+# Pictures, methods
+
+
+def test_the_frames_to_show_are_the_first_the_middle_the_last_and_the_worst():
+    quality = np.full(F, 0.9)
+    quality[17] = 0.2
+    frames = report_frames(replace(good_motion(), quality=quality))
+    assert frames == {0: "first", F // 2: "middle", F - 1: "last", 17: "lowest quality"}
+
+
+def test_a_close_up_shows_the_person_and_what_does_not_see_it_is_left_whole():
+    motion, image = good_motion(), np.full((480, 320, 3), 90, np.uint8)
+    camera = a_camera("cam0", 0.3)
+    close = close_up(image, motion, 0, camera, residuals=motion.residuals["cam0"])
+    assert close.shape[0] < 480 and (close != 90).any() and (image == 90).all()
+    away = camera.with_pose(se3.transform(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ camera.T_camera_world)
+    assert close_up(image, motion, 0, away).shape == image.shape
+
+
+def test_pictures_stand_beside_their_moment(tmp_path):
+    motion = changed_residuals(good_motion(), "cam2", slice(33, 36), slice(None), values=20.0)
+    worst = doubtful_moments(motion)[0].worst
+    pictures = {"cam2": dict.fromkeys(report_frames(motion), np.full((90, 60, 3), 9, np.uint8))}
+    assert worst in pictures["cam2"]
+    text = page_of(motion, tmp_path, pictures=pictures)
+    doubtful = text[text.index('id="doubtful-moments"') : text.index('id="moving-figure"')]
+    assert f"cam2, frame {worst}" in doubtful and doubtful.count("<img") == 1
+    shown = text[text.index('<section id="pictures"') : text.index('<section id="methods"')]
+    assert shown.count("<img") == 3
+
+
+def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
+    motion = good_motion()
+    bare = " ".join(methods_sentences(motion, 0))
+    assert "cam0, cam1 and cam2" in bare and "No moment was flagged" in bare
+    assert "smoothed" not in bare and "SHA-256" not in bare
+    told = {
+        "kinefit": "9.9", "tracking": {"poor": 0.5},
+        "smoothing": {"window": 500, "pixel_sigma": {"cam0": {"nose": 4.0, "neck": 5.0}}},
+        "calibration": {"file": "calib.toml", "sha256": "ab" * 32},
+        "keypoints": [{"camera": "cam0", "format": "openpose", "set": "BODY_25B", "accuracy": 8.0}],
+    }  # fmt: skip
+    text = " ".join(methods_sentences(replace(motion, provenance=told), 3))
+    for part in (
+        "kinefit 9.9", "(openpose BODY_25B)", "a stated accuracy of 8 px", "calib.toml (SHA-256 abababababababab…)",
+        "window 500", "every keypoint (median 4.5 px) was estimated", "poor 0.5", "3 moments were",
+    ):  # fmt: skip
+        assert part in text, part
+    page = page_of(replace(motion, provenance=told), tmp_path)
+    block = json.loads(re.search(r"<pre>(.*?)</pre>", page, re.S)[1].replace("&quot;", '"'))
+    assert block["provenance"] == told and block["sensors"]["cam0"]["unit"] == "px" and block["frames"] == F
+
+
+def test_lengths_are_in_centimetres_with_deviations_where_known():
+    motion = good_motion()
+    length = 100 * motion.body.segment_lengths()["thigh_l-shank_l"]
+    assert f"<td>{length:.1f}</td>" in lengths_table(motion)
+    told = replace(motion, provenance={"length_std_m": {"thigh_l-shank_l": 0.012}})
+    assert f"<td>{length:.1f} ± 1.2</td>" in lengths_table(told)

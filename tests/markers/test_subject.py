@@ -1,0 +1,185 @@
+"""Marker sets on bodies, and subjects found from what their markers do."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from kinefit import Markers, load_body
+from kinefit.errors import FileError, KinefitError, ObservationError, TrackingError
+from kinefit.evaluation import joint_errors
+from kinefit.markers.fit import fit_markers
+from kinefit.markers.people import split_people
+from kinefit.markers.placement import find_placement, marker_set_names, placement
+from kinefit.markers.subject import fit_marker_subject
+from kinefit.readers.markers import read_markers
+from kinefit.simulation import squat_and_wave
+
+BODY = load_body("humanoid")
+REAL = {  # file of the folder markers: set that is found, markers of it, stature [m] that a person has
+    "momentum/momentum__examples__process_markers_app__02_01.c3d": ("CMU_41", 41),
+    "nimblephysics/data__grf__Subject4__MarkerData__walking1.trc": ("STANFORD_47", 47),
+    "nimblephysics/data__osim__WeirdFormatTests__markers.trc": ("PIG", 61),
+    "nimblephysics/data__osim__HamnerSubject04__subject04__trials__run200__markers.trc": ("HAMNER", 42),
+    "nimblephysics/data__c3d__JA1Gait35.c3d": ("SPRINT_51", 51),
+    "opensim/Pipelines__Rajagopal__ExpData__motion_capture_walk.trc": ("RAJAGOPAL", 41),
+}
+
+
+@pytest.mark.parametrize("name", marker_set_names())
+def test_sets_lie_on_the_body_and_are_symmetric(name):
+    placed = placement(BODY, name)
+    assert len(set(placed.points.names)) == len(placed.points) >= 20
+    x = BODY.points_rest(placed.points)
+    ends = np.concatenate([BODY.points_rest(BODY.landmarks), BODY.tree.rest])
+    nearest = np.linalg.norm(x[:, None] - ends[None], axis=2).min(axis=1)
+    assert nearest.max() < 0.16  # [m] half a thigh
+    assert np.all((placed.spread > 0.005) & (placed.spread <= 0.1))
+    mirrored = x * (1, 1, -1)
+    images = np.linalg.norm(mirrored[:, None] - x[None], axis=2).min(axis=1)
+    assert np.all(images[np.abs(x[:, 2]) > 1e-9] < 1e-9)
+
+
+def test_sets_go_by_all_their_names():
+    assert placement(BODY, "hdm05-41").points.names == placement(BODY, "CMU_41").points.names
+    labels = placement(BODY, "STANFORD_47").points.names
+    assert {"r.ASIS", "L.ASIS", "r_knee", "L_knee", "R_Shoulder", "L_Shoulder"} <= set(labels)
+
+
+BAD_SETS = {
+    "not valid TOML": "name = ",
+    "not a marker set": "name = 3",
+    "landmark, or on a segment": 'name = "a"\n[markers]\nA = { segment = "thigh_r" }',
+    "not finite": 'name = "a"\n[markers]\nA = { landmark = "r_asis", spread = -1.0 }',
+}
+
+
+@pytest.mark.parametrize("problem", BAD_SETS)
+def test_bad_sets_are_told(tmp_path, problem):
+    (tmp_path / "a.toml").write_text(BAD_SETS[problem])
+    with pytest.raises(FileError, match=problem):
+        placement(BODY, tmp_path / "a.toml")
+    with pytest.raises(FileError, match="cannot read"):
+        placement(BODY, tmp_path / "none.toml")
+    with pytest.raises(ObservationError, match="no marker set 'X'"):
+        placement(BODY, "X")
+
+
+def test_own_set_from_a_file(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'name = "mine"\nsides = [["R", "L"]]\n[markers]\nRA = { landmark = "r_asis" }\nRB = { landmark = "r_psis" }\n'
+        'RC = { segment = "thigh_r", at = [0.0, -0.2, 0.1], spread = 0.05 }\nRD = { landmark = "not_there" }\n'
+    )
+    found = find_placement(BODY, ("LA", "LB", "LC", "RA", "LD"), tmp_path / "a.toml")
+    assert found.points.names == ("RA", "LA", "LB", "LC")
+    assert found.points.points[3] == pytest.approx([0.0, -0.2, -0.1])
+    with pytest.raises(ObservationError, match="only 2 of the labels are known to set"):
+        find_placement(BODY, ("LA", "LB", "X"), tmp_path / "a.toml")
+
+
+@pytest.fixture(scope="module")
+def known():
+    """A known person who moves, in CMU's markers at places of their own: truth, markers."""
+    rng = np.random.default_rng(5)
+    truth = squat_and_wave(rate=60)
+    placed = placement(truth.body, "CMU_41")
+    points = type(placed.points)(
+        placed.points.names, placed.points.segments,
+        placed.points.points + placed.spread[:, None] * np.clip(rng.normal(size=(len(placed.points), 3)), -1.5, 1.5),
+    )  # fmt: skip
+    x = truth.positions(points) + rng.normal(0, 0.002, (len(truth), len(points), 3))
+    return truth, Markers(points.names, truth.rate, x, up=truth.up)
+
+
+def test_size_and_offsets_of_a_known_person(known):
+    truth, markers = known
+    subject = fit_marker_subject(BODY, markers)
+    assert subject.marker_set == "CMU_41"
+    lengths, found = truth.body.segment_lengths(), subject.body.segment_lengths()
+    for bone in ("thigh_r-shank_r", "shank_l-foot_l", "upperarm_r-forearm_r"):
+        assert found[bone] == pytest.approx(lengths[bone], abs=0.015)
+    motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    assert np.sqrt(np.nanmean(motion.residuals["markers"].norms ** 2)) < 0.005
+    errors = joint_errors(truth, motion)
+    assert errors.mean() < 0.02  # [m] markers are held to slide by 5 mm or more, which these do not
+
+
+def test_static_and_moving_trials_go_together(known):
+    _, markers = known
+    still = Markers(markers.names, markers.rate, markers.positions[:10], up=markers.up)
+    subject = fit_marker_subject(BODY, [still, markers], frames=30)
+    assert subject.frames <= 30
+    assert subject.rms < 0.006
+
+
+def test_hidden_limbs_and_frames_are_bridged(known):
+    _, markers = known
+    x = np.array(markers.positions)
+    arm = [i for i, n in enumerate(markers.names) if n in ("RUPA", "RELB", "RFRM", "RWRA", "RWRB", "RFIN")]
+    x[20:40, arm] = np.nan
+    x[60:70] = np.nan
+    hidden = Markers(markers.names, markers.rate, x, up=markers.up)
+    subject = fit_marker_subject(BODY, hidden)
+    motion = fit_markers(subject.body, hidden, subject.marker_set, sigma=subject.sigma)
+    assert np.isfinite(motion.angles).all()
+    whole = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    steps = np.linalg.norm(np.diff(motion.positions(), axis=0), axis=2).max()
+    assert steps < 2 * np.linalg.norm(np.diff(whole.positions(), axis=0), axis=2).max()
+    assert motion.quality[60:70].max() == 0.0
+    hand = motion.body.tree.segment("hand_r")
+    assert motion.segment_quality[20:40, hand].max() == 0.0
+    assert motion.joint_std[30, hand].max() > 5 * whole.joint_std[30, hand].max()
+
+
+def test_a_wrong_label_does_not_pull(known):
+    _, markers = known
+    x = np.array(markers.positions)
+    a, b = markers.names.index("RKNE"), markers.names.index("LKNE")
+    x[10:20, [a, b]] = x[10:20, [b, a]]
+    swapped = Markers(markers.names, markers.rate, x, up=markers.up)
+    subject = fit_marker_subject(BODY, swapped)
+    motion = fit_markers(subject.body, swapped, subject.marker_set, sigma=subject.sigma)
+    whole = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    weights = motion.residuals["markers"].weights[10:20, motion.residuals["markers"].names.index("RKNE")]
+    assert weights.max() < 0.1
+    knee = motion.body.tree.segment("shank_r")
+    centre = (m.segment_poses()[10:20, knee, :3, 3] for m in (motion, whole))
+    assert np.linalg.norm(next(centre) - next(centre), axis=1).max() < 0.03
+
+
+def test_bad_input_is_told(known):
+    _, markers = known
+    with pytest.raises(ObservationError, match="times the body's size: the unit"):
+        fit_marker_subject(BODY, Markers(markers.names, 60.0, markers.positions * 1000))
+    two = Markers(
+        tuple(f"{p}:{n}" for p in "AB" for n in markers.names), 60.0, np.tile(markers.positions, (1, 2, 1)), up="y"
+    )
+    with pytest.raises(ObservationError, match="more than one subject"):
+        fit_marker_subject(BODY, two)
+    assert list(split_people(two)) == ["A", "B"]
+    assert split_people(two)["B"].names == markers.names
+    for unseen in (markers.positions[:0], np.full_like(markers.positions, np.nan)):
+        with pytest.raises(ObservationError, match="none of the markers is seen"):
+            fit_marker_subject(BODY, Markers(markers.names, 60.0, unseen))
+    few = np.array(markers.positions)
+    few[:, 5:] = np.nan
+    with pytest.raises(TrackingError, match="5 at most"):
+        fit_marker_subject(BODY, Markers(markers.names, 60.0, few))
+    with pytest.raises(KinefitError, match="height"):
+        fit_marker_subject(BODY, markers, height=180.0)
+    with pytest.raises(ObservationError, match="appear twice for A: X"):
+        split_people(Markers(("A:X", "A:X", "A:Y", "A:Z"), 60.0, np.zeros((2, 4, 3))))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_takes(data_dir, name):
+    markers = read_markers(data_dir("markers") / name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        subject = fit_marker_subject(BODY, markers, frames=30)
+        motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    assert (subject.marker_set, len(subject.points)) == REAL[name]
+    assert 1.5 < subject.body.stature < 2.0
+    residuals = motion.residuals["markers"]
+    assert (residuals.weights > 0.5).mean() > 0.9
+    assert np.sqrt(np.mean(residuals.norms[residuals.weights > 0.5] ** 2)) < 0.012

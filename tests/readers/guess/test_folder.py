@@ -1,0 +1,483 @@
+"""A take file guessed from a folder: made-up recordings under all sorts of names, and real ones."""
+
+import json
+import re
+from dataclasses import replace
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from kinefit.errors import CalibrationError, TakeError
+from kinefit.geometry.camera import Camera, ImageFrame, Rig
+from kinefit.readers.calibration.read import write_calibration
+from kinefit.readers.guess.folder import guess_take
+from kinefit.readers.guess.names import trials
+from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+
+SIZE = (272, 480)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return cut(squat_and_wave(), 0, 30)
+
+
+@pytest.fixture(scope="module")
+def rig(motion):
+    return studio_rig(motion, size=SIZE)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "recording").mkdir()
+    return tmp_path / "recording"
+
+
+def renamed(rig, names):
+    return Rig(tuple(replace(camera, name=name) for camera, name in zip(rig, names, strict=True)))
+
+
+def write_video(path, size=SIZE, frames=30, bar=0, rate=30):
+    """A grey video, with black bars of `bar` px above and below."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = np.full((size[1], size[0], 3), 128, np.uint8)
+    picture[:bar], picture[size[1] - bar :] = 0, 0
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=Fraction(rate))
+        (stream.width, stream.height), stream.pix_fmt = size, "yuv420p"
+        for _ in range(frames):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode())
+
+
+def write_videos(folder, names, **how):
+    for name in names:
+        write_video(folder / name, **how)
+
+
+def write_mediapipe(folder, motion, rig, names, images=(), normalised=False):
+    seen = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.0, outliers=0.0, missing=0.0)
+    for number, (record, name) in enumerate(zip(seen, names)):
+        points = images[number].from_calibration(record.points[:, 0]) if images else record.points[:, 0]
+        points = points / SIZE if normalised else points
+        np.save(folder / name, np.nan_to_num(np.concatenate([points, record.confidence[:, 0, :, None]], -1)))
+
+
+def write_openpose(folder, record):
+    folder.mkdir(parents=True)
+    for frame, (people, confidence) in enumerate(zip(record.points, record.confidence)):
+        numbers = np.nan_to_num(np.concatenate([people[0], confidence[0][:, None]], axis=1)).ravel().tolist()
+        text = json.dumps({"people": [{"pose_keypoints_2d": numbers}]})
+        (folder / f"clip_{frame:012d}_keypoints.json").write_text(text)
+
+
+def taken(folder):
+    """The take of a folder, read and loaded, with its notes; the folder is unchanged by guessing."""
+    before = sorted(folder.rglob("*"))
+    guess = guess_take(folder)
+    assert sorted(folder.rglob("*")) == before
+    (folder / "take.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(folder / "take.toml")
+    return take, load_observations(take), guess
+
+
+def notes(guess, about=""):
+    return " | ".join(f"{note.sure} {note.about}: {note.told}" for note in guess.notes if about in note.about)
+
+
+@pytest.mark.parametrize(
+    ("files", "sure"),
+    [
+        ({"cam04": "cam04.mp4", "cam02": "CAM02.avi", "cam01": "cam01.mkv", "cam03": "cam03.mov"}, "sure"),
+        ({f"cam0{k}": f"walk_cam0{k}.mp4" for k in (1, 2, 3, 4)}, "sure"),
+        ({"far": "far_view.mp4", "left": "Left.mp4", "right": "the right.mp4", "top": "top.mp4"}, "sure"),
+        ({str(n): f"Miqus_3_{n}.mp4" for n in (21320, 21321, 21322, 2132)}, "sure"),
+        ({f"cam0{k}": f"cam0{k}/GX0{9 - k}0055.mp4" for k in (1, 2, 3, 4)}, "sure"),
+        ({n: f"2019-08-02-vid01-cam{n}.mov" for n in "ABCD"}, "sure"),
+        ({n: f"{n}.mp4" for n in "1234"}, "sure"),
+        ({n: f"2024-1-2-cam{n}.mp4" for n in "1234"}, "sure"),
+        ({n: f"snowboard_{n}.mp4" for n in ("c1", "c2", "c3", "c4")}, "sure"),
+        ({f"cam_{k}": f"port_{k}.mp4" for k in (0, 1, 2, 3)}, "likely"),
+        ({f"cam{k:02}": f"Camera {k}.mp4" for k in (1, 2, 3, 10)}, "likely"),
+        ({f"cam{k}": f"view{k:03} 2024-11-0{9 - k}.mp4" for k in (1, 2, 3, 4)}, "likely"),
+        ({f"cam{k}": f"GX01001{k - 1}.mp4" for k in (1, 2, 3, 4)}, "guess"),
+        (dict(zip(("east", "north", "south", "west"), ("a.mp4", "b2.mp4", "b10.mp4", "d.mp4"))), "guess"),
+    ],
+)
+def test_videos_find_their_cameras(folder, rig, files, sure):
+    write_calibration(renamed(rig, list(files)), folder / "calibration.toml")
+    write_videos(folder, files.values(), frames=2)
+    take, _, guess = taken(folder)
+    assert {entry.name: entry.video.relative_to(folder).as_posix() for entry in take.cameras} == files
+    assert notes(guess, "camera ").count(f"{sure} camera") == 4
+
+
+def test_a_camera_of_another_size_is_told_by_it(folder, rig):
+    sizes = [(320, 240), (400, 300), (272, 480), (640, 480)]
+    own = Rig(tuple(camera.scaled(size) for camera, size in zip(rig, sizes)))
+    write_calibration(renamed(own, ["a1x", "b1x", "c1x", "d1x"]), folder / "calibration.toml")
+    for name, size in zip(("p.mp4", "q.mp4", "r.mp4", "s.mp4"), reversed(sizes)):
+        write_video(folder / name, size=size, frames=2)
+    take, _, guess = taken(folder)
+    assert [entry.video.name for entry in take.cameras] == ["s.mp4", "r.mp4", "q.mp4", "p.mp4"]
+    assert notes(guess, "camera").count("by the size of its picture") == 4
+
+
+def test_two_recordings_of_one_session_are_kept_apart(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    for trial, frames in (("walk", 3), ("jump", 9), ("static", 30)):
+        write_videos(folder, [f"{trial}_{name}.mp4" for name in rig.names], frames=frames)
+    write_videos(folder, [f"intrinsics/{name}.mp4" for name in rig.names], frames=40)
+    take, _, guess = taken(folder)
+    assert {entry.video.name for entry in take.cameras} == {f"jump_{name}.mp4" for name in rig.names}
+    told = notes(guess, "video")
+    assert "jump_*: taken" in told and "walk_*: another recording" in told and "static_*: a static trial" in told
+    assert "# subject = " in guess.text
+
+
+def test_files_of_no_camera_are_left_out(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, ["cam01.mp4", "cam03.mp4", "overview.mp4"], frames=2)
+    take, _, guess = taken(folder)
+    assert [entry.name for entry in take.cameras] == ["cam01", "cam03"]
+    assert "overview.mp4 fits no camera" in notes(guess, "video")
+    assert "cam02, cam04 of the calibration: nothing here fits" in notes(guess, "cameras")
+
+
+def test_videos_without_keypoints_go_to_the_detector(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=5)
+    take, seen, guess = taken(folder)
+    assert take.keypoints == () and len(seen.videos) == 4 and take.rate == 30.0
+    assert "kinefit track runs the built-in detector" in notes(guess, "keypoints")
+
+
+def test_videos_of_different_length_and_of_different_rate(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    for number, name in enumerate(rig.names):
+        write_video(folder / f"{name}.mp4", frames=5 + number)
+    take, _, guess = taken(folder)
+    assert take.frames == (0, 5) and "guess frames" in notes(guess)
+    write_video(folder / "cam02.mp4", rate=25)
+    assert "open rate: videos of different rate: cam01 30, cam02 25" in notes(guess_take(folder))
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000.0), ("cm", 100.0), ("inch", 1 / 0.0254)])
+def test_the_unit_follows_from_the_person(folder, motion, rig, unit, factor):
+    def far(camera):
+        T = camera.T_camera_world.copy()
+        T[:3, 3] *= factor
+        return camera.with_pose(T)
+
+    write_calibration(Rig(tuple(map(far, rig))), folder / "calibration.toml")
+    text = (folder / "calibration.toml").read_text()
+    (folder / "calibration.toml").write_text(text.replace('unit = "m"\n', ""))
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    take = read_guess(folder)
+    assert take.calibration.unit == unit
+
+
+def read_guess(folder):
+    """The take where its rate is not told by any file."""
+    guess = guess_take(folder)
+    assert "open rate" in notes(guess)
+    (folder / "take.toml").write_text(guess.text, encoding="utf-8")
+    return read_take(folder / "take.toml")
+
+
+@pytest.mark.parametrize("up", ["x", "y", "-z"])
+@pytest.mark.parametrize("keypoints", [True, False])
+def test_up_follows_from_person_and_cameras(folder, motion, up, keypoints):
+    own = motion.turned(up)
+    rig = studio_rig(own, size=SIZE)
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=30)
+    if keypoints:
+        write_mediapipe(folder, own, rig, [f"{name}.npy" for name in rig.names])
+    take, _, guess = taken(folder)
+    assert take.up == up
+    assert notes(guess, "up").startswith("sure" if keypoints else "likely")
+
+
+def test_a_person_on_the_ceiling_is_no_certain_up(folder, motion, rig):
+    """Cameras upside down, as in a mirrored world: both opinions are told."""
+    def upside_down(camera):
+        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        K = camera.matrix.copy()
+        K[:2, 2] = np.subtract(camera.size, 1) - K[:2, 2]
+        return Camera(camera.name, camera.size, K, (), T_camera_world=turn @ camera.T_camera_world)
+
+    own = Rig(tuple(map(upside_down, rig)))
+    write_calibration(own, folder / "calibration.toml")
+    write_mediapipe(folder, motion, own, [f"{name}.npy" for name in own.names])
+    told = notes(guess_take(folder), "up")
+    assert told.startswith("guess")
+    assert 'up = "z": the person stands so; but the cameras stand upright would give -z' in told
+
+
+@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
+def test_the_set_follows_from_the_points(folder, motion, rig, keypoint_set):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    for record in simulate_keypoints(motion, rig, keypoint_set, noise_px=1.5):
+        write_openpose(folder / "pose" / f"{record.camera}_json", record)
+    take, seen, _ = taken(folder)
+    assert [(k.camera, k.set, k.format) for k in take.keypoints] == [(n, keypoint_set, "openpose") for n in rig.names]
+    assert seen.keypoints[0].names == KEYPOINT_SETS[keypoint_set]
+
+
+def test_of_two_detectors_one_is_left_as_comments(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_mediapipe(folder, motion, rig, [f"mediapipe_{name}.npy" for name in rig.names])
+    for record in simulate_keypoints(motion, rig, "COCO_17"):
+        write_openpose(folder / "pose" / record.camera, record)
+    take = read_guess(folder)
+    assert {k.format for k in take.keypoints} == {"openpose"}
+    assert (folder / "take.toml").read_text().count('# format = "mediapipe"') == 4
+    text = (folder / "take.toml").read_text()
+    (folder / "take.toml").write_text(re.sub(r"^# (?=\[\[keyp|camera =|file =|format =)", "", text, flags=re.M))
+    assert len(read_take(folder / "take.toml").keypoints) == 8
+
+
+@pytest.mark.parametrize(
+    ("size", "bar", "image"),
+    [((136, 240), 0, "scaled"), ((272, 504), 12, "letterboxed"), ((272, 540), 0, "scaled")],
+)
+@pytest.mark.parametrize("frame", ["video", "calibration"])
+def test_pictures_of_another_size(folder, motion, rig, size, bar, image, frame):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], size=size, bar=bar)
+    made = ImageFrame.scaled(SIZE, size) if image == "scaled" else ImageFrame.letterboxed(SIZE, size)
+    write_mediapipe(folder, motion, rig, [f"{n}.npy" for n in rig.names], images=[made] * 4 if frame == "video" else ())
+    take, seen, guess = taken(folder)
+    assert {entry.image for entry in take.cameras} == {image}
+    assert {k.frame for k in take.keypoints} == {frame}
+    truth = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.0, outliers=0.0, missing=0.0)
+    for got, true in zip(seen.keypoints, truth):
+        shown = np.isfinite(got.points).all(-1) & np.isfinite(true.points).all(-1)
+        assert np.abs(got.points - true.points)[shown].max() < 1e-3
+    assert "guess keypoints, mediapipe: frame" not in notes(guess)
+
+
+@pytest.mark.parametrize("degrees", [90, 270])
+def test_turned_pictures_show_people_upright(folder, motion, rig, degrees):
+    """Calibrated lying, filmed upright: the turn that puts the vertical up is taken."""
+    def lying(camera):
+        back = ImageFrame.rotated(camera.size, -degrees % 360).T_image_calibration
+        turn = np.eye(4)
+        turn[:2, :2] = back[:2, :2]
+        K = np.diag([camera.matrix[1, 1], camera.matrix[0, 0], 1.0])
+        K[:2, 2] = back[:2, :2] @ camera.matrix[:2, 2] + back[:2, 2]
+        return Camera(camera.name, camera.size[::-1], K, (), T_camera_world=turn @ camera.T_camera_world)
+
+    own = Rig(tuple(map(lying, rig)))
+    write_calibration(own, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    write_mediapipe(
+        folder, motion, own, [f"{n}.npy" for n in rig.names], images=[ImageFrame.rotated(c.size, degrees) for c in own]
+    )
+    take, _, _ = taken(folder)
+    assert take.up == "z"
+    assert {entry.rotation for entry in take.cameras} == {degrees}
+    assert {k.frame for k in take.keypoints} == {"video"}
+
+
+def test_the_calibration_may_lie_above_and_the_refined_is_preferred(folder, rig):
+    write_calibration(rig, folder / "Calib.toml")
+    (folder / "trial").mkdir()
+    write_videos(folder / "trial", [f"{name}.mp4" for name in rig.names], frames=2)
+    assert taken(folder / "trial")[0].calibration.file == folder / "trial" / ".." / "Calib.toml"
+    write_calibration(rig, folder / "trial" / "calib_refined.toml")
+    write_calibration(rig, folder / "trial" / "calib.toml")
+    guess = guess_take(folder / "trial")
+    assert "calib_refined.toml: 4 cameras" in notes(guess) and "its name says that it was refined" in notes(guess)
+    assert '# file = "calib.toml"' in guess.text
+    write_calibration(renamed(rig, ["p", "q", "r", "s"]), folder / "trial" / "other_refined.toml")
+    assert "calib_refined.toml: 4 cameras" in notes(guess_take(folder / "trial"))  # the other fits no video
+
+
+def test_calibrations_of_one_file_a_camera_are_found_as_a_folder(folder, rig):
+    (folder / "calib").mkdir()
+    for camera in rig:
+        K, D, T = camera.matrix.tolist(), camera.distortion.tolist(), camera.T_camera_world[:3].tolist()
+        text = json.dumps({"name": camera.name, "K": K, "dist": D, "extrinsic": T, "image_size": list(camera.size)})
+        (folder / "calib" / f"{camera.name}.json").write_text(text)
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=2)
+    take, seen, _ = taken(folder)
+    assert take.calibration.file == folder / "calib" and len(seen.rig) == 4
+
+
+def test_normalised_coordinates_and_odd_arrays_are_told(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names], normalised=True)
+    np.save(folder / "smpl.npy", np.zeros((30, 24, 3)))
+    take, _, guess = taken(folder)
+    assert take.keypoints == ()
+    assert "coordinates run from 0 to 1" in notes(guess) and "smpl.npy: an array of shape (30, 24, 3)" in notes(guess)
+
+
+def test_keypoints_of_which_none_can_be_used(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names], normalised=True)
+    with pytest.raises(TakeError, match="cannot be used|can be used with the cameras.*run from 0 to 1"):
+        guess_take(folder)
+    for record in simulate_keypoints(motion, rig, "COCO_17"):
+        write_openpose(folder / record.camera, record)
+    for file in folder.rglob("*.json"):  # a set that nobody knows
+        text = json.loads(file.read_text())
+        text["people"][0]["pose_keypoints_2d"] += [0.0] * 3
+        file.write_text(json.dumps(text))
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    take = read_guess(folder)
+    assert {k.format for k in take.keypoints} == {"mediapipe"}
+    assert "18 points; there are sets of 17, 25, 26, 33" in notes(guess_take(folder))
+
+
+def test_keypoints_of_another_recording_are_left_out(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=60)
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    take, _, guess = taken(folder)
+    assert take.keypoints == () and "30 frames, the videos have 60: of another recording" in notes(guess)
+
+
+def test_keypoints_go_with_the_recording_that_shares_their_words(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    for trial, bitrate in (("walk", 0), ("run", 4)):
+        write_videos(folder, [f"{trial}/videos/{name}.mp4" for name in rig.names], bar=bitrate)
+        (folder / trial / "pose").mkdir()
+        write_mediapipe(folder / trial / "pose", motion, rig, [f"{name}.npy" for name in rig.names])
+    take, _, _ = taken(folder)
+    trial = take.cameras[0].video.parts[-3]
+    assert {entry.video.parts[-3] for entry in take.cameras} == {trial}
+    assert {entry.file.parts[-3] for entry in take.keypoints} == {trial}
+
+
+def test_a_camera_with_keypoints_and_no_video_is_kept(folder, motion, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, ["cam01.mp4", "cam02.mp4"])
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    take, seen, _ = taken(folder)
+    assert [entry.video is not None for entry in take.cameras] == [True, True, False, False]
+    assert len(seen.keypoints) == 4
+
+
+def test_videos_that_a_detector_drew_on_are_not_taken(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"videos/{name}.mp4" for name in rig.names], frames=2)
+    write_videos(folder, [f"pose/{name}_pose.mp4" for name in rig.names], frames=9)
+    write_videos(folder, [f"videos/more/{name}.mp4" for name in rig.names], frames=9)
+    take, _, guess = taken(folder)
+    assert {entry.video.parent for entry in take.cameras} == {folder / "videos"}
+    assert "pose/*_pose: another recording, or what a detector drew" in notes(guess, "video")
+
+
+def test_what_kinefit_left_is_no_recording(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=2)
+    write_videos(folder, [f"take-kinefit/overlays/{name}.mp4" for name in rig.names], frames=9)
+    take, _, guess = taken(folder)
+    assert {entry.video.parent for entry in take.cameras} == {folder}
+    assert "kinefit/" not in notes(guess)
+
+
+def test_an_empty_folder_and_none(folder):
+    (folder / "readme.txt").write_text("nothing")
+    with pytest.raises(TakeError, match="nothing here that a take is made of, among 1 files"):
+        guess_take(folder)
+    with pytest.raises(TakeError, match="no such folder"):
+        guess_take(folder / "none")
+
+
+def test_videos_without_calibration_are_told_of_the_two_ways(folder, rig):
+    write_videos(folder, ["cam01.mp4", "cam02.mp4"], frames=2)
+    with pytest.raises(CalibrationError, match=r"kinefit calibrate board.*kinefit calibrate people"):
+        guess_take(folder)
+    write_calibration(Rig((rig["cam01"],)), folder / "cam01.toml")
+    with pytest.raises(CalibrationError, match=r"cam01.toml is of one camera alone"):
+        guess_take(folder)
+    (folder / "docker-compose.yml").write_text("a: [1,")  # of something else
+    with pytest.raises(CalibrationError, match="is of one camera alone"):
+        guess_take(folder)
+    (folder / "cam01.toml").write_text('[cam01]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[cam02]\nmatrix = "x"\n')
+    with pytest.raises(CalibrationError, match=r"cam01.toml.*no calibration can be used"):
+        guess_take(folder)
+
+
+def test_names_that_fit_nothing(folder, rig):
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, ["kitchen.mp4", "garden.mp4"], frames=2)
+    with pytest.raises(TakeError, match="bear the name of its camera: cam01, cam02, cam03, cam04"):
+        guess_take(folder)
+
+
+def test_markers_alone(folder):
+    text = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\n100\t100\t2\t2\tmm\n"
+    text += "Frame#\tTime\tA\t\t\tB\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n"
+    text += "1\t0.00\t1\t2\t3\t4\t1500\t6\n2\t0.01\t1\t2\t3\t4\t1500\t6\n"
+    (folder / "walk.trc").write_text(text)
+    (folder / "static.trc").write_text(text)
+    (folder / "bad.c3d").write_bytes(b"\x02\x50")
+    take, _, guess = taken(folder)
+    assert [entry.file.name for entry in take.markers] == ["walk.trc"] and (take.up, take.rate) == ("y", 100.0)
+    assert "bad.c3d left out" in notes(guess) and '# file = "static.trc"' in guess.text
+    (folder / "walk.trc").unlink()
+    (folder / "static.trc").unlink()
+    with pytest.raises(TakeError, match="no marker file can be read"):
+        guess_take(folder)
+
+
+def test_files_of_a_trial_stand_in_the_order_of_the_calibration(tmp_path):
+    paths = [tmp_path / name for name in ("b_c2.mp4", "b_c10.mp4", "b_c1.mp4")]
+    for path in paths:
+        path.touch()
+    (trial,), left = trials(paths, tmp_path, ["c10", "c1", "c2"])
+    assert list(trial.files) == ["c10", "c1", "c2"] and trial.place == "b_*" and not left
+
+
+def test_the_balancing_trial(data_dir, tmp_path):
+    folder = data_dir("video_balancing_4cam")
+    guess = guess_take(folder, beside=tmp_path)
+    (tmp_path / "take.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(tmp_path / "take.toml")
+    assert take.calibration.file.name == "Calib_refined_static.toml" and take.up == "z" and take.rate == 60.0
+    assert {c.name: c.image for c in take.cameras} == {
+        "cam01": "letterboxed", "cam02": "letterboxed", "cam03": "as calibrated", "cam04": "as calibrated",
+    }  # fmt: skip
+    videos = {(folder / "videos" / f"cam0{k}.mp4").resolve() for k in (1, 2, 3, 4)}
+    assert {c.video.resolve() for c in take.cameras} == videos
+    assert [(k.camera, k.set) for k in take.keypoints] == [(f"cam0{k}", "BODY_25B") for k in (1, 2, 3, 4)]
+    assert "static_trial/videos/*: a static trial" in notes(guess)
+    assert {k.frame for k in take.keypoints if k.camera in ("cam01", "cam02")} == {"calibration"}  # SOURCE.txt, trap 1
+    assert "as in the static trial" in notes(guess, "keypoints, openpose")
+    seen = load_observations(take)
+    assert seen.frames == (0, 100) and len(seen.keypoints) == 4
+
+
+def test_its_static_trial_tells_the_frame_of_the_keypoints(data_dir, tmp_path):
+    guess = guess_take(data_dir("video_balancing_4cam") / "static_trial", beside=tmp_path)
+    (tmp_path / "take.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(tmp_path / "take.toml")
+    assert {k.frame for k in take.keypoints if k.camera in ("cam03", "cam04")} == {"calibration"}  # SOURCE.txt, trap 1
+    assert take.frames == (0, 11) and len(load_observations(take).keypoints) == 4
+
+
+def test_recordings_of_caliscope(data_dir, tmp_path):
+    guess = guess_take(data_dir("mv4_upperbody_caliscope"), beside=tmp_path)
+    (tmp_path / "a.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(tmp_path / "a.toml")
+    assert [c.video.name for c in take.cameras] == [f"port_{k}.mp4" for k in range(4)]
+    assert (take.rate, take.up, load_observations(take).frames) == (6.0, "z", (0, 111))
+    guess = guess_take(data_dir("mv4_landmarks_caliscope"), beside=tmp_path)
+    (tmp_path / "b.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(tmp_path / "b.toml")
+    assert {k.format for k in take.keypoints} == {"caliscope"} and take.up == "x"
+    assert all(c.video is None for c in take.cameras)  # its videos are of the calibration
+    seen = load_observations(take)
+    assert seen.frames == (0, 267) and [k.camera for k in seen.keypoints] == [f"cam_{k}" for k in range(4)]

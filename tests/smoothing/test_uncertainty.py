@@ -1,0 +1,112 @@
+"""Lasting errors go through to the pose as the closed form says: against fits with such errors."""
+
+import numpy as np
+import pytest
+
+from kinefit.bodies import PointSet, load_body
+from kinefit.correspondences import pixel_rows, prior_rows
+from kinefit.multiview.detector_noise import DetectorNoise
+from kinefit.sensors.channels import make_channels
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.smoothing.uncertainty import lasting
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.subject.keypoints import fit_subject
+
+MOTION = squat_and_wave(rate=20.0, duration=3.0)
+RIG = studio_rig(MOTION)
+SIGMA = 3.0
+
+
+@pytest.fixture(scope="module")
+def scene():
+    seen = simulate_keypoints(MOTION, RIG, noise_px=1.0, outliers=0.0, missing=0.0)
+    body = load_body("humanoid")
+    channels = make_channels(body, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [SIGMA] * 4)
+    subject = fit_subject(body, channels)
+    channels = channels.with_points(subject.body)
+    weight = channels.weight[20]
+    return subject, channels, weight, fit(subject.body, channels, channels.uv[20], weight, MOTION.state(20))
+
+
+def fit(body, channels, uv, weight, start):
+    points = channels.with_points(body).points
+    each = PointSet(channels.column.astype(str), points.segments[channels.column], points.points[channels.column])
+    uv = np.where(weight[:, None] > 0, uv, np.nan)
+    sigma = 1.0 / np.sqrt(np.where(weight > 0, weight, 1.0))
+
+    def rows(state):
+        return [pixel_rows(body, state, each, RIG, channels.camera, uv, sigma=sigma), prior_rows(body, state)]
+
+    return levenberg_marquardt(body, start, rows, tolerance=1e-12, max_iterations=60).state
+
+
+def covariance(scene, noise, Sigma=None):
+    subject, channels, weight, state = scene
+    p = len(subject.shape.theta)
+    Sigma = np.zeros((p, p)) if Sigma is None else Sigma
+    return lasting(subject.shape.parameters, subject.shape.theta, Sigma, channels, state, weight, noise)
+
+
+def noise_of(channels, drift=0.0, shift=None):
+    count = len(channels.column)
+    shift = np.zeros((4, 2)) if shift is None else shift
+    return DetectorNoise(np.zeros(count), np.full(count, drift), 0.3, shift)
+
+
+def test_drift_moves_the_pose_as_refitting_does(scene):
+    subject, channels, weight, state = scene
+    random = np.random.default_rng(0)
+    exact = channels.uv[20]
+    moved = np.array([
+        state.difference(fit(subject.body, channels, exact + 2.0 * random.standard_normal(exact.shape), weight, state))
+        for _ in range(60)
+    ])
+    told = np.sqrt(np.diag(covariance(scene, noise_of(channels, drift=2.0)).dofs))
+    sure = told[6:] < 0.15  # what is nearly free is not linear
+    ratio = np.std(moved, axis=0)[6:][sure] / told[6:][sure]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.12)
+    assert np.all((ratio > 0.6) & (ratio < 1.5))
+
+
+def test_a_shifted_camera_moves_the_pose_as_refitting_does(scene):
+    subject, channels, weight, state = scene
+    shift = np.zeros((4, 2))
+    shift[1] = (2.0, 0.0)
+    pushed = channels.uv[20] + shift[channels.source]
+    moved = state.difference(fit(subject.body, channels, pushed, weight, state))
+    told = np.sqrt(np.diag(covariance(scene, noise_of(channels, shift=shift)).dofs))
+    sure = (told < 0.1) & (told > 1e-4)
+    np.testing.assert_allclose(np.abs(moved)[sure], told[sure], rtol=0.25, atol=2e-3)
+
+
+def test_another_shape_moves_joints_as_refitting_does(scene):
+    subject, channels, weight, state = scene
+    body, groups = load_body("humanoid"), load_body("humanoid").scale_groups
+    g, by = groups.index("thigh"), 0.01
+    longer = np.array(subject.scales)
+    longer[g] += by
+    name = next(iter(channels.sets))
+    other = body.scaled(longer)
+    points = other.keypoints(name)
+    span = np.array(points.points)
+    span[[points.index(n) for n in channels.points.names]] += subject.shape.shifts
+    other = other.with_keypoints(name, span)
+    refitted = fit(other, channels, channels.uv[20], weight, state)
+    before, after = (
+        b.tree.segment_poses(s.T_world_root[None], s.angles[None])[0, :, :3, 3]
+        for b, s in ((subject.body, state), (other, refitted))
+    )
+    Sigma = np.zeros((len(subject.shape.theta),) * 2)
+    Sigma[g, g] = by**2
+    told = np.sqrt(covariance(scene, noise_of(channels), Sigma).joints)
+    np.testing.assert_allclose(told, np.abs(after - before), atol=1.2e-3)
+    assert told.max() > 2e-3
+
+
+def test_nothing_seen_leaves_finite_bars(scene):
+    subject, channels, weight, state = scene
+    out = lasting(
+        subject.shape.parameters, subject.shape.theta, subject.covariance, channels, state, np.zeros_like(weight),
+        noise_of(channels, drift=3.0),
+    )  # fmt: skip
+    assert np.all(np.isfinite(out.dofs)) and np.all(np.isfinite(out.joints)) and out.joints.min() >= 0
