@@ -23,9 +23,9 @@ from kinefit.correspondences.rims import RimFinder
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import outline
+from kinefit.losses import geman_mcclure
 from kinefit.rendering import Canvas
 from kinefit.solvers.least_squares import gauss_newton
-from kinefit.solvers.losses import geman_mcclure
 
 FRAMES, SIZE, FOCAL = 200, (640, 480), 560.0
 JOINTS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "elbow_flex"))

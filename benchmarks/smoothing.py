@@ -25,8 +25,8 @@ from benchmarks.tracking import NOISE, TRIAL, median_residual, read_trial
 from kinefit import Motion, load_body, read_markers, track
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors, joint_errors
+from kinefit.losses import geman_mcclure
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.solvers.losses import geman_mcclure
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, smooth
 

@@ -23,8 +23,8 @@ from kinefit import Motion, levenberg_marquardt, load_body
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows
 from kinefit.initialization.from_points import aligned_root
+from kinefit.losses import geman_mcclure
 from kinefit.rows import Rows
-from kinefit.solvers.losses import geman_mcclure
 from kinefit.solvers.sequence import Planes, Sequence, fit_sequence
 
 FRAMES, NOISE, PLANES, PLANE_FRAMES = 500, 0.002, 5000, 100

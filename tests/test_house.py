@@ -13,9 +13,9 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
 LEVELS = [
     {"errors", "_jit"},
-    {"geometry", "_kernels_rendering"},
+    {"geometry", "_kernels_rendering", "_kernels_losses"},
     {"bodies", "observations", "motion"},
-    {"readers", "images", "rendering", "rows"},
+    {"readers", "images", "rendering", "rows", "losses"},
     {"correspondences"},
     {"solvers"},
     {"identification", "sensors"},
@@ -31,7 +31,8 @@ LEVELS = [
     {"cli", "__main__"},
 ]
 BESIDE = {
-    ("motion", "bodies"), ("__main__", "cli"), ("initialization", "subject"), ("subject", "initialization"),
+    ("motion", "bodies"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
+    ("subject", "initialization"),
     ("smoothing", "tracking"), ("initialization", "tracking"), ("smoothing", "subject"),
 }
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.losses import Loss
 
 
 def _check(what: str, *arrays: NDArray) -> None:
@@ -48,11 +49,14 @@ class Rows:
     segment : (N,) int, the segment that each point belongs to.
     group : (N,) int
         Measurement id: adjacent rows with one id share one robust weight; -1 for a row that is never an outlier.
+    loss : Loss, optional
+        Of these rows; without it the solver's.
     """
 
     data: NDArray
     segment: NDArray
     group: NDArray
+    loss: Loss | None = None
 
     @classmethod
     def of(
@@ -63,6 +67,7 @@ class Rows:
         residual: NDArray,
         weight: NDArray,
         group: NDArray | None = None,
+        loss: Loss | None = None,
     ) -> Rows:
         """Rows from segment (N,), point (N, 3) [m], direction (N, 3), residual (N,) [m], weight (N,) [1/m²]."""
         n = len(segment)
@@ -71,11 +76,11 @@ class Rows:
         data[6], data[7] = residual, weight
         _check("rows", data)
         ids = np.arange(n) if group is None else np.asarray(group)
-        return cls(data, np.ascontiguousarray(segment, np.int64), np.ascontiguousarray(ids, np.int64))
+        return cls(data, np.ascontiguousarray(segment, np.int64), np.ascontiguousarray(ids, np.int64), loss)
 
     @classmethod
     def concat(cls, *parts: Rows) -> Rows:
-        """All rows of several makers; measurement ids are renumbered so that none clash."""
+        """All rows of several makers, without their losses; measurement ids are renumbered so that none clash."""
         groups, first = [], 0
         for part in parts:
             groups.append(np.where(part.group < 0, -1, part.group + first))
@@ -185,12 +190,15 @@ class DofRows:
     weight : (N,) [1/m²]
     group : (N,) int
         As of `Rows`.
+    loss : Loss, optional
+        As of `Rows`.
     """
 
     jacobian: NDArray
     residual: NDArray
     weight: NDArray
     group: NDArray
+    loss: Loss | None = None
 
     def __post_init__(self) -> None:
         number, size = (float, (None,)), np.shape(self.jacobian)[1:]

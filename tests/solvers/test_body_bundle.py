@@ -5,9 +5,9 @@ import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.losses import geman_mcclure
 from kinefit.solvers.body_bundle import fit_body_and_cameras
 from kinefit.solvers.cameras import COLUMNS, TIME, CameraPrior, PointPixels, departure, moved_rig
-from kinefit.solvers.losses import geman_mcclure
 from kinefit.solvers.shape import PixelFrames, shape_parameters
 
 BODY = load_body("humanoid")

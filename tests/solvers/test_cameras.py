@@ -6,6 +6,7 @@ from tests.oracle import rig_around
 
 from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.solvers.cameras import (
     COLUMNS,
     FOCAL,
@@ -19,7 +20,6 @@ from kinefit.solvers.cameras import (
     reduce_points,
     residuals,
 )
-from kinefit.solvers.losses import SQUARED, geman_mcclure
 
 LENSES = {
     "plain": ("radtan", ()),

@@ -20,11 +20,11 @@ from kinefit.bodies import KinematicTree, load_body
 from kinefit.correspondences import coincidence_rows, point_rows, prior_rows
 from kinefit.errors import KinefitError
 from kinefit.geometry import se3
+from kinefit.losses import SQUARED, geman_mcclure, huber, tukey
 from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.losses import SQUARED, geman_mcclure, huber, tukey
 
 LOSSES = {"squared": SQUARED, "huber": huber(), "tukey": tukey(), "geman-mcclure": geman_mcclure()}
 

@@ -21,9 +21,9 @@ from kinefit.correspondences import (
 )
 from kinefit.geometry import lines, se3
 from kinefit.geometry.camera import Rig
+from kinefit.losses import geman_mcclure, huber, tukey
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
-from kinefit.solvers.losses import geman_mcclure, huber, tukey
 
 HUMANOID = load_body("humanoid")
 POINTS = HUMANOID.landmarks

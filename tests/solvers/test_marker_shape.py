@@ -6,7 +6,7 @@ import pytest
 from kinefit.bodies import BodyState, load_body
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
-from kinefit.solvers.losses import SQUARED
+from kinefit.losses import SQUARED
 from kinefit.solvers.marker_shape import fit_marker_shape, marker_equations, marker_parameters
 
 BODY = load_body("humanoid")

@@ -7,8 +7,8 @@ from tests.oracle import posture, random_unit
 from kinefit.bodies import BodyState, load_body
 from kinefit.correspondences import plane_rows, point_rows
 from kinefit.errors import ObservationError
+from kinefit.losses import SQUARED, huber
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.losses import SQUARED, huber
 from kinefit.solvers.sequence import Planes, fit_sequence
 
 BODY = load_body("humanoid")

@@ -9,9 +9,9 @@ from kinefit import BodyState, load_body
 from kinefit.bodies import PointSet
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
+from kinefit.losses import geman_mcclure
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers import _kernels_band
-from kinefit.solvers.losses import geman_mcclure
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Smoothed, _system, _workspace, blocks, posterior, smooth
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows, prior_rows, surface_rows
 from kinefit.initialization.depth_score import Score, limbs, spreads
+from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.depth_view import DepthView, geodesic_ends
 from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_marquardt
-from kinefit.solvers.losses import geman_mcclure
 
 POINTS = 700  # measured points that take part in a fit: more do not tell postures apart
 FACING = 0.02  # of the score: a person rather faces the sensor (twice that for one turned away) ...

@@ -9,10 +9,10 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.channels import Channels, exchange
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.losses import geman_mcclure
 
 
 def triangulated(channels: Channels, frames: NDArray, *, max_residual_px: float = 30.0) -> NDArray:

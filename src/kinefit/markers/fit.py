@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import TrackingError
+from kinefit.losses import Loss
 from kinefit.markers.placement import find_placement
 from kinefit.markers.poses import LOSS, POSTURE, bare, columns, sequence_both_ways
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.losses import Loss
 from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
 
 _TOLD = 0.35  # [rad] an angle less sure than that is not told by its frame, but by those before and after

@@ -12,8 +12,8 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry import se3
 from kinefit.initialization.from_points import aligned_root
+from kinefit.losses import SQUARED, Loss, geman_mcclure
 from kinefit.observations import Markers
-from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure
 from kinefit.solvers.sequence import fit_sequence
 
 LOSS = geman_mcclure(5.0)

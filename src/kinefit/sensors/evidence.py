@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 # 0.2 to 0.3 and 0.5 to 0.7 give 97 to 100 % at 0.01 to 0.1 %.
 SHOWN = 0.25  # of a segment's outline that must be seen: with less nothing holds it but prediction and prior
 BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
+AGREES = 3.0  # standard deviations within which a measurement speaks for its segment
 
 
 @dataclass(frozen=True, eq=False)

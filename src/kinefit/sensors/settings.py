@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from kinefit.solvers.losses import Loss, geman_mcclure
+from kinefit.losses import Loss, geman_mcclure
 
 
 @dataclass(frozen=True)

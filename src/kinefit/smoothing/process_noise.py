@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.losses import Loss
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.unwrap import boxes
-from kinefit.solvers.losses import Loss
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
 

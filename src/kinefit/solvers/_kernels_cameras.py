@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from kinefit._jit import jit
+from kinefit._kernels_losses import robust
 from kinefit.geometry._kernels_camera import CX, CY, DIST, FX, FY, MODEL, ROT, SKEW, TRANS, project_jacobian
-from kinefit.solvers._kernels import robust
 
 COLUMNS = 10
 """Parameters of a camera: v, ω in its own frame [m, rad], log of the focal length, k1, k2, time offset [s]."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit._kernels_losses import robust
 from kinefit.correspondences._kernels import place
-from kinefit.solvers._kernels import robust
 from kinefit.solvers._kernels_shape import scale_motion
 
 

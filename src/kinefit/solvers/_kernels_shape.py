@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit._kernels_losses import robust
 from kinefit.correspondences._kernels import place
 from kinefit.geometry._kernels_camera import project_jacobian
-from kinefit.solvers._kernels import robust
 from kinefit.solvers._kernels_cameras import COLUMNS, camera_columns
 
 

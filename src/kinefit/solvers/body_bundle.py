@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.geometry.camera import Rig
+from kinefit.losses import Loss, geman_mcclure
 from kinefit.solvers import _kernels_linear, _kernels_shape
 from kinefit.solvers.cameras import (
     COLUMNS,
@@ -22,7 +23,6 @@ from kinefit.solvers.cameras import (
     residuals,
     robust_cost,
 )
-from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.solvers.shape import _POSTURE, PixelFrames, ShapeParameters
 
 

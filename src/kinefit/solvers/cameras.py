@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.losses import Loss
 from kinefit.solvers import _kernels_cameras
 from kinefit.solvers._kernels_cameras import COLUMNS
-from kinefit.solvers.losses import Loss
 
 _UNSEEN = 1e6  # squared standard deviations of a point that its camera cannot see
 POSE, FOCAL, RADIAL, TIME = slice(0, 6), 6, slice(7, 9), 9

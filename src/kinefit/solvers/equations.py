@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
+from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, DofRows, Rows, sort_out
 from kinefit.solvers import _kernels, _kernels_linear
-from kinefit.solvers.losses import SQUARED, Loss
 
 _ROUNDING = 1e-14  # share of the most informed degree of freedom's information that is none
 _LOOSE = 1e-5  # share of a free direction from which a degree of freedom takes part in it
@@ -60,7 +60,8 @@ class Equations:
 def normal_equations(
     body: Body, state: BodyState, parts: AnyRows | Iterable[AnyRows], *, loss: Loss = SQUARED
 ) -> Equations:
-    """Gather rows of any kinds at a state into H and g; the loss applies to every row with a measurement id."""
+    """Gather rows of any kinds at a state into H and g; `loss` is that of rows without their own."""
+    parts = [parts] if isinstance(parts, AnyRows) else list(parts)
     rows, pairs, parameters, dense = sort_out(parts)
     tree = body.tree
     n = tree.n_dofs
@@ -71,10 +72,22 @@ def normal_equations(
     chain, depth = tree.chain, tree.depth
     factor, blocks = np.empty(len(rows)), np.empty((len(tree.segments), 27))
     C, g = np.empty(chain.shape), np.empty(n)
-    cost = _kernels.assemble(
-        rows.data, rows.segment, rows.group, len(rows), loss.kind, loss.scale, centre,
+    given = [p for p in parts if isinstance(p, Rows)]
+    one = given[0].loss or loss if len(given) == 1 else loss
+    mixed = np.ndim(one.scale) > 0 or any((p.loss or loss) is not one for p in given)
+    data, kind, scale, cost = rows.data, one.kind, one.scale, 0.0
+    if mixed:  # each part by its own loss: in the weights already, with what that leaves of the cost
+        weighed = [(p.loss or loss).of_rows(p.data, p.group) for p in given]
+        robust = np.concatenate([f for f, _ in weighed])
+        data, kind, scale = np.array(rows.data), SQUARED.kind, 1.0
+        data[7] *= robust
+        cost = sum(c for _, c in weighed) - float(data[7] @ np.square(data[6]))
+    cost += _kernels.assemble(
+        data, rows.segment, rows.group, len(rows), kind, scale, centre,
         tree.parents, tree.dof_start, chain, depth, screws, factor, blocks, C, g,
     )  # fmt: skip
+    if mixed:
+        factor = robust
     joint = [p for p in parameters if p.weight.ndim == 2]
     for p in parameters:
         if p.weight.ndim == 1:
@@ -103,9 +116,9 @@ def _add_dense(rows: DofRows, body: Body, loss: Loss, H: NDArray, g: NDArray) ->
     if rows.jacobian.shape[1] != len(g):
         problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {len(g)}"
         raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
-    data, factor = np.zeros((8, len(rows))), np.empty(len(rows))
+    data = np.zeros((8, len(rows)))
     data[6], data[7] = rows.residual, rows.weight
-    cost = _kernels.weigh(data, rows.group, len(rows), loss.kind, loss.scale, factor)
+    factor, cost = (rows.loss or loss).of_rows(data, rows.group)
     weighted = rows.jacobian * (rows.weight * factor)[:, None]
     H += rows.jacobian.T @ weighted
     g += rows.residual @ weighted

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Equations, lock, normal_equations
-from kinefit.solvers.losses import SQUARED, Loss
 
 _TRIES = 30  # of more damping, for a matrix that is not positive
 

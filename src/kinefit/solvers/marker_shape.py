@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
+from kinefit.losses import Loss, geman_mcclure
 from kinefit.solvers import _kernels_linear, _kernels_marker_shape
-from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.solvers.shape import PROPORTIONS, ShapeParameters
 
 _UNKNOWN_SIZE, _KNOWN_SIZE = 0.2, 0.02  # one standard deviation of a person's size, as a share, as in `solvers.shape`

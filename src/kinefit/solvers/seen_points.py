@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.geometry.camera import Rig
+from kinefit.losses import SQUARED, Loss
 from kinefit.solvers import _kernels_smoothing
-from kinefit.solvers.losses import SQUARED, Loss
 from kinefit.solvers.smoothing import Equations, MakeEquations
 
 NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))

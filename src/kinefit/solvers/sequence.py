@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
+from kinefit.losses import SQUARED, Loss
 from kinefit.solvers._kernels_sequence import certainties as _certainties
 from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
 from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import bounds_of
-from kinefit.solvers.losses import SQUARED, Loss
 
 _NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 

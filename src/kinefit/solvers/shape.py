@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
+from kinefit.losses import SQUARED, Loss, geman_mcclure
 from kinefit.solvers import _kernels, _kernels_linear, _kernels_shape
-from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure
 
 _MIDDLE = 0.002  # [m] spread of a point in the middle to either side
 PROPORTIONS = 0.05

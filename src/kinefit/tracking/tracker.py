@@ -12,12 +12,12 @@ from kinefit.bodies.charts import off_the_limits
 from kinefit.correspondences import _kernels, prior_rows, targets
 from kinefit.errors import TrackingError
 from kinefit.initialization.from_points import pose_from_points, triangulated_frame
+from kinefit.losses import Loss, geman_mcclure
 from kinefit.multiview.left_right import find_swaps, limb_groups
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.sensors.channels import Channels, fitted_pixels
 from kinefit.solvers.equations import Covariance, covariance, inverse, joint_std, normal_equations
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
-from kinefit.solvers.losses import Loss, geman_mcclure
 from kinefit.tracking.prediction import Prediction, belief
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already

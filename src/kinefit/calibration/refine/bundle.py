@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
+from kinefit.losses import Loss, geman_mcclure
 from kinefit.solvers.cameras import (
     COLUMNS,
     TIME,
@@ -18,7 +19,6 @@ from kinefit.solvers.cameras import (
     residuals,
     robust_cost,
 )
-from kinefit.solvers.losses import Loss, geman_mcclure
 
 
 @dataclass(frozen=True, eq=False)

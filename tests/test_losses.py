@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kinefit.solvers import _kernels
-from kinefit.solvers.losses import SQUARED, Loss, geman_mcclure, huber, tukey
+from kinefit import _kernels_losses as kernels
+from kinefit.losses import SQUARED, Loss, geman_mcclure, huber, tukey
 
 S = np.array([0.0, 0.3, 1.0, 1.9, 2.1, 4.0, 30.0])  # none on a seam
 
@@ -18,7 +18,7 @@ losses = pytest.mark.parametrize(("loss", "rho"), FORMULAS.values(), ids=FORMULA
 
 
 def kernel(loss, s2):
-    return np.array([_kernels.robust(loss.kind, loss.scale, v) for v in np.asarray(s2, float)]).T
+    return np.array([kernels.robust(loss.kind, loss.scale, v) for v in np.asarray(s2, float)]).T
 
 
 @losses
@@ -50,4 +50,4 @@ def test_scales():
     assert (huber().scale, tukey().scale, geman_mcclure().scale) == (1.345, 4.685, 3.0)
     for bad in (0.0, -1.0, np.nan):
         with pytest.raises(Exception, match="scale of a loss must be positive"):
-            Loss(_kernels.HUBER, bad)
+            Loss(kernels.HUBER, bad)

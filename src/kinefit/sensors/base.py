@@ -1,0 +1,169 @@
+"""What every kind of sensor is to the tracker, the smoother and the subject fit: three short classes.
+
+A `Sensor` lives for a whole take. At one time it makes a `Measurement` of what it saw; the measurement is matched to
+the body (correspondences, visibility, sides: discrete, then frozen), and what is `Matched` gives rows at any state:
+
+    sensor.prepare(frame, scene) -> measurement.match(scene, reach) -> matched.rows(scene)
+
+`rows` is a pure function of the scene. That is what lets a solver compare costs of trial states, and a subject fit
+differentiate by anything of the body: it asks for the rows of the same match again, with a body that is a little
+different. So whatever a match refers to must have a meaning on any body of the same make: a landmark's name, a
+surface's own coordinates.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.rows import AnyRows, DofRows, PairRows, Rows
+from kinefit.sensors.depth_view import DepthView
+from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.scene import Scene
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Something of a sensor that is not known beforehand, such as a rope's length.
+
+    Parameters
+    ----------
+    mean, std : float, what is thought of it before anything is measured: in metres, radians, seconds, pixels.
+    """
+
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What a measurement tells of the body where nothing is known of its pose.
+
+    Parameters
+    ----------
+    points, x_world : PointSet of K points of the body, and where they are (K, 3) [m].
+    view : what a limb, or a person, can be sought in.
+    """
+
+    points: PointSet | None = None
+    x_world: NDArray | None = None
+    view: DepthView | None = None
+
+
+class Matched(ABC):
+    """A measurement with its correspondences."""
+
+    @abstractmethod
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """Rows at a scene's state: a pure function of the scene, not softened, each kind with its loss."""
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """What it says of each segment; by default every group of rows speaks for its segments, or against them."""
+        out = np.zeros((2, len(scene.body.tree.segments)))
+        for rows in self.rows(scene):
+            for segments, square in _groups(rows):
+                out[int(square >= AGREES**2), list(segments)] += SHOWN
+        return Evidence(*out)
+
+
+class Measurement(ABC):
+    """What one sensor saw at one time.
+
+    Attributes
+    ----------
+    sensor : name of the sensor
+    time : float [s]
+    settled : whether a match depends on the state only in what is discrete (labels, sides), so that the fit may go to
+        its minimum under one match. False for nearest points, which are sought anew at every step.
+    """
+
+    sensor: str
+    time: float
+    settled: bool = True
+
+    @abstractmethod
+    def match(self, scene: Scene, reach: float) -> Matched:
+        """Correspondences at a scene's state, within a distance [m]."""
+
+    def hints(self, scene: Scene) -> Hints:
+        """What it tells where no pose is known."""
+        return Hints()
+
+    def compact(self) -> Measurement:
+        """What a smoother keeps of it: no whole images."""
+        return self
+
+
+class Sensor(ABC):
+    """A sensor for the whole of a take: its noise, its clock, what it has learnt.
+
+    Attributes
+    ----------
+    name : as frames name it in `sensor`
+    unknowns : {name: Unknown} of its own that a subject fit estimates
+    """
+
+    name: str
+    unknowns: Mapping[str, Unknown] = {}
+
+    @abstractmethod
+    def prepare(self, frame: Any, scene: Scene) -> Measurement:
+        """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
+
+    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+        """Learn from a step that was accepted; `sure` where no segment is lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowsOf(Matched):
+    """A match that is no more than a function from scenes to rows."""
+
+    make: Any
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """As the function makes them."""
+        made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
+        return [made] if isinstance(made, AnyRows) else list(made)
+
+
+def _groups(rows: AnyRows) -> list[tuple[set[int], float]]:
+    """Segments and squared residual, in variances, of each measurement in some rows."""
+    if isinstance(rows, PairRows):
+        square = rows.weight * rows.residual**2
+        return [({int(a), int(b)}, float(s)) for (a, b), s in zip(rows.segments, square)]
+    if not isinstance(rows, Rows) or isinstance(rows, DofRows):
+        return []
+    ids = np.where(rows.group < 0, rows.group.max(initial=-1) + 1 + np.arange(len(rows)), rows.group)
+    square = np.bincount(ids, rows.weight * rows.residual**2)
+    return [({int(s) for s in rows.segment[ids == i]}, float(square[i])) for i in np.unique(ids)]
+
+
+def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
+    """Rows as a sensor of someone's own made them, or an error that names the sensor.
+
+    Raises
+    ------
+    ObservationError
+        No rows, or on segments or degrees of freedom that the body does not have.
+    """
+    from kinefit.errors import ObservationError
+
+    parts = [rows] if isinstance(rows, AnyRows) else rows
+    if not isinstance(parts, Sequence) or not all(isinstance(p, AnyRows) for p in parts):
+        kinds = type(rows).__name__
+        remedy = "`rows` must return Rows, PairRows, ParameterRows or DofRows, or a list of them."
+        raise ObservationError(f"sensor '{sensor}' gave a {kinds}", remedy=remedy)
+    count = len(body.tree.segments)
+    for p in parts:
+        used = p.segment if isinstance(p, Rows) else p.segments if isinstance(p, PairRows) else np.empty(0, np.int64)
+        if used.size and not 0 <= used.min() <= used.max() < count:
+            problem = f"sensor '{sensor}' has rows on segment {int(used.max())}; body '{body.name}' has {count}"
+            raise ObservationError(problem, remedy="Use body.tree.segment(name), or the segments of a point set.")
+    return list(parts)

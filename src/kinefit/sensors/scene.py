@@ -1,0 +1,143 @@
+"""Scene: what a measurement is compared with, a body in a pose, the cameras, and what else was measured then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.morphing import MorphedPose, Morphing
+from kinefit.correspondences import targets
+from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.geometry.camera import Rig
+from kinefit.rows import DofRows, Rows
+from kinefit.sensors.surface import Surface
+
+if TYPE_CHECKING:
+    from kinefit.sensors.base import Measurement
+
+SAMPLES = 600  # points of a body's surface that look for their measurement
+
+
+class Scene:
+    """A body at a state, with the cameras that see it.
+
+    Scenes of one body share what was made for it once (its surface, its morphs), so that another state costs nothing
+    before something is asked of it.
+
+    Parameters
+    ----------
+    body : Body
+    state : BodyState
+    rig : Rig of all cameras
+    time : float [s] of the state
+    velocity : (6 + D,) [m/s, rad/s], optional
+        How the body moves, for measurements of another time than the scene's.
+    values : {sensor: {name: value}}, optional
+        What is thought of a sensor's own unknowns, such as the length of a rope.
+    measurements : what all sensors measured at this time, for those that ask each other
+    surface : Surface of the body, made when it is first needed
+    others : scenes of other bodies at the same time
+    """
+
+    def __init__(
+        self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
+        values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
+        surface: Surface | None = None, others: Sequence[Scene] = (), samples: int = SAMPLES,
+    ) -> None:  # fmt: skip
+        self.body, self.state, self.rig, self.time, self.velocity = body, state, rig, time, velocity
+        self.values, self.measurements, self.others = values or {}, tuple(measurements), tuple(others)
+        self._samples = samples
+        self._shared: dict[str, Any] = {} if surface is None else {"surface": surface}
+        self._frames: NDArray | None = None
+
+    def at(self, state: BodyState, **changes: Any) -> Scene:
+        """The same scene with the body in another state; `changes` are other arguments of a scene."""
+        given: dict[str, Any] = {
+            "time": self.time, "velocity": self.velocity, "values": self.values, "measurements": self.measurements,
+            "others": self.others, "samples": self._samples, **changes,
+        }  # fmt: skip
+        out = Scene(self.body, state, self.rig, **given)
+        out._shared = self._shared
+        return out
+
+    def at_time(self, time: float) -> Scene:
+        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own."""
+        if self.velocity is None or abs(time - self.time) < 1e-9:
+            return self
+        return self.at(self.state.retract((time - self.time) * self.velocity), time=time)
+
+    def value(self, sensor: str, name: str, default: float) -> float:
+        """What is thought of a sensor's own unknown: the default where nothing is."""
+        return self.values.get(sensor, {}).get(name, default)
+
+    @property
+    def surface(self) -> Surface:
+        """The body's surface, with room to draw it.
+
+        Raises
+        ------
+        BodyError
+            A body without surfaces.
+        """
+        if "surface" not in self._shared:
+            self._shared["surface"] = Surface(self.body, self._samples)
+        return self._shared["surface"]
+
+    @property
+    def morphing(self) -> Morphing | None:
+        """Of a body whose joints move with its angles; None where the tree alone tells where segments are."""
+        if "morphing" not in self._shared:
+            moving = None
+            if self.body.morphs:
+                own = self.surface.morphing if self.body.surfaces else Morphing(self.body)
+                moving = own if own.moves_joints else None
+            self._shared["morphing"] = moving
+        return self._shared["morphing"]
+
+    @property
+    def pose(self) -> MorphedPose:
+        """The body's skin in the world, morphed."""
+        return self.surface.pose(self.state)
+
+    @property
+    def frames(self) -> NDArray:
+        """(S, 12) of the segments: rotation times a point at rest, then shift; see `KinematicTree.forward`."""
+        if self._frames is None:
+            if self.morphing is not None:
+                self._frames = self.morphing.pose(self.state).frames
+            else:
+                self._frames = self.body.tree.forward(self.state.T_world_root, self.state.angles)[0]
+        return self._frames
+
+    def positions(self, points: PointSet) -> NDArray:
+        """(K, 3) [m] points of the body in the world."""
+        if self.morphing is not None:
+            return self.morphing.pose(self.state).positions(points)
+        return self.body.positions(self.state, points)
+
+    def position(self, name: str) -> NDArray:
+        """(3,) [m] a landmark of the body in the world."""
+        return self.positions(self.body.landmarks.select((name,)))[0]
+
+    def rows_of(self, kernel: Any, lines: int, points: PointSet, *given: Any) -> Rows | DofRows:
+        """Rows of a compiled row maker for points of the body, on joints that move where they do."""
+        if self.morphing is None:
+            return targets.fill(kernel, lines, self.body, self.state, points, *given)
+        pose = self.morphing.pose(self.state)
+        return on_moved_joints(pose, targets.fill(kernel, lines, self.body, self.state, points, *given, frames=pose.frames))
+
+    def along(
+        self, points: PointSet, direction: NDArray, residual: NDArray, sigma: NDArray | float, **options: Any
+    ) -> Rows | DofRows:
+        """One row a point of the body: it should lie further along a direction (K, 3) by a residual (K,) [m].
+
+        The short way for a sensor of one's own. `options` are `group` and `loss` of `Rows.of`.
+        """
+        x, n = self.positions(points), np.broadcast_to(np.asarray(direction, float), (len(points), 3))
+        weight = np.broadcast_to(1.0 / np.square(np.asarray(sigma, float)), len(points))
+        rows = Rows.of(points.segments, x, n, np.broadcast_to(residual, len(points)), weight, **options)
+        return rows if self.morphing is None else on_moved_joints(self.morphing.pose(self.state), rows)
