@@ -16,7 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from kinefit.rows import AnyRows, DofRows, PairRows, Rows
 from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
+
+if TYPE_CHECKING:
+    from kinefit.sensors.occlusion import DepthSeen
 
 
 @dataclass(frozen=True)
@@ -57,11 +60,31 @@ class Hints:
 
 
 class Matched(ABC):
-    """A measurement with its correspondences."""
+    """A measurement with its correspondences.
+
+    Attributes
+    ----------
+    sensor : name of the sensor
+    of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
+    shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
+    """
+
+    sensor: str = ""
+    of_points: bool = True
+    shows_surface: bool = False
+
+    @property
+    def key(self) -> bytes:
+        """The same for matches that make the same rows: what tells a fit that nothing discrete changes any more."""
+        return b""
 
     @abstractmethod
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Rows at a scene's state: a pure function of the scene, not softened, each kind with its loss."""
+
+    def squares(self, scene: Scene) -> NDArray:
+        """(M,) squared residual of each of its points, in variances; by default of each group of rows."""
+        return np.concatenate([np.zeros(0), *(np.array([s for _, s in _groups(r)]) for r in self.rows(scene))])
 
     def evidence(self, scene: Scene) -> Evidence:
         """What it says of each segment; by default every group of rows speaks for its segments, or against them."""
@@ -95,6 +118,10 @@ class Measurement(ABC):
         """What it tells where no pose is known."""
         return Hints()
 
+    def depth_image(self) -> DepthSeen | None:
+        """A depth image that other sensors may ask what is in front of something."""
+        return None
+
     def compact(self) -> Measurement:
         """What a smoother keeps of it: no whole images."""
         return self
@@ -116,7 +143,7 @@ class Sensor(ABC):
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
         """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from a step that was accepted; `sure` where no segment is lost."""
 
 

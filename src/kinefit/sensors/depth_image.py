@@ -16,7 +16,7 @@ from kinefit.sensors import _kernels_depth_image as kernels
 from kinefit.sensors.background import Background
 from kinefit.sensors.depth_view import DepthView, view_of
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
 from kinefit.sensors.visibility import judge_segments
 
@@ -46,7 +46,7 @@ class DepthMeasurement:
 
     def __init__(
         self, frame: DepthFrame, camera: Camera, surface: Surface, vertices: NDArray, sigma: float,
-        settings: FusionSettings, background: Background | None = None,
+        settings: TrackSettings, background: Background | None = None,
     ) -> None:  # fmt: skip
         if frame.size != camera.size:
             problem = f"depth images of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
