@@ -21,7 +21,7 @@ from kinefit.correspondences.morphed import toward_tangents
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
-from kinefit.rows import DofRows, Rows
+from kinefit.rows import Rows
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteMeasurement
 from kinefit.sensors.surface import Surface as Drawn

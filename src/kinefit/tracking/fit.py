@@ -12,12 +12,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.sensors.base import Matched, Measurement, check_rows
+from kinefit.sensors.results import FrameResult, judged
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 from kinefit.tracking.prediction import belief
-from kinefit.sensors.results import FrameResult, judged
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone

@@ -13,10 +13,10 @@ from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.base import Measurement
+from kinefit.sensors.results import ANYWHERE, FrameResult
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 from kinefit.tracking.prediction import forgetting
-from kinefit.sensors.results import ANYWHERE, FrameResult
 
 if TYPE_CHECKING:
     from kinefit.tracking.tracker import Tracker

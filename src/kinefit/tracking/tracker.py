@@ -15,12 +15,12 @@ from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.results import FrameResult
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.fit import Fitted, FrameFit
 from kinefit.tracking.prediction import Prediction
 from kinefit.tracking.recovery import Recovery
-from kinefit.sensors.results import FrameResult
 from kinefit.tracking.routing import Sensors, time_of
 
 __all__ = ["FrameResult", "TrackSettings", "Tracker"]
