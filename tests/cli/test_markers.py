@@ -8,9 +8,9 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit import Markers, read_markers
+from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.exporters import write_markers
-from kinefit.markers.placement import placement
 from kinefit.simulation import squat_and_wave
 
 

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies.marker_sets import bare, known_set, matched
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
-from kinefit.markers.placement import known_set
-from kinefit.markers.poses import bare
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
 from kinefit.observations import (
@@ -222,8 +221,10 @@ class FrameSource:
 def _markers(
     markers: Markers, frame: int, sensor: str, body: Body, given: str | None, time: float
 ) -> MarkerFrame:
-    names = tuple(bare(n) for n in markers.names)
-    return MarkerFrame(sensor, time, names, markers.positions[frame], known_set(body, names, given))
+    own = known_set(body, markers.names, given)
+    known = body.markers(own) if own else body.landmarks
+    names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))
+    return MarkerFrame(sensor, time, names, markers.positions[frame], own)
 
 
 def _sized(body: Body, take: Take, source: FrameSource, up: NDArray, progress: Progress | None) -> Sized:
