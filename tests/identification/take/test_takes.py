@@ -19,7 +19,7 @@ from kinefit.simulation import squat_and_wave
 
 @pytest.fixture(scope="module")
 def labelled():
-    """Two seconds of a person with 42 markers, at 60 Hz."""
+    """Two seconds of a person with 41 markers, at 60 Hz."""
     motion = squat_and_wave(rate=60)
     points = placement(motion.body, "CMU_41").points
     return Markers(points.names, 60.0, motion.positions(points), up="z")
