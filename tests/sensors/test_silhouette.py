@@ -229,7 +229,7 @@ def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
     text = '[take]\nrate = 30.0\nup = "y"\nstart = "motion.npz"\n[calibration]\nfile = "rig.toml"\nunit = "m"\n'
     for camera in rig:
         text += f'[[camera]]\nname = "{camera.name}"\n'
-        text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\naccuracy = 2.0\n'
+        text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\nsigma = 2.0\n'
     (tmp_path / "take.toml").write_text(text)
     motion, seen = track_take(tmp_path / "take.toml")
     assert len(motion) == 6 and len(seen.silhouettes) == 4

@@ -143,7 +143,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")
         return None
-    accuracy = [entry.accuracy for entry in take.keypoints]
+    accuracy = [entry.sigma for entry in take.keypoints]
     channels = make_channels(load_body(take.body), seen.rig, seen.keypoints, people, accuracy)
     return triangulated(channels, np.arange(len(channels.uv)))
 
