@@ -53,9 +53,24 @@ class Channels:
         seen = np.isfinite(self.uv).all(axis=-1)
         return np.where(seen, self.confidence / np.square(self.sigma), 0.0)
 
+    def part(self, frames: Sequence[int]) -> Channels:
+        """The same channels in some frames."""
+        return replace(self, uv=self.uv[frames], confidence=self.confidence[frames])
+
+    @classmethod
+    def none(cls, rig: Rig, frames: int) -> Channels:
+        """No keypoints in so many frames."""
+        numbers, points = np.zeros(0, np.int64), PointSet((), np.zeros(0, np.int64), np.zeros((0, 3)))
+        return cls(
+            rig, points, {}, (), numbers, numbers, numbers, numbers, np.zeros(0), np.zeros((frames, 0, 2)),
+            np.zeros((frames, 0)),
+        )  # fmt: skip
+
     def with_points(self, body: Body) -> Channels:
         """The same measurements of another body's points."""
         parts = [known_points(body, name).select(self.points.names[span]) for name, span in self.sets.items()]
+        if not parts:
+            return self
         return replace(self, points=joined(parts))
 
 

@@ -22,6 +22,7 @@ from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
 from kinefit.sensors.depth_gate import gathered, person_view, window_of
 from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.occlusion import DepthSeen
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
@@ -32,109 +33,6 @@ AGREES = 3.0  # standard deviations of a measurement that agrees
 _SHAPE = 0.03  # [m] by which a surface of simple shapes is off
 _LIMB = 0.04  # [m] radius of a forearm
 _MOST_PIXELS, _MOST_POINTS = 25_000, 5_000  # of what is kept: 100 kB and 80 kB
-
-
-class DepthMeasurement:
-    """A depth image: measured points towards the surface, the visible surface towards what was measured, free space.
-
-    Parameters
-    ----------
-    frame : DepthFrame
-    camera : Camera
-    surface : Surface of the body
-    vertices : (V, 3) [m]
-        Its mesh where the body is thought to be: about it, measured points are gathered.
-    sigma : float [m] standard deviation of a depth.
-    background : Background of this camera, None where it moves.
-
-    Raises
-    ------
-    ObservationError
-        An image of another size than the camera's.
-    """
-
-    def __init__(
-        self, frame: DepthFrame, camera: Camera, surface: Surface, vertices: NDArray, sigma: float,
-        settings: TrackSettings, background: Background | None = None,
-    ) -> None:  # fmt: skip
-        if frame.size != camera.size:
-            problem = f"depth images of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
-            raise ObservationError(problem, remedy="Give the camera of these images, or camera.scaled(size).")
-        self.sensor, self.camera, self.surface, self.sigma, self._settings = (
-            frame.sensor, camera, surface, sigma, settings,
-        )  # fmt: skip
-        self._raw, self._background = frame.depth, background
-        box = np.empty((2, 3))
-        kernels.box(vertices, box)
-        self._low, self._high = box[0] - settings.reach, box[1] + settings.reach
-        first, last, self._back = window_of(camera, self._low, self._high)
-        self._depth = frame.depth if background is None else background.marked(frame.depth, first, last)
-        self._shown = surface.depth(vertices, camera)
-        self._space = self._free()
-        self._calls = 0
-        patch = settings.patch**2
-        span = self._low, self._high
-        self._points, share = gathered(self._depth, camera, span, (first, last), self._shown, settings)
-        self._point_sigma = sigma / np.sqrt(share / 2.0)  # halved: a patch is told of by its points and by its samples
-        per_sample = min(surface.areas.sum() / (patch * max(len(surface.samples), 1)), 1.0)
-        self._sample_sigma = sigma / np.sqrt(per_sample / 2.0)
-        # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
-        # points draw thin limbs towards the sensor: by 2 to 5 cm with deviations of 3 cm. Pixels do not.
-        self._blur = min(_LIMB / (4.0 * sigma), 1.0) ** 2
-
-    def _free(self) -> FreeSpace | None:
-        """Where the body can be, and where some of it is missing, with the body as it is drawn now."""
-        if not np.isfinite(self._settings.through):
-            return None
-        reach = AGREES * self.sigma + _SHAPE
-        return FreeSpace.of(self._depth, farthest=self._back, shown=self._shown, tolerance=reach)
-
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
-        """Rows at a state, softened at half the bound."""
-        body, samples, s = self.surface.body, self.surface.samples, self._settings
-        bound = max(bound, AGREES * self.sigma)
-        if self._calls and self._calls % s.render_every == 0:
-            self._shown = self.surface.depth(self.surface.posed(state), self.camera)
-            self._space = self._free()
-        self._calls += 1
-        points = surface_rows(
-            body, state, self._points.T, max_distance=bound, sigma=self._point_sigma,
-            viewpoint=self.camera.centre_world,
-        )  # fmt: skip
-        pixels = depth_image_rows(
-            body, state, samples, self.camera, self._depth, self._shown, before=bound, behind=bound,
-            sigma=self._sample_sigma,
-        )  # fmt: skip
-        for rows in (points, pixels):
-            kernels.soften(rows.data, bound / 2.0)
-        if bound <= max(s.near, AGREES * self.sigma):
-            points.data[7] *= self._blur
-        out = [points, pixels]
-        if self._space is not None:
-            reach, sigma = AGREES * self.sigma + _SHAPE, s.through * self._space.cell
-            out.append(free_space_rows(body, state, samples, self._space, self.camera, tolerance=reach, sigma=sigma))
-        for rows in out:
-            rows.group[:] = -1  # softened already
-        return out
-
-    def evidence(self, state: BodyState) -> Evidence:
-        """Pixels for and against each segment; see `judge_segments`."""
-        layers, vertices = self.surface.layers(self.camera), self.surface.posed(state)
-        self.surface.judged = state
-        return judge_segments(vertices, layers, self._depth, self.camera, noise=(self.sigma / 2.0, 0.0)).evidence
-
-    def view(self) -> DepthView | None:
-        """All that was measured about the body and is not background."""
-        return person_view(self._depth, self.camera, (self._low, self._high))
-
-    def learn(self, state: BodyState, sure: bool) -> None:
-        """Let the background learn from the image, with the body where it was found."""
-        if self._background is not None:
-            if self.surface.judged is state:  # drawn already
-                shown = self.surface.layers(self.camera).front
-            else:
-                shown = self.surface.depth(self.surface.posed(state), self.camera)
-            self._background.learn(self._raw, shown, (self._low, self._high), sure)
 
 
 class DepthImageSensor(Sensor):
@@ -295,6 +193,10 @@ class DepthImageMeasurement(Measurement):
             return self._judged[1]
         return scene.surface.depth(scene.surface.posed(scene.state), self.camera)
 
+    def depth_image(self) -> DepthSeen:
+        """For other sensors, what stands still among it."""
+        return DepthSeen(np.abs(self.depth), self.camera, self.sigma)
+
     def hints(self, scene: Scene) -> Hints:
         """All that was measured about the body and is not background."""
         return Hints(view=person_view(self.depth, self.camera, self.box))
@@ -334,6 +236,13 @@ class DepthImageMatched(Matched):
     points: SurfacePairs
     samples: SurfacePairs
     free: FreePairs | None
+    of_points = False
+    shows_surface = True
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the depth camera."""
+        return self.measurement.sensor
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a measured point, one a visible sample, one a sample in free space."""

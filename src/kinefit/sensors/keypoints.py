@@ -16,7 +16,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import Loss
 from kinefit.observations import KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.left_right import find_swaps, limb_groups
@@ -212,6 +212,22 @@ class KeypointMatched(Matched):
         for h in self.hidden:
             out[h.far] = np.inf
         return np.nan_to_num(out, nan=np.inf)
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Of every point of every detector."""
+        layout, channels = self.measurement.layout, self.measurement.layout.channels
+        points = layout.points_of(scene.body)
+        uv = np.where((self.weight > 0)[:, None], self.uv, np.nan)
+        values = uv - projected(scene, layout)
+        factor = np.where(self.weight > 0, self.loss.factor(self.squares(scene)), 0.0)
+        out = []
+        for q, label in enumerate(channels.sources):
+            mine = np.flatnonzero(channels.source == q)
+            out.append(Leftover(
+                label, tuple(points.names[k] for k in mine), points.segments[mine], values[mine], factor[mine], "px",
+                uv[mine], bool(self.swapped[mine].any()),
+            ))  # fmt: skip
+        return out
 
     def evidence(self, scene: Scene) -> Evidence:
         """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""

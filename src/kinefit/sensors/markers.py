@@ -13,7 +13,7 @@ from kinefit.correspondences import _kernels
 from kinefit.losses import Loss
 from kinefit.observations import MarkerFrame
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
@@ -110,6 +110,13 @@ class MarkerMatched(Matched):
         """(M,) squared distances, in variances."""
         m = self.measurement
         return np.asarray(m.weight * np.square(m.x_world - scene.positions(m.points_of(scene.body))).sum(axis=1))
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Of every marker."""
+        m = self.measurement
+        points = m.points_of(scene.body)
+        values, factor = m.x_world - scene.positions(points), self.loss.factor(self.squares(scene))
+        return [Leftover(m.sensor, m.names, points.segments, values, factor, "m", m.x_world)]
 
     def evidence(self, scene: Scene) -> Evidence:
         """A marker speaks for its segment within three standard deviations, and against it beyond."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.sensors.base import Matched
+from kinefit.sensors.base import Matched, Measurement
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import joint_moves
@@ -41,6 +41,7 @@ class FrameResult:
         Share of all evidence that agrees.
     iterations : int
     matched : of every measurement, with the correspondences of the fit
+    measurements : the measurements themselves
     """
 
     time: float
@@ -53,6 +54,7 @@ class FrameResult:
     support: float
     iterations: int
     matched: tuple[Matched, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
 
     @property
     def quality(self) -> float:
@@ -113,5 +115,6 @@ def judged(
     support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)
     return FrameResult(
-        scene.time, scene.state, *std, told.quality, told.lost, told.hidden, support, iterations, tuple(matched)
-    )
+        scene.time, scene.state, *std, told.quality, told.lost, told.hidden, support, iterations, tuple(matched),
+        scene.measurements,
+    )  # fmt: skip

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, DofRows, Rows
-from kinefit.sensors.base import Matched, Measurement
+from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.equations import normal_equations
@@ -87,7 +87,7 @@ class OtherSensors:
         for f in range(T):
             state = BodyState(roots[f], angles[f])
             scene = self.scene(f, state)
-            matched = tuple(m.match(scene, self.reach) for m in self.measurements[f])
+            matched = tuple(matched_by(m, scene, self.reach) for m in self.measurements[f])
             matches.append(matched)
             parts = [weaker(r, self.scale.get(m.sensor, 1.0)) for m in matched for r in m.rows(scene)]
             rows[f] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)

@@ -7,6 +7,7 @@ mean residual has that is not new in every frame lasts; what all residuals of a 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +47,17 @@ class OtherNoise:
     drift: dict[str, float]
     shift: dict[str, NDArray]
 
+    def as_told(self) -> dict[str, Any]:
+        """The same in a few numbers, by sensor."""
+        return {
+            name: {"drift [m]": round(d, 4), "shift [m]": np.round(self.shift.get(name, np.zeros(3)), 4).tolist()}
+            for name, d in self.drift.items()
+        }
 
-def other_noise(body: Body, others: OtherSensors, matched: tuple[tuple[Matched, ...], ...], roots: NDArray, angles: NDArray) -> OtherNoise:
+
+def other_noise(
+    body: Body, others: OtherSensors, matched: tuple[tuple[Matched, ...], ...], roots: NDArray, angles: NDArray
+) -> OtherNoise:
     """Noise of all sensors but the keypoints, from their residuals at fitted states.
 
     Parameters

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.rows import AnyRows, ParameterRows
-from kinefit.sensors.base import Matched, Measurement, check_rows
+from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
 from kinefit.sensors.results import FrameResult, judged
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -106,5 +106,5 @@ class FrameFit:
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:
-    return [m.match(scene, reach) for m in measurements]
+    return [matched_by(m, scene, reach) for m in measurements]
 

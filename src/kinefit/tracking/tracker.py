@@ -14,7 +14,10 @@ from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
 from kinefit.geometry.camera import Rig
+from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.results import FrameResult
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -80,6 +83,11 @@ class Tracker:
     def state(self) -> BodyState | None:
         """The last frame's, None before a start."""
         return self._prediction.state
+
+    @property
+    def sees_surfaces(self) -> bool:
+        """Whether some sensor so far shows a person as a whole: searches in it take long."""
+        return any(isinstance(s, DepthImageSensor | PointCloudSensor) for s in self.sensors)
 
     @property
     def accuracy(self) -> Mapping[str, float]:
@@ -187,6 +195,10 @@ class Tracker:
     def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
         """The tracker's body in a state."""
         return self._scene.at(state, time=time)
+
+    def apart(self, scene: Scene) -> list[AnyRows]:
+        """Rows that keep parts of the body from running into each other."""
+        return self._fit.apart(scene)
 
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
         scene = self._scene.at(state, time=time, velocity=self._prediction.velocity * self.rate)
