@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.correspondences import surface_rows
 from kinefit.observations import PointCloud
-from kinefit.rows import Rows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors import _kernels_depth_image as kernels
+from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
 from kinefit.sensors.depth_image import AGREES
 from kinefit.sensors.depth_view import DepthView, camera_at, splat, view_of
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import FusionSettings
 from kinefit.sensors.surface import Surface
+from kinefit.sensors.surface_match import SegmentResiduals, SurfacePairs, by_segment
 
 _PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
 
@@ -80,3 +86,114 @@ class CloudMeasurement:
             return None
         coarse, small = splat(self._points, camera_at(self._points, self._eye))
         return view_of(coarse, coarse > 0, small) if (coarse > 0).any() else None
+
+
+class PointCloudSensor(Sensor):
+    """A scanner: points on some surface, on the body, or on one segment of it (P2 2.3), towards the body's surface.
+
+    Parameters
+    ----------
+    name : as its frames are named
+    sigma : float [m] standard deviation of a point.
+    settings : FusionSettings
+    """
+
+    def __init__(self, name: str, sigma: float, settings: FusionSettings) -> None:
+        self.name, self.sigma, self.settings = name, sigma, settings
+
+    def prepare(self, frame: PointCloud, scene: Scene) -> PointCloudMeasurement:
+        """The points about the body.
+
+        Raises
+        ------
+        BodyError
+            A segment that the body does not have; a body without surfaces.
+        """
+        return PointCloudMeasurement(self, frame, scene)
+
+
+class PointCloudMeasurement(Measurement):
+    """Points of one time.
+
+    Parameters
+    ----------
+    of : PointCloudSensor
+    frame : PointCloud
+    scene : Scene with the body where it is expected: points that may be another's are taken about it.
+
+    Attributes
+    ----------
+    points : (N, 3) [m]
+    """
+
+    settled = False
+
+    def __init__(self, of: PointCloudSensor, frame: PointCloud, scene: Scene) -> None:
+        s = of.settings
+        self.sensor, self.time, self.sigma, self._eye = of.name, frame.time, of.sigma, frame.viewpoint
+        self._segment = None if frame.segment is None else np.int64(scene.body.tree.segment(frame.segment))
+        self._certain = frame.on_body or frame.segment is not None
+        x, vertices = frame.points, scene.surface.posed(scene.state)
+        if not self._certain:
+            low, high = vertices.min(axis=0) - s.reach, vertices.max(axis=0) + s.reach
+            x = x[((x > low) & (x < high)).all(axis=1)]
+        self.points = np.array(x[:: max(len(x) // s.points, 1)], float)
+        cells = np.floor(np.clip(self.points, -1e6, 1e6) / s.patch).astype(np.int64)
+        patches = len(np.unique(cells @ _PRIMES))
+        self._point_sigma = of.sigma * np.sqrt(max(len(self.points) / max(patches, 1), 1.0))
+
+    def match(self, scene: Scene, reach: float) -> PointCloudMatched:
+        """Nearest points of the surface; for points known to be the body's twice as far."""
+        bound = max(2.0 * reach if self._certain else reach, AGREES * self.sigma)
+        return PointCloudMatched(self, SurfacePairs.nearest(self._near(scene, bound), self.points, scene, bound / 2.0))
+
+    def _near(self, scene: Scene, reach: float) -> Rows:
+        return surface_rows(
+            scene.body, scene.state, self.points, max_distance=reach, sigma=self._point_sigma, viewpoint=self._eye,
+            segment=self._segment, frames=scene.frames,
+        )  # fmt: skip
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """For a segment, as much as there are points near it, of those that its share of the surface should have."""
+        rows, areas = self._near(scene, AGREES * self.sigma), scene.surface.areas
+        count, none = len(self.points), np.zeros(len(areas))
+        if self._segment is not None:
+            share, told = len(rows) / max(count, 1), Evidence(none, none.copy())
+            told.agreeing[self._segment], told.contrary[self._segment] = share, (1.0 - share) * bool(count)
+            return told
+        expected = np.maximum(count * areas / max(areas.sum(), 1e-12), 1.0)
+        return Evidence(np.minimum(np.bincount(rows.segment, minlength=len(none)) / expected, 1.0), none)
+
+    def hints(self, scene: Scene) -> Hints:
+        """The points as a camera at the sensor would show them."""
+        if not len(self.points):
+            return Hints()
+        coarse, small = splat(self.points, camera_at(self.points, self._eye))
+        return Hints(view=view_of(coarse, coarse > 0, small) if (coarse > 0).any() else None)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloudMatched(Matched):
+    """A cloud with its correspondences.
+
+    Parameters
+    ----------
+    measurement : PointCloudMeasurement
+    pairs : SurfacePairs of points and the nearest ones of the surface
+    """
+
+    measurement: PointCloudMeasurement
+    pairs: SurfacePairs
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """One row a point."""
+        return [self.pairs.rows(scene)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """For a segment, as much as there are points near it, of those that its share of the surface should have."""
+        return self.measurement.evidence(scene)
+
+    def summary(self, scene: Scene) -> SegmentResiduals:
+        """Distances [m] of the points from the surface, by segments."""
+        rows = self.pairs.on_segments(scene)
+        return by_segment(rows.residual, rows.segment, len(scene.body.tree.segments))
