@@ -132,6 +132,7 @@ class FusedFit:
         sigma, vertices = self.accuracy.get(name, s.depth), surface.posed(state)
         if isinstance(frame, PointCloud):
             return CloudMeasurement(frame, surface, vertices, sigma, s)
+        assert isinstance(frame, DepthFrame)
         camera = self.rig[name]
         return DepthMeasurement(frame, camera, surface, vertices, sigma, s, self.background(camera))
 

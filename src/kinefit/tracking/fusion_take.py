@@ -36,7 +36,7 @@ from kinefit.sensors.settings import FusionSettings
 from kinefit.subject.keypoints import Progress, fit_subject
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
-from kinefit.tracking.silhouette_take import shaped_by_silhouettes, silhouettes_of
+from kinefit.tracking.silhouette_take import shaped_by_silhouettes
 
 _SIZES = 4  # depth images from which a person's size is found ...
 _FIRST = 5.0  # [s] ... spread over so much of the beginning
@@ -138,7 +138,7 @@ class FrameSource:
         if not cameras:
             raise TakeError("no camera of the take is calibrated", file=take.path, remedy="Add [calibration].")
         self.rig = Rig(cameras)
-        self.silhouettes: tuple[SilhouetteVideo, ...] = silhouettes_of(take, seen)
+        self.silhouettes: tuple[SilhouetteVideo, ...] = seen.silhouettes
         self._offsets = [entry.time_offset for entry in take.markers]
         self.people: list[NDArray] = []
         if seen.keypoints:

@@ -126,3 +126,15 @@ def test_wrong_colours_are_told(folder):
     ):
         with pytest.raises(TakeError, match=said):
             load(folder, f'\n[[silhouette]]\ncamera = "cam"\nformat = "threshold"\n{keys}')
+
+
+def test_silhouettes_before_the_background(folder):
+    entry = '\n[[silhouette]]\ncamera = "cam"\nformat = "background"\nfile = "{}.png"\n'
+    cv2.imwrite(str(folder / "empty.png"), np.full((240, 320, 3), WALL[::-1], np.uint8))
+    (video,) = load(folder, entry.format("empty")).silhouettes
+    truth = np.any(drawn(7) != WALL, axis=2)
+    assert np.count_nonzero((video.frame(7).mask > 127) != truth) < 0.1 * np.count_nonzero(truth)
+    cv2.imwrite(str(folder / "small.png"), np.zeros((24, 32, 3), np.uint8))
+    with pytest.raises(KinefitError, match="the background has") as caught:
+        load(folder, entry.format("small"))
+    assert caught.value.place == "silhouette of camera cam"
