@@ -12,6 +12,7 @@ from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.marker_sets import bare, known_set, matched
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
+from kinefit.identification.take.named import with_names
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
 from kinefit.motion import UP_AXES, Motion
@@ -66,6 +67,7 @@ def fuse_take(
             "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
             remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
+    seen = with_names(take, seen, progress=progress)
     source = FrameSource(take, seen)
     up = np.array(UP_AXES[take.up])
     found = Sized(load_body(take.body)) if take.start is None else _started(take)
