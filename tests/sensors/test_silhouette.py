@@ -15,7 +15,7 @@ from kinefit.initialization.from_silhouettes import LEVELS, coarse_to_fine
 from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.take import track_take
@@ -72,7 +72,7 @@ def silhouettes(body, state, cameras, time, mesh=None):
 
 
 def tracker(body, rig, **settings):
-    return FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=FusionSettings(search=False, **settings))
+    return FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False, **settings))
 
 
 def joints(body, state):

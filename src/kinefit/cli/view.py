@@ -132,9 +132,9 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
 
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
-    from kinefit.initialization.from_points import triangulated
     from kinefit.multiview.association import choose_people
     from kinefit.sensors.channels import make_channels
+    from kinefit.sensors.triangulation import triangulated
 
     if seen.rig is None or not seen.keypoints:
         return None

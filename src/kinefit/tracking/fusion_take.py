@@ -33,7 +33,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.video import Video
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress, fit_subject
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
@@ -45,7 +45,7 @@ _EMPTY = 30  # images of an empty scene that are looked at: more tell no more
 
 
 def fuse_take(
-    take: Take, seen: Observations, *, settings: FusionSettings | None = None, size: bool = True,
+    take: Take, seen: Observations, *, settings: TrackSettings | None = None, size: bool = True,
     progress: Progress | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of the person of a take from depth, keypoints and markers at once.

@@ -1,0 +1,103 @@
+"""Rows of any kind as whitened residuals √w·r, with their derivatives by the degrees of freedom: what a border needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
+from kinefit.losses import Loss
+from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """How the segments of a body at a state move with its degrees of freedom.
+
+    Parameters
+    ----------
+    body : Body
+    state : BodyState
+    centre : (3,) [m] the root's origin, which twists are taken about.
+    moves : (S, 6, n) twist (v, ω) of each segment by each degree of freedom.
+    """
+
+    body: Body
+    state: BodyState
+    centre: NDArray
+    moves: NDArray
+
+    @classmethod
+    def of(cls, body: Body, state: BodyState) -> Pose:
+        """The body at a state."""
+        tree = body.tree
+        _, screws = tree.forward(state.T_world_root, state.angles)
+        moves = np.stack([tree.segment_jacobian(screws, s) for s in range(len(tree.segments))])
+        return cls(body, state, state.T_world_root[:3, 3], moves)
+
+    def along(self, segment: NDArray, point: NDArray, direction: NDArray) -> NDArray:
+        """(N, n) [m] how far points (N, 3) of segments (N,) move along directions (N, 3)."""
+        a = np.concatenate([direction, np.cross(point - self.centre, direction)], axis=1)
+        out = np.empty((len(a), self.moves.shape[2]))
+        for s in np.unique(segment):
+            of = segment == s
+            out[of] = a[of] @ self.moves[s]
+        return out
+
+
+def residuals(rows: AnyRows) -> NDArray:
+    """(N,) √w·r of rows, before any loss; for a joint weight Lᵀ r with W = L Lᵀ."""
+    if rows.weight.ndim == 2:
+        return np.asarray(np.linalg.cholesky(rows.weight).T @ rows.residual)
+    return np.asarray(np.sqrt(rows.weight) * rows.residual)
+
+
+def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
+    """(N,) square root of each row's robust factor, and the cost Σ ρ; `loss` is that of rows without their own."""
+    if isinstance(rows, Rows):
+        factor, cost = (rows.loss or loss).of_rows(rows.data, rows.group)
+        return np.sqrt(factor), cost
+    if isinstance(rows, DofRows):
+        data = np.zeros((8, len(rows)))
+        data[6], data[7] = rows.residual, rows.weight
+        factor, cost = (rows.loss or loss).of_rows(data, rows.group)
+        return np.sqrt(factor), cost
+    left = residuals(rows)
+    return np.ones(len(rows)), float(left @ left)
+
+
+def columns(rows: AnyRows, pose: Pose) -> NDArray:
+    """(N, n) derivative of a point's whitened place by the degrees of freedom, so that `residuals` ≈ columns · δ.
+
+    Raises
+    ------
+    ObservationError
+        Rows on degrees of freedom or segments that the body does not have.
+    """
+    n, count = pose.body.tree.n_dofs, len(pose.body.tree.segments)
+    if isinstance(rows, Rows):
+        _within("segment", rows.segment, count, pose.body)
+        return np.sqrt(rows.weight)[:, None] * pose.along(rows.segment, rows.point, rows.direction)
+    if isinstance(rows, PairRows):
+        _within("segment", rows.segments, count, pose.body)
+        a = pose.along(rows.segments[:, 0], rows.point_a, rows.direction)
+        return np.sqrt(rows.weight)[:, None] * (a - pose.along(rows.segments[:, 1], rows.point_b, rows.direction))
+    if isinstance(rows, ParameterRows):
+        _within("degree of freedom", rows.index, n, pose.body)
+        chosen = np.eye(n)[rows.index]
+        if rows.weight.ndim == 2:
+            return np.asarray(np.linalg.cholesky(rows.weight).T @ chosen)
+        return np.sqrt(rows.weight)[:, None] * chosen
+    if rows.jacobian.shape[1] != n:
+        problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{pose.body.name}' has {n}"
+        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
+    return np.sqrt(rows.weight)[:, None] * rows.jacobian
+
+
+def _within(what: str, index: NDArray, count: int, body: Body) -> None:
+    if index.size and not 0 <= index.min() <= index.max() < count:
+        problem = f"rows name {what} {int(index.max())}, but body '{body.name}' has {count}"
+        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")

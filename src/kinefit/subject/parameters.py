@@ -1,0 +1,349 @@
+"""What a subject fit may find: parameters of a world, each kind of them a few lines.
+
+A kind of parameter is a prior and a function from values to a world. Nothing is told of derivatives, and no sensor
+knows of parameters: the solver compares the rows of the same correspondences in worlds that differ a little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.errors import BodyError, ObservationError, choices
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.sensors.base import Sensor, Unknown
+from kinefit.solvers.shape import PROPORTIONS, mirror_points
+
+UNKNOWN_SIZE, KNOWN_SIZE = 0.2, 0.02
+"""Standard deviation of the logarithm of a person's size, and of one whose stature is known (shoes, posture)."""
+
+_MIDDLE = 0.002  # [m] standard deviation of a point in the middle to either side
+_STEP = 1e-4  # [m, rad, logarithm] from which derivatives are taken
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Everything that measurements are compared with, but for poses.
+
+    Parameters
+    ----------
+    body : Body
+    rig : Rig of all cameras
+    values : {sensor: {name: value}} of the sensors' own unknowns.
+    """
+
+    body: Body
+    rig: Rig
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MappingProxyType({}))
+
+
+class Parameters(Protocol):
+    """One kind of parameters.
+
+    Attributes
+    ----------
+    names : (p,)
+    mean : (p,) what is thought of them before.
+    information : (p, p) inverse covariance of the prior.
+    step : (p,) from which derivatives are taken.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,)."""
+        ...
+
+    @property
+    def mean(self) -> NDArray:
+        """(p,)."""
+        ...
+
+    @property
+    def information(self) -> NDArray:
+        """(p, p)."""
+        ...
+
+    @property
+    def step(self) -> NDArray:
+        """(p,)."""
+        ...
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The world with these values (p,); pure."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentScales:
+    """Logarithms of the scales of a body's lengths: `Body.scale_groups`.
+
+    All follow the person's size, which is unknown by 20 %, or known by 2 % where `size` is given; each differs from it
+    by 5 % (`PROPORTIONS`), so that a length that nothing measures goes with those that something does.
+
+    Parameters
+    ----------
+    body : Body, of scales 1.
+    size : float, optional
+        Of the person, as a share of the body's, where the stature is known.
+    about : float, mean of an unknown size.
+    proportions : standard deviation of each length about the size.
+    """
+
+    body: Body
+    size: float | None = None
+    about: float = 1.0
+    proportions: float = PROPORTIONS
+
+    def __post_init__(self) -> None:
+        if not ((self.size is None or self.size > 0) and self.about > 0 and self.proportions > 0):
+            problem = f"a size of {self.size} about {self.about} with proportions of {self.proportions}"
+            raise BodyError(problem, remedy="Give shares of the body's size above 0.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(G,)."""
+        return tuple(f"length {name}" for name in self.body.scale_groups)
+
+    @property
+    def mean(self) -> NDArray:
+        """(G,) logarithms."""
+        return np.full(len(self.names), np.log(self.about if self.size is None else self.size))
+
+    @property
+    def information(self) -> NDArray:
+        """(G, G)."""
+        common = UNKNOWN_SIZE if self.size is None else KNOWN_SIZE
+        return np.linalg.inv(np.eye(len(self.names)) * self.proportions**2 + common**2)
+
+    @property
+    def step(self) -> NDArray:
+        """(G,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The body with these lengths; all its points, surfaces and morphs go along."""
+        return replace(world, body=world.body.scaled(np.exp(values)))
+
+
+@dataclass(frozen=True, eq=False)
+class PointOffsets:
+    """Shifts [m] of a detector's keypoints or of markers from their places on the body, along their segment's axes.
+
+    Parameters
+    ----------
+    body : Body, whose set it is.
+    name : of a keypoint set or of a marker set.
+    std : scalar or (K,) [m] standard deviation of each point, along each axis.
+    mirror : whether left and right points are shifted alike; by default those of keypoint sets are.
+    """
+
+    body: Body
+    name: str
+    std: ArrayLike = 0.01
+    mirror: bool | None = None
+
+    def __post_init__(self) -> None:
+        sets = {**self.body.keypoint_sets, **self.body.marker_sets}
+        if self.name not in sets:
+            raise BodyError(choices(f"set of points of body '{self.body.name}' named", self.name, sets))
+        std = np.asarray(self.std, float)
+        if std.shape not in ((), (len(self.points),)) or not np.all(std > 0):
+            problem = f"standard deviations of shape {std.shape} for the {len(self.points)} points of '{self.name}'"
+            raise BodyError(problem, remedy="Give one, or one for each point, in metres above 0.")
+
+    @property
+    def points(self) -> PointSet:
+        """The K points where the body has them."""
+        return {**self.body.marker_sets, **self.body.keypoint_sets}[self.name]
+
+    @cached_property
+    def _shared(self) -> tuple[NDArray, NDArray, NDArray]:
+        """For each point the point that leads it, and the sign of its z; then all leaders."""
+        count = len(self.points)
+        lead, sign = np.arange(count), np.ones(count)
+        if self.mirror if self.mirror is not None else self.name in self.body.keypoint_sets:
+            lead, sign = mirror_points(self.points, self.body.tree.segments)
+        return lead, sign, np.unique(lead)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(3 L,) of the L points that lead."""
+        return tuple(f"{self.name} {self.points.names[k]} {axis}" for k in self._shared[2] for axis in "xyz")
+
+    @property
+    def mean(self) -> NDArray:
+        """(3 L,) [m] zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(3 L, 3 L) [1/m²]."""
+        _, sign, leaders = self._shared
+        std = np.repeat(np.broadcast_to(np.asarray(self.std, float), len(self.points))[leaders], 3)
+        std[3 * np.flatnonzero(sign[leaders] == 0.0) + 2] = _MIDDLE
+        return np.diag(std**-2)
+
+    @property
+    def step(self) -> NDArray:
+        """(3 L,)."""
+        return np.full(len(self.names), _STEP)
+
+    def shifts(self, values: NDArray) -> NDArray:
+        """(K, 3) [m] of all points, mirrored where they share."""
+        lead, sign, leaders = self._shared
+        out = np.asarray(values, float).reshape(-1, 3)[np.searchsorted(leaders, lead)].copy()
+        out[:, 2] *= np.where(sign == 0.0, 1.0, sign)
+        return out
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The body with its points shifted."""
+        body = world.body
+        if self.name in body.keypoint_sets:
+            old = body.keypoints(self.name)
+            return replace(world, body=body.with_keypoints(self.name, old.points + self.shifts(values)))
+        old = body.markers(self.name)
+        moved = PointSet(old.names, old.segments, old.points + self.shifts(values))
+        return replace(world, body=replace(body, marker_sets={**body.marker_sets, self.name: moved}))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraExtrinsics:
+    """Six parameters a camera: the twist (v, ω) [m, rad] of its pose, in its own frame.
+
+    Cameras and bodies may move together unseen. So one camera is the gauge, and stays; or none, where other sensors
+    such as markers know where the world is.
+
+    Parameters
+    ----------
+    rig : Rig, the prior mean.
+    held : name of the camera that stays; None where other sensors hold the world.
+    std : (2,) standard deviations of v [m] and ω [rad].
+    """
+
+    rig: Rig
+    held: str | None
+    std: tuple[float, float] = (0.02, 0.01)
+
+    def __post_init__(self) -> None:
+        if self.held is not None:
+            self.rig.index(self.held)
+        if not min(self.std) > 0:
+            raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the cameras that move."""
+        return tuple(name for name in self.rig.names if name != self.held)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(6 C,)."""
+        return tuple(f"{camera} {axis}" for camera in self.free for axis in ("tx", "ty", "tz", "rx", "ry", "rz"))
+
+    @property
+    def mean(self) -> NDArray:
+        """(6 C,) zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(6 C, 6 C)."""
+        return np.diag(np.tile(np.repeat(self.std, 3), len(self.free)) ** -2.0)
+
+    @property
+    def step(self) -> NDArray:
+        """(6 C,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The rig with its cameras moved."""
+        twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
+        cameras = tuple(_moved(c, twist[c.name]) if c.name in twist else c for c in world.rig)
+        return replace(world, rig=Rig(cameras))
+
+
+def _moved(camera: Camera, twist: NDArray) -> Camera:
+    return camera.with_pose(se3.exp(twist) @ camera.T_camera_world)
+
+
+@dataclass(frozen=True, eq=False)
+class OwnUnknowns:
+    """What sensors do not know of themselves: a rope's length, a clock's delay; `Sensor.unknowns`.
+
+    Parameters
+    ----------
+    unknowns : {sensor: {name: Unknown}}
+    """
+
+    unknowns: Mapping[str, Mapping[str, Unknown]]
+
+    def __post_init__(self) -> None:
+        for sensor, own in self.unknowns.items():
+            for name, unknown in own.items():
+                if not (np.isfinite(unknown.mean) and 0.0 < unknown.std < np.inf):
+                    problem = f"sensor '{sensor}' knows '{name}' as {unknown.mean} ± {unknown.std}"
+                    raise ObservationError(problem, remedy="Give a mean, and a standard deviation above 0.")
+
+    @classmethod
+    def of(cls, sensors: Iterable[Sensor]) -> OwnUnknowns:
+        """Of all sensors that have some."""
+        return cls({s.name: dict(s.unknowns) for s in sensors if s.unknowns})
+
+    @property
+    def _each(self) -> list[tuple[str, str, Unknown]]:
+        return [(sensor, name, u) for sensor, own in self.unknowns.items() for name, u in own.items()]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,)."""
+        return tuple(f"{sensor} {name}" for sensor, name, _ in self._each)
+
+    @property
+    def mean(self) -> NDArray:
+        """(p,)."""
+        return np.array([u.mean for _, _, u in self._each])
+
+    @property
+    def information(self) -> NDArray:
+        """(p, p)."""
+        return np.diag([u.std**-2 for _, _, u in self._each])
+
+    @property
+    def step(self) -> NDArray:
+        """(p,) a thousandth of each standard deviation."""
+        return np.array([1e-3 * u.std for _, _, u in self._each])
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The world with these values."""
+        out = {sensor: dict(own) for sensor, own in world.values.items()}
+        for (sensor, name, _), value in zip(self._each, values, strict=True):
+            out.setdefault(sensor, {})[name] = float(value)
+        return replace(world, values=out)
+
+
+def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray, NDArray, NDArray]:
+    """Names, mean (p,), information (p, p) and steps (p,) of several kinds together.
+
+    Raises
+    ------
+    ObservationError
+        No parameters, or two of one name.
+    """
+    names = tuple(name for one in parameters for name in one.names)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if not names or twice:
+        problem = f"two parameters named '{twice[0]}'" if twice else "no parameters to fit"
+        raise ObservationError(problem, remedy="Give every kind of parameter once, such as SegmentScales(body).")
+    information, first = np.zeros((len(names), len(names))), 0
+    for one in parameters:
+        own = slice(first, first := first + len(one.names))
+        information[own, own] = one.information
+    return names, np.concatenate([p.mean for p in parameters]), information, np.concatenate([p.step for p in parameters])

@@ -1,0 +1,145 @@
+"""Parameters of a body's surface: girths of its cylinders, or the shape of an Anny body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.anny import AnnyFamily, AnnyModel
+from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.errors import BodyError
+from kinefit.subject.parameters import World
+
+GIRTH, OFFSET = 0.2, 0.015
+"""Standard deviations between people: of the logarithm of a half axis (ANSUR II: girths by 10 %; a body of cylinders
+differs from a person's by as much again), and of where a surface lies about its bone [m]."""
+
+_KINDS = ("start a", "start b", "end a", "end b", "start offset", "end offset")
+_STEP = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderShape:
+    """Half axes (logarithms) and forward offsets [m] of tapered cylinders; left and right alike.
+
+    Parameters
+    ----------
+    body : Body with cylinders.
+    girth, offset : standard deviation of the logarithm of a half axis, and of an offset [m].
+
+    Raises
+    ------
+    BodyError
+        A body without cylinders.
+    """
+
+    body: Body
+    girth: float = GIRTH
+    offset: float = OFFSET
+
+    def __post_init__(self) -> None:
+        if not any(isinstance(s, TaperedCylinder) for s in self.body.surfaces):
+            raise BodyError(f"body '{self.body.name}' has no cylinders", remedy="Give its segments a `surface`.")
+
+    @cached_property
+    def _groups(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Names of what left and right share, and the group of each surface (-1 for a mesh)."""
+        names: dict[str, int] = {}
+        count = [0] * len(self.body.tree.segments)
+        of = []
+        for s in self.body.surfaces:
+            own = self.body.tree.segments[s.segment].removesuffix("_r").removesuffix("_l")
+            key = f"{own} {count[s.segment]}".removesuffix(" 0")
+            count[s.segment] += 1
+            of.append(names.setdefault(key, len(names)) if isinstance(s, TaperedCylinder) else -1)
+        return tuple(names), tuple(of)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(6 C,)."""
+        return tuple(f"{name} {kind}" for name in self._groups[0] for kind in _KINDS)
+
+    @property
+    def mean(self) -> NDArray:
+        """(6 C,) zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(6 C, 6 C)."""
+        return np.diag(np.tile([self.girth] * 4 + [self.offset] * 2, len(self._groups[0])) ** -2.0)
+
+    @property
+    def step(self) -> NDArray:
+        """(6 C,) of logarithms, and a tenth of that in metres."""
+        return np.tile([_STEP] * 4 + [0.1 * _STEP] * 2, len(self._groups[0]))
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The body with these cylinders."""
+        sizes = np.asarray(values, float).reshape(-1, 6)
+        surfaces = tuple(
+            _shaped(s, sizes[g]) if isinstance(s, TaperedCylinder) else s
+            for s, g in zip(world.body.surfaces, self._groups[1], strict=True)
+        )
+        return replace(world, body=replace(world.body, surfaces=surfaces))
+
+
+def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
+    (a0, b0), (a1, b1) = (np.exp(size[:4].reshape(2, 2)) * surface.radii).tolist()
+    a = surface.axes[0]
+    start, end = (np.add(at, shift * a) for at, shift in zip((surface.start, surface.end), size[4:]))
+    return replace(
+        surface, start=tuple(start.tolist()), end=tuple(end.tolist()), radii=((a0, b0), (a1, b1)),
+        side=tuple(a.tolist()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class AnnyShape:
+    """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a usual shape.
+
+    It makes the body anew, so it goes before all other parameters; lengths beside the shape's are `SegmentScales` after
+    it, and the body that is fitted is one of the model's.
+
+    Parameters
+    ----------
+    model : AnnyModel
+    usual : (6,) shape parameters at zero.
+    std : standard deviation of each: about a quarter of its range.
+    """
+
+    model: AnnyModel
+    usual: NDArray
+    std: float = 0.25
+
+    @cached_property
+    def _family(self) -> AnnyFamily:
+        return AnnyFamily(self.model, np.asarray(self.usual, float), lengths=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(5,)."""
+        return self._family.names
+
+    @property
+    def mean(self) -> NDArray:
+        """(5,) zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(5, 5)."""
+        return np.eye(len(self.names)) / self.std**2
+
+    @property
+    def step(self) -> NDArray:
+        """(5,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The world with a body of this shape."""
+        return replace(world, body=self._family.at(values))
