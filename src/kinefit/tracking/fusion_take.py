@@ -12,6 +12,7 @@ from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.marker_sets import bare, known_set, matched
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
+from kinefit.identification.take.named import with_names
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
 from kinefit.motion import UP_AXES, Motion
@@ -36,7 +37,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress, fit_subject
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
-from kinefit.tracking.silhouette_take import shaped_by_silhouettes, silhouettes_of
+from kinefit.tracking.silhouette_take import shaped_by_silhouettes
 
 _SIZES = 4  # depth images from which a person's size is found ...
 _FIRST = 5.0  # [s] ... spread over so much of the beginning
@@ -66,6 +67,7 @@ def fuse_take(
             "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
             remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
+    seen = with_names(take, seen, progress=progress)
     source = FrameSource(take, seen)
     up = np.array(UP_AXES[take.up])
     found = Sized(load_body(take.body)) if take.start is None else _started(take)
@@ -138,7 +140,7 @@ class FrameSource:
         if not cameras:
             raise TakeError("no camera of the take is calibrated", file=take.path, remedy="Add [calibration].")
         self.rig = Rig(cameras)
-        self.silhouettes: tuple[SilhouetteVideo, ...] = silhouettes_of(take, seen)
+        self.silhouettes: tuple[SilhouetteVideo, ...] = seen.silhouettes
         self._offsets = [entry.time_offset for entry in take.markers]
         self.people: list[NDArray] = []
         if seen.keypoints:
