@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kinefit.tracking.fusion import FusionTracker
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure
@@ -26,7 +27,6 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
 from kinefit.subject.silhouettes import fit_silhouettes
-from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.take import track_take
 
 STEPS, POSES = 100, 6

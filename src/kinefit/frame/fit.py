@@ -13,7 +13,7 @@ from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, 
 from kinefit.frame.prediction import belief
 from kinefit.frame.results import FrameResult, judged
 from kinefit.rows import AnyRows, ParameterRows
-from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
+from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
@@ -84,7 +84,7 @@ class FrameFit:
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
     ) -> list[AnyRows]:
         """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart."""
-        parts = [rows for m in matched for rows in check_rows(m.rows(scene), m.sensor, self.body)]
+        parts = [rows for m in matched for rows in rows_at(m, scene)]
         if held is not None:
             parts.append(belief(scene.state, *held))
         usual = self.body.tree.usual

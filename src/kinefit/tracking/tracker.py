@@ -64,6 +64,7 @@ class Tracker:
         self.dropped = self.late = 0
         self._last: FrameResult | None = None
         self._time: float | None = None
+        self._direction = 1.0  # of time
         self._wear(body)
 
     def _wear(self, body: Body) -> None:
@@ -119,7 +120,7 @@ class Tracker:
             self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings,
             values=self.values,
         )  # fmt: skip
-        out.sensors = self.sensors.anew()
+        out.sensors, out._direction = self.sensors.anew(), -1.0
         out.start_at(state)
         return out
 
@@ -201,19 +202,20 @@ class Tracker:
         return self._fit.apart(scene)
 
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
-        scene = self._scene.at(state, time=time, velocity=self._prediction.velocity * self.rate)
+        scene = self._scene.at(state, time=time, velocity=self._direction * self.rate * self._prediction.velocity)
         measurements = self.sensors.measurements(frames, scene)
         return scene.at(state, measurements=tuple(measurements)), measurements
 
     def _steps(self, time: float) -> float | None:
         """Frames since the last update, which is remembered; None for one that came too late."""
         s, before = self.settings, self._time
-        steps = 1.0 if before is None else (time - before) * self.rate
-        if before is not None and -s.pause < time - before <= 0.0:
+        gone = 0.0 if before is None else self._direction * (time - before)  # [s]
+        steps = 1.0 if before is None else gone * self.rate
+        if before is not None and -s.pause < gone <= 0.0:
             self.late += 1
             return None
         self._time = time
-        if before is not None and abs(time - before) > s.pause:
+        if before is not None and abs(gone) > s.pause:
             self._recovery.forget()
             if self._prediction.state is not None:
                 self._prediction.start(self._prediction.state)
