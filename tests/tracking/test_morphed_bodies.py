@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
-from tests.sensors.test_silhouette import at, ring
+from kinefit.tracking.fused_fit import FusedFit
+from kinefit.tracking.fusion import FusionTracker
+from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import Morphing
@@ -15,8 +17,6 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fused_fit import FusedFit
-from kinefit.tracking.fusion import FusionTracker
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
 
