@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
-from kinefit.tracking.fused_fit import FusedFit
-from kinefit.tracking.fusion import FusionTracker
 from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
@@ -17,6 +15,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
 from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.fused_fit import FusedFit
+from kinefit.tracking.fusion import FusionTracker
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
 
