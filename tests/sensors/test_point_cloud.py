@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.oracle import central_differences, design
+from tests.sensors.scenes import at, ring
 from tests.sensors.test_depth_image import SETTINGS, TRUTH, apart, found, moving, scene
-from tests.sensors.test_silhouette import at, ring
 from tests.tracking.fusion_oracle import BODY, cloud_frame, turned
 
 from kinefit.bodies import load_body
@@ -66,9 +66,9 @@ def test_evidence_and_residuals():
     match = measured(cloud_frame(0, "forearm_l")).match(there, 0.1)
     assert np.flatnonzero(~match.evidence(there).hidden).tolist() == [arm]
     assert match.evidence(there.at(turned(TRUTH, arm_add_l=-60))).lost[arm]
-    summary = match.summary(there)
+    summary = match.leftovers(there)[0]
     assert np.flatnonzero(summary.count).tolist() == [arm] and summary.rms[arm] < 0.003
-    assert abs(summary.median[arm]) < 0.002 and np.isnan(summary.median[0])
+    assert abs(summary.values[:, 0][arm]) < 0.002 and np.isnan(summary.values[:, 0][0])
     whole = measured(cloud_frame(0))
     told = whole.match(there, 0.1).evidence(there)
     assert told.agreeing.max() <= 1.0 and (told.contrary == 0).all() and (~told.hidden).sum() > 5

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.oracle import central_differences, design
+from tests.sensors.scenes import posture, ring
 from tests.sensors.test_depth_image import apart, softened
-from tests.sensors.test_silhouette import posture, ring
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import Morphing
@@ -73,9 +73,9 @@ def test_on_a_wider_body_the_same_points_lie_further_out():
     wide = replace(
         BODY, surfaces=tuple(replace(s, radii=tuple((a + 0.02, b + 0.02) for a, b in s.radii)) for s in BODY.surfaces)
     )
-    told, same = match.summary(Scene(wide, TRUTH, RIG)), match.summary(SCENE)
+    told, same = match.leftovers(Scene(wide, TRUTH, RIG))[0], match.leftovers(SCENE)[0]
     many = same.count > 15
-    shift = (told.median - same.median)[many] / (measurement.pixels_per_metre / measurement.of.scale)
+    shift = (told.values - same.values)[:, 0][many] / (measurement.pixels_per_metre / measurement.of.scale)
     assert many.sum() > 5 and np.median(shift) == pytest.approx(-0.02, abs=0.004)
     np.testing.assert_array_equal(told.count, same.count)
     assert len(match.rows(Scene(wide, TRUTH, RIG))[0]) == len(match.rows(SCENE)[0])
@@ -100,10 +100,10 @@ def test_evidence_and_residuals_by_segments():
     match, arm = measurement.match(SCENE, 0.05), BODY.tree.segment("forearm_r")
     told = match.evidence(SCENE)
     assert told.agreeing.sum() > 20 * told.contrary.sum() and match.evidence(gone).contrary[arm] > told.contrary[arm]
-    summary = match.summary(SCENE)
+    summary = match.leftovers(SCENE)[0]
     many = summary.count > 15
     assert summary.count.sum() == len(match.rim) and many.sum() > 5
-    assert np.abs(summary.median[many]).max() < 1.0 and summary.rms[many].max() < 2.0
+    assert np.abs(summary.values[:, 0][many]).max() < 1.0 and summary.rms[many].max() < 2.0
 
 
 def test_its_image_is_made_smaller_and_only_that_is_kept():
@@ -122,7 +122,7 @@ def test_an_empty_mask_says_nothing_for_and_one_of_another_size_is_refused():
     assert of.name == "silhouette c0"
     empty = of.prepare(SilhouetteFrame("c0", 0.0, np.zeros((240, 320), np.uint8)), SCENE).match(SCENE, 0.1)
     assert len(empty.rows(SCENE)[0]) == 0 and empty.evidence(SCENE).agreeing.sum() == 0.0
-    assert empty.evidence(SCENE).lost.sum() > 10 and (empty.summary(SCENE).count == 0).all()
+    assert empty.evidence(SCENE).lost.sum() > 10 and (empty.leftovers(SCENE)[0].count == 0).all()
     with pytest.raises(ObservationError, match="c0 are"):
         of.prepare(SilhouetteFrame("c0", 0.0, np.zeros((10, 10), np.uint8)), SCENE)
 
