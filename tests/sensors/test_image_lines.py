@@ -5,11 +5,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from kinefit.bodies import BodyState, parse_body
+from kinefit.bodies import BodyState, load_body, parse_body
 from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.observations import LineFrame
+from kinefit.rows import DofRows
 from kinefit.sensors.image_lines import ImageLineSensor, image_lines
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import normal_equations
@@ -134,3 +135,30 @@ def test_what_cannot_be_is_told():
     ):
         with pytest.raises(ObservationError, match=said):
             LineFrame("cam", 0.0, names, landmarks, points)
+
+
+def test_on_a_body_whose_joints_move():
+    """A shoulder that follows the arm: derivatives of the morphed body, and what lines say of segments."""
+    body = load_body("humanoid_morphing")
+    angles = np.array(body.tree.usual)
+    angles[body.tree.coordinates.index("arm_add_r")] += 0.8
+    state = BodyState(np.eye(4), angles).retract(np.append([0.0, 0.0, 3.0], np.zeros(body.tree.n_dofs - 3)))
+    scene = Scene(body, state, rig())
+    own = ("r_humeral_lateral_epicondyle", "r_radial_styloid")
+    uv = rig().cameras[0].project(np.array([scene.position(n) for n in own]))
+    frame = LineFrame("cam", 0.0, ("forearm",), (own,), uv[None] + np.array([0.0, 1.0]))
+    match = matched(frame, scene)
+    (rows,) = match.rows(scene)
+    assert isinstance(rows, DofRows) and list(rows.group) == [0, 0]
+    step = 1e-6
+
+    def off(delta):
+        (rows,) = match.rows(scene.at(state.retract(delta)))
+        return np.sqrt(rows.weight) * rows.residual
+
+    n = body.tree.n_dofs
+    numeric = np.stack([(off(step * e) - off(-step * e)) / (2 * step) for e in np.eye(n)], axis=1)
+    analytic = -np.sqrt(rows.weight)[:, None] * rows.jacobian
+    np.testing.assert_allclose(numeric, analytic, atol=1e-4 * np.abs(analytic).max())
+    evidence, arm = match.evidence(scene), body.landmarks.segments[[body.landmarks.index(n) for n in own]]
+    assert np.all(evidence.agreeing[arm] > 0) and not evidence.contrary.any()

@@ -13,8 +13,9 @@ from kinefit.correspondences import _kernels
 from kinefit.geometry.camera import Camera
 from kinefit.losses import Loss
 from kinefit.observations import LineFrame
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, Sensor
+from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
 
@@ -101,6 +102,18 @@ class ImageLineMatched(Matched):
         index = np.full(len(points), k, np.int64)
         rows = scene.rows_of(_kernels.image_line_rows, 1, points, scene.rig.packed, index, lines, weight)
         return [replace(rows, group=np.ascontiguousarray(m.line[rows.group]), loss=self.loss)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """A line speaks for the segments of its landmarks within three standard deviations, and against them beyond."""
+        out, m = np.zeros((2, len(scene.body.tree.segments))), self.measurement
+        (rows,) = self.rows(scene)
+        assert isinstance(rows, Rows | DofRows)
+        segments = m.points_of(scene.body).segments
+        for line in np.unique(rows.group):
+            mine = rows.group == line
+            far = int(float(np.sum(rows.weight[mine] * rows.residual[mine] ** 2)) >= AGREES**2)
+            out[far, np.unique(segments[m.line == line])] += SHOWN
+        return Evidence(*out)
 
 
 def image_lines(camera: Camera, ends: NDArray, x_world: NDArray) -> NDArray:
