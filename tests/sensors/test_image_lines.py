@@ -122,6 +122,23 @@ def test_a_wrong_line_does_not_pull_and_speaks_against_the_crate():
     assert costs[0] > costs[1]  # a wider correspondence distance lets a wrong line count for more
 
 
+def test_what_the_fit_leaves_over_is_the_way_to_the_line():
+    scene, frame = Scene(CRATE, TRUTH, rig()), seen()
+    ends = np.array(frame.ends)
+    across = np.array([[0.0, -1.0], [1.0, 0.0]]) @ (ends[0, 1] - ends[0, 0])
+    ends[0] += 6.0 * across / np.linalg.norm(across)
+    moved = LineFrame("cam", 0.0, frame.names, frame.landmarks, ends)
+    match = matched(moved, scene, geman_mcclure(3.0))
+    (left,) = match.leftovers(scene)
+    assert (left.label, left.unit, left.names[:2]) == ("lines cam", "px", ("ab: a", "ab: b")) and len(left.names) == 24
+    np.testing.assert_allclose(np.linalg.norm(left.values, axis=1), [6.0] * 2 + [0.0] * 22, atol=1e-6)
+    np.testing.assert_allclose(left.values[0], 6.0 * across / np.linalg.norm(across), atol=1e-6)
+    np.testing.assert_allclose(match.squares(scene), [2 * (6.0 / 1.5) ** 2] + [0.0] * 11, atol=1e-8)
+    (rows,) = match.rows(scene)
+    np.testing.assert_allclose(np.bincount(rows.group, rows.weight * rows.residual**2), match.squares(scene), atol=1e-8)
+    assert left.weights[0] < 0.2 and left.weights[2:].min() > 0.99
+
+
 def test_what_cannot_be_is_told():
     scene = Scene(CRATE, TRUTH, rig())
     ends = np.array([[[0.0, 0.0], [9.0, 9.0]]])
