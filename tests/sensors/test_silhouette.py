@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from kinefit.tracking.fusion import FusionTracker
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
@@ -17,7 +18,6 @@ from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
-from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.take import track_take
 
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.multiview.observability import SHORTEST, levers, near
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.left_right import find_swaps, limb_groups
-from kinefit.sensors.results import BLIND, FrameResult, judged
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged

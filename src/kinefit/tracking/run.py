@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
+from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
-from kinefit.sensors.results import FrameResult
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.recording import Recording

@@ -13,18 +13,18 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.frame.fit import Fitted, FrameFit
+from kinefit.frame.prediction import Prediction
+from kinefit.frame.results import FrameResult
+from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
-from kinefit.sensors.results import FrameResult
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fit import Fitted, FrameFit
-from kinefit.tracking.prediction import Prediction
 from kinefit.tracking.recovery import Recovery
-from kinefit.tracking.routing import Sensors, time_of
 
 __all__ = ["FrameResult", "TrackSettings", "Tracker"]
 

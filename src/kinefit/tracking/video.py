@@ -9,9 +9,9 @@ import numpy as np
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
+from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover
-from kinefit.sensors.results import FrameResult
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.sensor_noise import other_noise
@@ -95,7 +95,7 @@ def _motion(
     if any(tracked.measurements):
         others = OtherSensors(
             times, tuple(tracked.measurements), tracker.scene_of, tracker.apart, settings.near,
-            {name: 1.0 for name in {m.sensor for several in tracked.measurements for m in several}},
+            dict.fromkeys({m.sensor for several in tracked.measurements for m in several}, 1.0),
         )  # fmt: skip
     matched = None
     if smooth:

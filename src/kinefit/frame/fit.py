@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.frame.prediction import belief
+from kinefit.frame.results import FrameResult, judged
 from kinefit.rows import AnyRows, ParameterRows
 from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
-from kinefit.sensors.results import FrameResult, judged
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
-from kinefit.tracking.prediction import belief
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
