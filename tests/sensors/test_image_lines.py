@@ -15,6 +15,7 @@ from kinefit.sensors.image_lines import ImageLineSensor, image_lines
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton
+from kinefit.tracking.tracker import Tracker
 
 CORNERS = dict(zip("abcdefgh", product((0.0, 0.6), (0.0, 0.4), (0.0, 0.3))))
 EDGES = {m + n: (m, n) for m in CORNERS for n in CORNERS if m < n and np.sum(np.array(CORNERS[m]) != CORNERS[n]) == 1}
@@ -137,6 +138,17 @@ def test_what_the_fit_leaves_over_is_the_way_to_the_line():
     (rows,) = match.rows(scene)
     np.testing.assert_allclose(np.bincount(rows.group, rows.weight * rows.residual**2), match.squares(scene), atol=1e-8)
     assert left.weights[0] < 0.2 and left.weights[2:].min() > 0.99
+
+
+def test_the_tracker_follows_a_crate_by_its_edges():
+    tracker = Tracker(CRATE, rig(), rate=30.0, accuracy={"lines cam": 1.0})
+    tracker.start_at(TRUTH)
+    state = TRUTH
+    for k in range(15):
+        state = state.retract(np.array([0.004, 0.002, 0.005, 0.0, 0.01, 0.005]))
+        frame = seen(state, noise=0.3)
+        result = tracker.update([LineFrame("cam", k / 30.0, frame.names, frame.landmarks, frame.ends)], k / 30.0)
+    np.testing.assert_allclose(result.state.T_world_root, state.T_world_root, atol=0.01)
 
 
 def test_what_cannot_be_is_told():
