@@ -10,19 +10,10 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import (
-    DepthFrame,
-    Frame,
-    KeypointFrame,
-    LineFrame,
-    MarkerFrame,
-    PointCloud,
-    SilhouetteFrame,
-)
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.sensors.background import Background
 from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.depth_image import DepthImageSensor
-from kinefit.sensors.image_lines import ImageLineSensor
 from kinefit.sensors.keypoints import NAME as KEYPOINTS
 from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.markers import MarkerSensor
@@ -40,8 +31,7 @@ class Sensors:
     rig : Rig
     rate : float [Hz] of the frames
     sigma : {sensor: standard deviation}
-        [m] of depth, clouds and markers, [px] of keypoints, and of "silhouette CAMERA" and
-        "lines CAMERA".
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
     settings : TrackSettings
     own : sensors of one's own
     on_body : depth cameras whose images show nothing but the body: no background is learnt
@@ -69,7 +59,7 @@ class Sensors:
         self._backgrounds: dict[str, Background | None] = dict.fromkeys(on_body)
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
-            PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
+            PointCloud: self._cloud, SilhouetteFrame: self._silhouette,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -132,8 +122,7 @@ class Sensors:
         return out
 
     def _of_frame(self, frame: Frame) -> Sensor:
-        kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
-        name = f"{kind}{frame.sensor}"
+        name = f"silhouette {frame.sensor}" if isinstance(frame, SilhouetteFrame) else frame.sensor
         if name not in self._sensors:
             self._sensors[name] = self._makers[type(frame)](frame.sensor)
         return self._sensors[name]
@@ -156,10 +145,6 @@ class Sensors:
     def _silhouette(self, name: str) -> SilhouetteSensor:
         sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)
         return SilhouetteSensor(self.rig[name], sigma, self.settings)
-
-    def _lines(self, name: str) -> ImageLineSensor:
-        s = self.settings
-        return ImageLineSensor(f"lines {name}", self.sigma.get(f"lines {name}", s.pixel), s.loss, s.near)
 
 
 def _check_measurement(m: Any) -> None:
