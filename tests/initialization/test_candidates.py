@@ -10,11 +10,21 @@ from hypothesis.extra.numpy import arrays
 from tests.tracking.movements import BODY, a_motion, a_rig, cloud_frame, keypoint_frame, marker_frame, off, turned
 
 from kinefit.errors import CalibrationError
-from kinefit.initialization.candidates import GAIN, LEAP, dofs_of_limbs, find_limbs, find_starts
+from kinefit.initialization.candidates import (
+    GAIN,
+    LEAP,
+    dofs_of_limbs,
+    find_limbs,
+    starts_from_points,
+    starts_from_views,
+)
 from kinefit.initialization.depth_search import Search
+from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, PointCloud
 from kinefit.rendering import render_body
 from kinefit.sensors.depth_view import camera_at, view_of
+from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.scene import Scene
 
 UP = np.array([0.0, 1.0, 0.0])
 TRUTH = a_motion().state(0)
@@ -23,7 +33,10 @@ FEW = ("neck", "r_wrist", "l_ankle", "r_hip", "l_hip")
 
 
 def starts(*frames, count=3):
-    return find_starts(BODY, a_rig(), frames, UP, count)
+    scene = Scene(BODY, BODY.usual_state(np.eye(4)), a_rig())
+    detectors = KeypointSensor(a_rig(), {}, 4.0, geman_mcclure(), 0.03)
+    found = starts_from_points(BODY, frames, (), scene, detectors)
+    return found or starts_from_views(BODY, a_rig(), frames, UP, scene, detectors, count)
 
 
 def test_markers_tell_by_themselves():

@@ -102,5 +102,7 @@ def turned(state, **degrees):
 
 
 def is_finite(result):
-    numbers = result.state.T_world_root, result.state.angles, result.dof_std, result.joint_std, result.segment_quality
-    return all(np.isfinite(v).all() for v in numbers)
+    """No state is unknown; standard deviations are numbers, infinite where only the prior speaks."""
+    numbers = result.state.T_world_root, result.state.angles, result.segment_quality
+    deviations = result.dof_std, result.joint_std
+    return all(np.isfinite(v).all() for v in numbers) and not any(np.isnan(v).any() for v in deviations)

@@ -20,6 +20,7 @@ from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
+_TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
 
 Held = tuple[BodyState, NDArray]
@@ -100,9 +101,13 @@ class FrameFit:
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
     def _judged(self, scene: Scene, H: NDArray, matched: Sequence[Matched], iterations: int) -> Fitted:
-        alone = np.array(H)
-        alone[self._prior, self._prior] -= self._prior_weight * (1.0 - 1e-6)
-        return Fitted(judged(scene, inverse(H), matched, iterations), inverse(alone))
+        posterior, alone = inverse(H), np.array(H)
+        alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
+        try:
+            filtered = inverse(alone)
+        except np.linalg.LinAlgError:  # measurements so large that nothing else counts
+            filtered = posterior
+        return Fitted(judged(scene, posterior, matched, iterations), filtered)
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

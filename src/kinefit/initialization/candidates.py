@@ -71,15 +71,6 @@ def starts_from_views(
     return [start.state for start in starts]
 
 
-def find_starts(
-    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, keypoints: KeypointSensor, count: int = 3
-) -> list[BodyState]:
-    """States to begin with, the most trusted first; none where nothing of a person's size is seen."""
-    scene = Scene(body, body.usual_state(np.eye(4)), rig)
-    found = starts_from_points(body, frames, (), scene, keypoints)
-    return found or starts_from_views(body, rig, frames, up, scene, keypoints, count)
-
-
 def known_points(
     frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
 ) -> tuple[PointSet, NDArray]:

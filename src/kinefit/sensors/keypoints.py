@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
-from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.losses import Loss
 from kinefit.observations import KeypointFrame, Keypoints
@@ -61,6 +60,8 @@ class Layout:
 
     @staticmethod
     def _of(channels: Channels) -> PointSet:
+        if not len(channels.column):
+            return channels.points
         names = tuple(channels.points.names[c] for c in channels.column)
         owner, place = channels.points.segments, channels.points.points
         return PointSet(names, owner[channels.column], place[channels.column])
@@ -99,10 +100,6 @@ class KeypointSensor(Sensor):
         time = float(np.mean([f.time for f in frames]))
         return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
 
-    def of_channels(self, channels: Channels, body: Body) -> Layout:
-        """The layout of a recording's channels, for `KeypointMeasurement`."""
-        return Layout(channels, body)
-
     def _layout(self, body: Body, frames: Sequence[KeypointFrame]) -> tuple[Layout, list[list[int]]]:
         key = (id(body), *((f.sensor, f.keypoint_set, f.names) for f in frames))
         if key not in self._layouts:
@@ -115,13 +112,12 @@ class KeypointSensor(Sensor):
                 records.append(
                     Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, np.zeros((*shape, 2)), np.zeros(shape))
                 )
-            sigma = [self.sigma.get(f.sensor, self.usual) for f in frames]
-            used = [r for r, c in zip(records, columns) if c]
-            if not used:
-                problem = f"body '{body.name}' has none of the points that {frames[0].sensor} names"
-                raise ObservationError(problem, remedy="Name its keypoint set, or its landmarks.")
-            people = [np.zeros(1, np.int64)] * len(records)
-            channels = make_channels(body, self.rig, records, people, sigma)
+            used = [k for k, c in enumerate(columns) if c]
+            people = [np.zeros(1, np.int64)] * len(used)
+            sigma = [self.sigma.get(frames[k].sensor, self.usual) for k in used]
+            channels = Channels.none(self.rig, 1)
+            if used:
+                channels = make_channels(body, self.rig, [records[k] for k in used], people, sigma)
             if len(self._layouts) > 16:
                 self._layouts.clear()
             self._layouts[key] = Layout(channels, body), columns

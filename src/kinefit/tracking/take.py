@@ -37,7 +37,7 @@ def track_take(
     take = take if isinstance(take, Take) else read_take(take)
     seen = with_names(take, load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines
+    alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines or take.skin
     if take.silhouettes and not alone:
         raise TakeError(
             "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",

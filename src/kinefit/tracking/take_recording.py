@@ -73,7 +73,7 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
     marked, body = _markers(take, seen, body)
     first, rate = seen.frames[0], seen.rate
     times = np.arange(*seen.frames) / rate
-    videos = (*stereo, *seen.videos_of_frames)
+    videos = (*stereo, *seen.recordings)
 
     def steps(i: int) -> Sequence[Any]:
         out: list[Any] = []
@@ -91,16 +91,11 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
         name=take.name,
     )  # fmt: skip
     if seen.keypoints:
-        pixels = Recording.of_keypoints(rig, seen.keypoints, accuracy=[entry.sigma for entry in pixel_entries(take)])
+        pixels = Recording.of_keypoints(rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints])
         recording = replace(
             recording, keypoints=pixels.keypoints, people=pixels.people, keypoint_sigma=pixels.keypoint_sigma
         )
     return recording, body
-
-
-def pixel_entries(take: Take) -> list[Any]:
-    """The `[[keypoints]]` that detectors wrote; those by the colour of the skin are followed as they are asked for."""
-    return [entry for entry in take.keypoints if entry.format != "skin"]
 
 
 def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
@@ -109,7 +104,7 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
     out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
-    out |= {entry.camera: entry.sigma for entry in take.keypoints}
+    out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
 
 
