@@ -19,15 +19,19 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows
-from kinefit.solvers import _kernels_linear
+from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.equations import lock
 from kinefit.solvers.whitened import Pose, columns, residuals, softening
 
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
 
-_FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
+_FIRST = 1e-5  # damping to begin with, as a share of the poses' mean diagonal
+_STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
+_NEAR = 3e-3  # [m, rad] of moves within which derivatives by parameters stay as they are
+_LEAST = 100.0  # [1/m², 1/rad²] damping of poses when they move with parameters
+_SETTLE, _SETTLED = 6, 1e-3  # steps of a pose by itself, and the fall of its cost at which it rests
 _FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
 
 Part = tuple[str, AnyRows]
@@ -85,16 +89,40 @@ class Bordered:
 
 
 @dataclass(frozen=True, eq=False)
+class _Frame:
+    """One frame's rows and the equations of its pose."""
+
+    parts: Sequence[Part]
+    factor: NDArray  # (N,) √ of shares and robust factors
+    J: NDArray  # (N, n) whitened and softened, by the pose
+    left: NDArray  # (N,) residuals, likewise
+    H: NDArray  # (n, n)
+    g: NDArray  # (n,)
+    held: NDArray  # (n,) bool, at a limit or fixed: does not move
+    cost: float
+
+    @property
+    def felt(self) -> NDArray:
+        """(N,) bool, rows with a weight: a slack rope's row must not feel its length."""
+        felt = [np.ones(len(r), bool) if r.weight.ndim == 2 else r.weight > 0.0 for _, r in self.parts]
+        return np.concatenate(felt) if felt else np.empty(0, bool)
+
+    def step(self, damping: float) -> tuple[NDArray, float]:
+        """δ (n,) of the pose alone, and the predicted fall of the cost."""
+        move = _solved(self.H, self.g[:, None], self.held, damping)[:, 0]
+        return move, float(self.g @ move) + damping * float(move @ move)
+
+
+@dataclass(frozen=True, eq=False)
 class _Block:
     """One frame's part of the arrow."""
 
-    H: NDArray  # (n, n)
+    frame: _Frame
+    by_theta: NDArray  # (N, p) whitened, as it was found
+    felt: NDArray  # (N,) bool
     B: NDArray  # (n, p)
     S: NDArray  # (p, p)
-    g: NDArray  # (n,)
     b: NDArray  # (p,)
-    held: NDArray  # (n,) bool, at a limit or fixed: does not move
-    fixed: NDArray  # (n,) bool, known
 
 
 def solve(
@@ -108,7 +136,7 @@ def solve(
     loss: Loss = SQUARED,
     posture: float = POSTURE,
     max_iterations: int = 20,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-5,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
 
@@ -131,29 +159,35 @@ def solve(
         A sensor whose rows differ in number between two worlds; rows that the body cannot take.
     """
     task = _Task(problem, prior, np.asarray(steps, float), dict(shares or {}), loss, posture)
-    theta = np.array(theta, float)
-    tree = problem.body(theta).tree
-    bounds = tree.lower, tree.upper
-    states = tuple(s.retract(np.zeros(tree.n_dofs), bounds) for s in states)
-    cost, blocks = task.cost(theta, states), task.blocks(theta, states)
-    mean = float(np.mean([np.trace(b.H) / len(b.H) for b in blocks])) if blocks else 1.0
-    damping, growth, converged, iteration = _FIRST * mean, 2.0, False, 0
+    theta, bounds = np.array(theta, float), _bounds(problem.body(theta))
+    frames, states = task.settle(theta, [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states])
+    cost, blocks = task.cost(theta, frames), task.blocks(theta, states, frames, None)
+    mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
+    damping, growth, converged, iteration, far = _FIRST * mean, 2.0, False, 0, 0.0
     for iteration in range(1, max_iterations + 1):
         delta, moves, predicted = task.step(theta, blocks, damping)
         if predicted <= tolerance * cost + 1e-300:
             converged = True
             break
         trial = theta + delta
-        moved = tuple(s.retract(m, bounds) for s, m in zip(states, moves, strict=True))
-        new = task.cost(trial, moved)
+        settled, moved = task.settle(trial, [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)])
+        new = task.cost(trial, settled)
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
         if new < cost:
-            theta, states, cost = trial, moved, new
-            blocks = task.blocks(theta, states)
+            far += max(float(np.abs(a.difference(b)).max()) for a, b in zip(states, moved)) + np.abs(delta).max()
+            theta, states, frames, cost = trial, moved, settled, new
+            near = blocks if far <= _NEAR else None
+            far = far if near else 0.0
+            blocks = task.blocks(theta, states, frames, near)
         elif damping > _MOST * mean:
             converged = True
             break
-    return Bordered(theta, states, _information(blocks, len(theta)), prior, cost, iteration, converged)
+    information = _information(blocks, len(theta), lock(problem.body(theta), None))
+    return Bordered(theta, tuple(states), information, prior, cost, iteration, converged)
+
+
+def _bounds(body: Body) -> tuple[NDArray, NDArray]:
+    return body.tree.lower, body.tree.upper
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,109 +201,138 @@ class _Task:
     loss: Loss
     posture: float
 
-    def _pull(self, body: Body) -> NDArray:
-        """(D,) weight of the posture prior: no more than the sensor counts that counts most."""
-        most = max(self.shares.values()) if self.shares else 1.0
-        return np.asarray(most * self.posture / np.square(body.tree.spread))
+    @property
+    def _most(self) -> float:
+        """The largest share of a sensor."""
+        return max(self.shares.values()) if self.shares else 1.0
 
-    def cost(self, theta: NDArray, states: Sequence[BodyState]) -> float:
+    @property
+    def _least(self) -> float:
+        """Damping of poses in steps with θ: angles that hardly anything holds settle by themselves."""
+        return _LEAST * self._most
+
+    def cost(self, theta: NDArray, frames: Sequence[_Frame]) -> float:
         """Of rows, postures and prior."""
-        body, away = self.problem.body(theta), theta - self.prior.mean
-        pull, total = self._pull(body), float(away @ self.prior.information @ away)
-        for f, state in enumerate(states):
-            total += float(pull @ np.square(state.angles - body.tree.usual))
-            for sensor, rows in self.problem.parts(theta, f, state):
-                total += self.shares.get(sensor, 1.0) * softening(rows, self.loss)[1]
-        return total
+        away = theta - self.prior.mean
+        return float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
 
-    def blocks(self, theta: NDArray, states: Sequence[BodyState]) -> list[_Block]:
-        """The frames' parts of the arrow."""
+    def frame(self, theta: NDArray, f: int, state: BodyState) -> _Frame:
+        """Equations of one frame's pose; its posture weighs no more than the sensor that counts most."""
         body = self.problem.body(theta)
-        centre = [self.problem.parts(theta, f, s) for f, s in enumerate(states)]
-        soft = [
-            np.concatenate([np.sqrt(self.shares.get(k, 1.0)) * softening(r, self.loss)[0] for k, r in parts] or [[]])
-            for parts in centre
-        ]
-        by_theta = self._differences(theta, states, centre)
-        pull, locked = self._pull(body), lock(body, None)
+        tree, parts, pose, n = body.tree, self.problem.parts(theta, f, state), Pose.of(body, state), body.tree.n_dofs
+        pull = self._most * self.posture / np.square(tree.spread)
+        away, factors, cost = state.angles - tree.usual, [], 0.0
+        for sensor, rows in parts:
+            share = self.shares.get(sensor, 1.0)
+            soft, own = softening(rows, self.loss)
+            factors.append(np.sqrt(share) * soft)
+            cost += share * own
+        factor = np.concatenate([*factors, np.empty(0)])
+        J = factor[:, None] * np.concatenate([*(columns(r, pose) for _, r in parts), np.empty((0, n))])
+        left = factor * _stacked(parts)
+        H, g, held = _gram(J, J), left @ J, lock(body, None)
+        H[range(6, n), range(6, n)] += pull
+        g[6:] -= pull * away
+        held[6:] |= (state.angles <= tree.lower) & (g[6:] < 0.0)
+        held[6:] |= (state.angles >= tree.upper) & (g[6:] > 0.0)
+        return _Frame(parts, factor, J, left, H, g, held, cost + float(pull @ np.square(away)))
+
+    def settle(self, theta: NDArray, states: Sequence[BodyState]) -> tuple[list[_Frame], list[BodyState]]:
+        """Every frame's pose brought near its own minimum: each has its own angles that hardly anything holds."""
+        bounds, frames, out = _bounds(self.problem.body(theta)), [], []
+        for f, state in enumerate(states):
+            frame = self.frame(theta, f, state)
+            damping, growth = _FIRST * float(np.trace(frame.H)) / len(frame.H) + 1e-12, 2.0
+            for _ in range(_SETTLE):
+                move, predicted = frame.step(damping)
+                if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
+                    break
+                moved = state.retract(move, bounds)
+                new = self.frame(theta, f, moved)
+                damping, growth = _kernels_linear.adapt(damping, growth, frame.cost - new.cost, predicted)
+                if new.cost < frame.cost:
+                    frame, state = new, moved
+            frames.append(frame)
+            out.append(state)
+        return frames, out
+
+    def blocks(
+        self, theta: NDArray, states: Sequence[BodyState], frames: Sequence[_Frame], near: Sequence[_Block] | None
+    ) -> list[_Block]:
+        """The frames' parts of the arrow, with the derivatives by θ of `near` blocks where those will do."""
+        felt = [frame.felt for frame in frames]
+        if near is not None and all(np.array_equal(a.felt, b) for a, b in zip(near, felt, strict=True)):
+            by_theta = [block.by_theta for block in near]
+        else:
+            by_theta = self._differences(theta, states, frames)
         out = []
-        for state, parts, factor, T in zip(states, centre, soft, by_theta, strict=True):
-            pose = Pose.of(body, state)
-            n = body.tree.n_dofs
-            J = factor[:, None] * np.concatenate([columns(r, pose) for _, r in parts] or [np.empty((0, n))])
-            T, left = factor[:, None] * T, factor * _stacked(parts)
-            H, g = J.T @ J, J.T @ left
-            H[range(6, n), range(6, n)] += pull
-            g[6:] -= pull * (state.angles - body.tree.usual)
-            held = locked.copy()
-            held[6:] |= (state.angles <= body.tree.lower) & (g[6:] < 0.0)
-            held[6:] |= (state.angles >= body.tree.upper) & (g[6:] > 0.0)
-            out.append(_Block(H, J.T @ T, T.T @ T, g, T.T @ left, held, locked))
+        for frame, D, some in zip(frames, by_theta, felt, strict=True):
+            T = (frame.factor * some)[:, None] * D
+            out.append(_Block(frame, D, some, _gram(frame.J, T), _gram(T, T), frame.left @ T))
         return out
 
-    def _differences(
-        self, theta: NDArray, states: Sequence[BodyState], centre: Sequence[Sequence[Part]]
-    ) -> list[NDArray]:
+    def _differences(self, theta: NDArray, states: Sequence[BodyState], frames: Sequence[_Frame]) -> list[NDArray]:
         """(N, p) of every frame: how far each row's point moves, whitened, with each parameter."""
-        out = [np.zeros((sum(len(r) for _, r in parts), len(theta))) for parts in centre]
-        counted = [np.concatenate([_counted(r) for _, r in parts] or [np.empty(0, bool)]) for parts in centre]
+        out = [np.zeros((len(frame.left), len(theta))) for frame in frames]
         for k, step in enumerate(self.steps):
             for sign in (-1.0, 1.0):
                 other = theta.copy()
                 other[k] += sign * step
-                for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
+                for f, (state, frame) in enumerate(zip(states, frames, strict=True)):
                     moved = self.problem.parts(other, f, state)
-                    _same(parts, moved)
+                    _same(frame.parts, moved)
                     out[f][:, k] -= sign * _stacked(moved) / (2.0 * step)
-        for rows, some in zip(out, counted, strict=True):
-            rows[~some] = 0.0
         return out
 
     def step(self, theta: NDArray, blocks: Sequence[_Block], damping: float) -> tuple[NDArray, list[NDArray], float]:
         """δθ (p,), each pose's δ (n,), and the predicted fall of the cost."""
         p = len(theta)
-        S = self.prior.information + damping * np.eye(p)
+        S = self.prior.information + _STIFF * damping * np.eye(p)
         pull = self.prior.information @ (self.prior.mean - theta)
         b, kept = pull.copy(), []
         for block in blocks:
-            back = _eliminated(block, block.held, damping)
-            S += block.S - block.B.T @ back[:, :p]
-            b += block.b - block.B.T @ back[:, p]
+            frame = block.frame
+            back = _solved(frame.H, np.column_stack([block.B, frame.g]), frame.held, damping + self._least)
+            both = _gram(block.B, back)
+            S += block.S - both[:, :p]
+            b += block.b - both[:, p]
             kept.append(back)
-        delta = np.linalg.solve(S, b) if p else np.empty(0)
+        delta = np.linalg.solve(S, b)
         moves = [back[:, p] - back[:, :p] @ delta for back in kept]
-        fall = float(delta @ pull) + damping * float(delta @ delta)
+        fall = float(delta @ pull) + _STIFF * damping * float(delta @ delta)
         for block, move in zip(blocks, moves, strict=True):
-            fall += float(block.b @ delta + block.g @ move) + damping * float(move @ move)
+            fall += float(block.b @ delta + block.frame.g @ move) + (damping + self._least) * float(move @ move)
         return delta, moves, fall
 
 
-def _eliminated(block: _Block, held: NDArray, damping: float) -> NDArray:
-    """(n, p + 1) H⁻¹ [B, g] of a pose, zero for what is held."""
-    n = len(block.g)
-    A, right = block.H.copy(), np.column_stack([block.B, block.g])
-    A[range(n), range(n)] += damping + _FLOOR * float(np.trace(block.H)) / n + 1e-12
+def _solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:
+    """(n, m) H⁻¹ right of a pose, zero for what is held."""
+    n = len(H)
+    A, right = H.copy(), np.ascontiguousarray(right).copy()
+    A[range(n), range(n)] += damping + _FLOOR * float(np.trace(H)) / n + 1e-12
     A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
     A[held, held] = 1.0
-    return np.linalg.solve(A, right)
+    return right if _kernels_border.solve(A.copy(), right) else np.linalg.lstsq(A, right)[0]
 
 
-def _information(blocks: Sequence[_Block], p: int) -> NDArray:
+def _gram(A: NDArray, B: NDArray) -> NDArray:
+    """(n, m) Aᵀ B."""
+    out = np.zeros((A.shape[1], B.shape[1]))
+    _kernels_border.gram(np.ascontiguousarray(A), np.ascontiguousarray(B), out)
+    return out
+
+
+def _information(blocks: Sequence[_Block], p: int, known: NDArray) -> NDArray:
     """(p, p) what all frames tell of θ with their poses unknown; limits of joints tell nothing."""
     out = np.zeros((p, p))
     for block in blocks:
-        out += block.S - block.B.T @ _eliminated(block, block.fixed, 0.0)[:, :p]
+        out += block.S - _gram(block.B, _solved(block.frame.H, block.B, known, 0.0))
     return 0.5 * (out + out.T)
 
 
 def _stacked(parts: Sequence[Part]) -> NDArray:
     """(N,) whitened residuals of all rows of a frame."""
     return np.concatenate([residuals(r) for _, r in parts]) if parts else np.empty(0)
-
-
-def _counted(rows: AnyRows) -> NDArray:
-    """(N,) bool, rows with a weight: a slack rope's row must not feel its length."""
-    return np.ones(len(rows), bool) if rows.weight.ndim == 2 else rows.weight > 0.0
 
 
 def _same(parts: Sequence[Part], moved: Sequence[Part]) -> None:

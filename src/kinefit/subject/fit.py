@@ -204,16 +204,17 @@ class _Worlds:
     """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
-        self._first, self._parameters = world, tuple(parameters)
+        self._first = world
+        ends = np.cumsum([0, *(len(one.names) for one in parameters)])
+        self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
         self._scenes: dict[tuple[int, int], tuple[World, Scene]] = {}
 
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
-        world, first = self._first, 0
-        for one in self._parameters:
-            values = theta[first : first + len(one.names)]
-            first += len(values)
+        world = self._first
+        for one, own in self._parameters:
+            values = theta[own]
             key = id(world), values.tobytes()
             if key not in self._kept:
                 if len(self._kept) >= _KEPT:
