@@ -26,11 +26,12 @@ from kinefit.solvers.whitened import Pose, columns, residuals, softening
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
 
-_FIRST = 1e-5  # damping to begin with, as a share of the poses' mean diagonal
+_FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
+_LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
 _NEAR = 3e-3  # [m, rad] of moves within which derivatives by parameters stay as they are
-_LEAST = 100.0  # [1/m², 1/rad²] damping of poses when they move with parameters
+_LEAST = 3.0  # [1/m², 1/rad²] damping of poses when they move with parameters
 _SETTLE, _SETTLED = 6, 1e-3  # steps of a pose by itself, and the fall of its cost at which it rests
 _FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
 
@@ -136,7 +137,7 @@ def solve(
     loss: Loss = SQUARED,
     posture: float = POSTURE,
     max_iterations: int = 20,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
 
@@ -173,6 +174,7 @@ def solve(
         settled, moved = task.settle(trial, [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)])
         new = task.cost(trial, settled)
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
+        damping = max(damping, _LITTLE * mean)
         if new < cost:
             far += max(float(np.abs(a.difference(b)).max()) for a, b in zip(states, moved)) + np.abs(delta).max()
             theta, states, frames, cost = trial, moved, settled, new
