@@ -124,10 +124,10 @@ class Stage:
 
     def follow(self, frames: Sequence[Any], points: int = POINTS) -> tuple[NDArray, list[Any]]:
         """CPU time [ms] and result of each frame, from the second frame of the movement on."""
-        from kinefit.sensors.settings import FusionSettings
+        from kinefit.sensors.settings import TrackSettings
         from kinefit.tracking.fusion import FusionTracker
 
-        settings = FusionSettings(points=points, search=False)
+        settings = TrackSettings(points=points, search=False)
         tracker = FusionTracker(
             self.motion.body, self.rig, rate=self.motion.rate, settings=settings,
             accuracy={self.camera.name: self.accuracy},

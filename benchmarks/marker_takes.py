@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import data
-from kinefit.identification.marker_sets import find_marker_set
+from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.figures import data, figure
+from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.identification.audit.audit import audit_take
-from kinefit.identification.marker_sets import find_marker_set
 from kinefit.identification.model.gate import training_gate
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel

@@ -196,8 +196,8 @@ def two_laboratories(folder: Path) -> Iterator[tuple[str, Markers, Markers, dict
 
 def known_person() -> None:
     """A simulated person whose markers sit 1 to 6 cm off the set's places: what movement adds to a static trial."""
+    from kinefit.bodies.marker_sets import placement
     from kinefit.evaluation import joint_errors
-    from kinefit.markers.placement import placement
     from kinefit.simulation import squat_and_wave
 
     rng, truth = np.random.default_rng(0), squat_and_wave(rate=60)

@@ -24,7 +24,7 @@ from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body, scaled
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
 
@@ -32,7 +32,7 @@ UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them
 FIRST, LAST, START, RATE = 40, 378, 160, 30.0
 SEEN = {"wrist": ((434, 160), (281, 369)), "tip": ((519, 375), (458, 406)), "arm": ((336, 28), (20, 382))}
 SKIN = (40, 138, 85), (235, 185, 123)  # YCrCb
-SETTINGS = FusionSettings(search=False, outline=360, far=0.08, near=0.015, patch=0.02, reach=0.08, iterations=10)
+SETTINGS = TrackSettings(search=False, outline=360, far=0.08, near=0.015, patch=0.02, reach=0.08, iterations=10)
 SIGMA = 4.0  # [px]
 BODY = """
 [body]

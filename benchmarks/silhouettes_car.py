@@ -16,14 +16,14 @@ from kinefit.geometry.camera import Rig
 from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.fusion import FusionTracker
 
 FRAMES = 120  # three degrees a frame
 LENGTH = 0.3  # [m]
 OFF, TRIALS = (10, 20, 30, 40, 60), 6  # [deg] from which the car is found, and how often that is tried
 # Reach of a correspondence in the size of a car, not of a person.
-SETTINGS = FusionSettings(search=False, outline=640, far=0.03, near=0.005, patch=0.01, reach=0.05, iterations=12)
+SETTINGS = TrackSettings(search=False, outline=640, far=0.03, near=0.005, patch=0.01, reach=0.05, iterations=12)
 
 
 def surface() -> FourierSurface:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 import kinefit
+from kinefit.bodies.marker_sets import placement
 from kinefit.exporters import write_markers, write_mot, write_osim
-from kinefit.markers.placement import placement
 from kinefit.simulation import squat_and_wave
 
 

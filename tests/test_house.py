@@ -31,7 +31,7 @@ LEVELS = [
     {"cli", "__main__"},
 ]
 BESIDE = {
-    ("motion", "bodies"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
+    ("motion", "bodies"), ("readers", "images"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
     ("subject", "initialization"),
     ("smoothing", "tracking"), ("initialization", "tracking"), ("smoothing", "subject"),
 }

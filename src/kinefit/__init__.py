@@ -13,7 +13,7 @@ _HOMES = {
     "BodyState": "kinefit.bodies",
     "Camera": "kinefit.geometry.camera",
     "FusionResult": "kinefit.tracking.fusion",
-    "FusionSettings": "kinefit.sensors.settings",
+    "TrackSettings": "kinefit.sensors.settings",
     "FusionTracker": "kinefit.tracking.fusion",
     "ImageFrame": "kinefit.geometry.camera",
     "Keypoints": "kinefit.observations",

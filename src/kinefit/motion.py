@@ -55,6 +55,8 @@ class Residuals:
         The measurements as used (people chosen, left and right put right), same frame and unit as the values.
     swapped : (F,) bool
         Frames in which the detector took left for right.
+    rms, count : (F, K), optional
+        Of a surface's or an outline's residuals, segment by segment, of which `values` hold the signed median (N = 1).
     """
 
     names: tuple[str, ...]
@@ -64,6 +66,13 @@ class Residuals:
     unit: str
     measured: NDArray
     swapped: NDArray
+    rms: NDArray | None = None
+    count: NDArray | None = None
+
+    @property
+    def of_points(self) -> bool:
+        """Whether they are of single points; else of the surface of each segment."""
+        return self.rms is None
 
     @property
     def norms(self) -> NDArray:
@@ -148,7 +157,7 @@ class Motion:
         T = se3.transform(R, np.zeros(3))
         axis = np.argmax(np.abs(R), axis=1)  # R takes axes onto axes; a product with it would make NaN of ∞ · 0
         residuals = {
-            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T) if r.unit == "m" else r
+            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T) if r.unit == "m" and r.of_points else r
             for name, r in self.residuals.items()
         }
         return replace(

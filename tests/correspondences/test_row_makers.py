@@ -25,6 +25,7 @@ from kinefit.bodies.steering import Steering
 from kinefit.bodies.surfaces import SkinnedMesh
 from kinefit.correspondences import (
     Bands,
+    anchored_rows,
     band_rows,
     coincidence_rows,
     collision_rows,
@@ -43,6 +44,7 @@ from kinefit.correspondences import (
     prior_rows,
     ray_rows,
     surface_rows,
+    target_rows,
 )
 from kinefit.correspondences.collisions import CollisionPairs
 from kinefit.correspondences.depth_image import SurfaceSamples
@@ -130,6 +132,12 @@ CASES = {
         lambda state: free_space_rows(s.body, state, *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
     ),
     "surface_rows": lambda s: about_surfaces(s),
+    "anchored_rows": lambda s: (
+        lambda state: anchored_rows(s.body, state, *anchors(s), s.target[:, [1, 2, 0]], weight=s.sigma)
+    ),
+    "target_rows": lambda s: (
+        lambda state: target_rows(s.body, state, *anchors(s)[:2], *in_one_camera(s), slack=3.0, sigma=0.7)
+    ),
     "morphed_rows": lambda s: on_a_morphed_skin(s),
     "morphed_outline_rows": lambda s: outlines_of_a_morphed_skin(s),
     "outline_rows": lambda s: outlines_of_random_edges(s),
@@ -141,6 +149,17 @@ CASES = {
         )
     ),
 }
+
+
+def anchors(s):
+    """Segments, points and normals of a surface, at rest."""
+    return s.points.segments, s.body.points_rest(s.points), s.normal
+
+
+def in_one_camera(s):
+    """A camera and places in its image some way off the points."""
+    camera = s.rig.cameras[1]
+    return camera, camera.project(s.x) + np.array([[30.0, -20.0]]) * (1 + np.arange(len(s.x)))[:, None]
 
 
 def about_surfaces(s):

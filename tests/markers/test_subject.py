@@ -1,4 +1,4 @@
-"""Marker sets on bodies, and subjects found from what their markers do."""
+"""Subjects found from what their markers do."""
 
 import warnings
 
@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from kinefit import Markers, load_body
-from kinefit.errors import FileError, KinefitError, ObservationError, TrackingError
+from kinefit.bodies.marker_sets import placement
+from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.evaluation import joint_errors
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.people import split_people
-from kinefit.markers.placement import find_placement, marker_set_names, placement
+from kinefit.markers.poses import columns
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import squat_and_wave
@@ -24,57 +25,6 @@ REAL = {  # file of the folder markers: set that is found, markers of it, statur
     "nimblephysics/data__c3d__JA1Gait35.c3d": ("SPRINT_51", 51),
     "opensim/Pipelines__Rajagopal__ExpData__motion_capture_walk.trc": ("RAJAGOPAL", 41),
 }
-
-
-@pytest.mark.parametrize("name", marker_set_names())
-def test_sets_lie_on_the_body_and_are_symmetric(name):
-    placed = placement(BODY, name)
-    assert len(set(placed.points.names)) == len(placed.points) >= 20
-    x = BODY.points_rest(placed.points)
-    ends = np.concatenate([BODY.points_rest(BODY.landmarks), BODY.tree.rest])
-    nearest = np.linalg.norm(x[:, None] - ends[None], axis=2).min(axis=1)
-    assert nearest.max() < 0.16  # [m] half a thigh
-    assert np.all((placed.spread > 0.005) & (placed.spread <= 0.1))
-    mirrored = x * (1, 1, -1)
-    images = np.linalg.norm(mirrored[:, None] - x[None], axis=2).min(axis=1)
-    assert np.all(images[np.abs(x[:, 2]) > 1e-9] < 1e-9)
-
-
-def test_sets_go_by_all_their_names():
-    assert placement(BODY, "hdm05-41").points.names == placement(BODY, "CMU_41").points.names
-    labels = placement(BODY, "STANFORD_47").points.names
-    assert {"r.ASIS", "L.ASIS", "r_knee", "L_knee", "R_Shoulder", "L_Shoulder"} <= set(labels)
-
-
-BAD_SETS = {
-    "not valid TOML": "name = ",
-    "not a marker set": "name = 3",
-    "landmark, or on a segment": 'name = "a"\n[markers]\nA = { segment = "thigh_r" }',
-    "not finite": 'name = "a"\n[markers]\nA = { landmark = "r_asis", spread = -1.0 }',
-}
-
-
-@pytest.mark.parametrize("problem", BAD_SETS)
-def test_bad_sets_are_told(tmp_path, problem):
-    (tmp_path / "a.toml").write_text(BAD_SETS[problem])
-    with pytest.raises(FileError, match=problem):
-        placement(BODY, tmp_path / "a.toml")
-    with pytest.raises(FileError, match="cannot read"):
-        placement(BODY, tmp_path / "none.toml")
-    with pytest.raises(ObservationError, match="no marker set 'X'"):
-        placement(BODY, "X")
-
-
-def test_own_set_from_a_file(tmp_path):
-    (tmp_path / "a.toml").write_text(
-        'name = "mine"\nsides = [["R", "L"]]\n[markers]\nRA = { landmark = "r_asis" }\nRB = { landmark = "r_psis" }\n'
-        'RC = { segment = "thigh_r", at = [0.0, -0.2, 0.1], spread = 0.05 }\nRD = { landmark = "not_there" }\n'
-    )
-    found = find_placement(BODY, ("LA", "LB", "LC", "RA", "LD"), tmp_path / "a.toml")
-    assert found.points.names == ("RA", "LA", "LB", "LC")
-    assert found.points.points[3] == pytest.approx([0.0, -0.2, -0.1])
-    with pytest.raises(ObservationError, match="only 2 of the labels are known to set"):
-        find_placement(BODY, ("LA", "LB", "X"), tmp_path / "a.toml")
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +133,16 @@ def test_real_takes(data_dir, name):
     residuals = motion.residuals["markers"]
     assert (residuals.weights > 0.5).mean() > 0.9
     assert np.sqrt(np.mean(residuals.norms[residuals.weights > 0.5] ** 2)) < 0.012
+
+
+def test_labels_spelt_otherwise_are_the_same_markers(known):
+    _, markers = known
+    first = markers.positions[:5]
+    other = Markers(tuple(f"Anna:{n.lower()}" for n in markers.names), markers.rate, first, up=markers.up)
+    spelt = columns(other, markers.names)
+    np.testing.assert_array_equal(spelt, first)
+    doubled = Markers((*other.names, "LASI", "lasi"), 60.0, np.zeros((1, len(other.names) + 2, 3)))
+    assert columns(doubled, ("LASI",)).shape == (1, 1, 3)  # the one that is spelt as the set has it
+    doubled = Markers(("A:lasi", "B:LAsi"), 60.0, np.zeros((1, 2, 3)))
+    with pytest.raises(ObservationError, match="more than one subject"):
+        columns(doubled, ("LASI",))

@@ -7,8 +7,8 @@ import pytest
 from tests.tracking.fusion_oracle import a_rig
 
 from kinefit import FusionTracker, Markers, fit_marker_subject, learn_model
+from kinefit.bodies.marker_sets import placement
 from kinefit.errors import TrackingError
-from kinefit.markers.placement import placement
 from kinefit.recipes.unlabelled_markers import name_frame, start_from_markers
 from kinefit.simulation import squat_and_wave
 

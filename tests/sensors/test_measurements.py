@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, of_points
 from tests.tracking.fusion_oracle import (
     BODY,
     SENSOR,
@@ -27,14 +28,13 @@ from kinefit.rendering import render_body
 from kinefit.sensors.background import Background
 from kinefit.sensors.depth_image import DepthMeasurement
 from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
-from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, of_points
 from kinefit.sensors.point_cloud import CloudMeasurement
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 
-TRUTH, SETTINGS = a_motion().state(0), FusionSettings()
+TRUTH, SETTINGS = a_motion().state(0), TrackSettings()
 S = len(BODY.tree.segments)
 WALL = 4.0
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from kinefit.sensors.measurements import KeypointMeasurement
 from tests.tracking.fusion_oracle import BODY, RATE, a_motion, a_rig
 
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.measurements import KeypointMeasurement
 from kinefit.sensors.occlusion import THICK, InSight, beside
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import normal_equations
 from kinefit.tracking.fused_fit import FusedFit
 
@@ -87,7 +87,7 @@ def test_a_wrist_that_is_seen_speaks_against_a_body_that_hides_it(confidence, ag
 
 
 def test_the_fit_pairs_them():
-    fit = FusedFit(BODY, a_rig(), RATE, {}, FusionSettings(), {})
+    fit = FusedFit(BODY, a_rig(), RATE, {}, TrackSettings(), {})
     uv = CAMERA.project(BODY.positions(TRUTH, WRISTS))
     frames = [KeypointFrame("depth", 0.0, WRISTS.names, uv, np.ones(2)), drawn()]
     made = fit.measurements(frames, TRUTH)

@@ -15,7 +15,7 @@ from kinefit.initialization.from_silhouettes import LEVELS, coarse_to_fine
 from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.take import track_take
@@ -72,7 +72,7 @@ def silhouettes(body, state, cameras, time, mesh=None):
 
 
 def tracker(body, rig, **settings):
-    return FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=FusionSettings(search=False, **settings))
+    return FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False, **settings))
 
 
 def joints(body, state):
@@ -229,7 +229,7 @@ def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
     text = '[take]\nrate = 30.0\nup = "y"\nstart = "motion.npz"\n[calibration]\nfile = "rig.toml"\nunit = "m"\n'
     for camera in rig:
         text += f'[[camera]]\nname = "{camera.name}"\n'
-        text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\naccuracy = 2.0\n'
+        text += f'[[silhouette]]\ncamera = "{camera.name}"\nfile = "{camera.name}"\nsigma = 2.0\n'
     (tmp_path / "take.toml").write_text(text)
     motion, seen = track_take(tmp_path / "take.toml")
     assert len(motion) == 6 and len(seen.silhouettes) == 4

@@ -40,7 +40,7 @@ def test_depth_reads_back_to_the_millimetre(motion, recording):
         there, here = video.frame(frame).depth, again.frame(frame).depth
         np.testing.assert_array_equal(there > 0, here > 0)
         assert np.abs(there - here).max() <= 0.0005 + 1e-6
-    assert 0.01 < take.depth[0].accuracy < 0.1
+    assert 0.01 < take.depth[0].sigma < 0.1
     np.testing.assert_allclose(video.times, motion.times - motion.times[0], atol=1e-9)
 
 

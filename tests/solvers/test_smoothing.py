@@ -71,7 +71,7 @@ def test_gradient_and_curvature_of_the_motion_prior(turn):
     def moved(delta):
         states = [BodyState(roots[t], angles[t]).retract(delta[t]) for t in range(T)]
         moved_roots, moved_angles = np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states])
-        return _system(BODY, moved_roots, moved_angles, none, p)
+        return _system(BODY, moved_roots, moved_angles, none, p, BODY.tree.depth)
 
     here = moved(np.zeros((T, N)))
     _, weight = p.rows(T - 1)
@@ -100,7 +100,7 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
     p = prior()
     random = np.random.default_rng(3)
     roots, angles = random_states(T, 0.4)
-    system = _system(BODY, roots, angles, held(random.uniform(1, 3, (T, N))), p)
+    system = _system(BODY, roots, angles, held(random.uniform(1, 3, (T, N))), p, BODY.tree.depth)
     H = dense(system, T)
     W, below, x = _workspace(T, N)
     b = random.normal(size=(T, N))
@@ -132,7 +132,7 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
 
 def test_a_matrix_that_is_not_positive_is_told():
     T = 3
-    system = _system(BODY, *random_states(T, 0.1), held(np.ones((T, N))), prior())
+    system = _system(BODY, *random_states(T, 0.1), held(np.ones((T, N))), prior(), BODY.tree.depth)
     system.C[1, 7, TREE.depth[7]] = -1e9
     W, below, x = _workspace(T, N)
     packed = system.C, TREE.chain, TREE.depth, system.band, *blocks(BODY)

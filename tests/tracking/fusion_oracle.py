@@ -9,7 +9,7 @@ from kinefit.bodies import load_body
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
 from kinefit.simulation.scenes import Scene
@@ -19,7 +19,7 @@ from kinefit.tracking.fusion import FusionTracker
 BODY = load_body("humanoid10")
 RATE = 30.0
 SENSOR = replace(KINECT, name="depth", size=(160, 120), focal=144.0, disparity_step=0.03)
-STILL = FusionSettings(search=False)
+STILL = TrackSettings(search=False)
 SET = "COCO_17"
 
 

@@ -31,7 +31,7 @@ from kinefit.bodies.parts import PartJoint, box, with_part, with_surfaces, witho
 from kinefit.errors import BodyError, CalibrationError, KinefitError, ObservationError
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.fusion import FusionResult, FusionTracker
 
 FEW = ("neck", "r_wrist", "l_ankle")
@@ -149,14 +149,14 @@ def test_a_start_with_no_pose(kind):
         "keypoints of two cameras": [keypoint_frame(5, "left"), keypoint_frame(5, "right")],
         "depth": [depth_frame(5)],
     }[kind]
-    tracker = a_tracker(start=None, settings=FusionSettings())
+    tracker = a_tracker(start=None, settings=TrackSettings())
     result = tracker.update(frames)
     assert result is not None and tracker.state is result.state
     assert np.median(off(result.state, 5)) < 0.05 and is_finite(result)
 
 
 def test_too_few_markers_are_no_start():
-    tracker = a_tracker(start=None, settings=FusionSettings())
+    tracker = a_tracker(start=None, settings=TrackSettings())
     assert tracker.update([marker_frame(0, FEW)]) is None
 
 
@@ -200,7 +200,7 @@ def test_a_limb_that_is_somewhere_else_is_sought_and_found():
     assert off(wrong, 0)[wrist] > 0.4
     found = {}
     for search in (True, False):
-        tracker = a_tracker(start=None, settings=FusionSettings(search=search))
+        tracker = a_tracker(start=None, settings=TrackSettings(search=search))
         tracker.start_at(wrong)
         tracker._prediction.start(wrong, np.full(N, 0.02))  # a tracker that has been sure for long
         for i in range(8):
@@ -354,11 +354,11 @@ def nothing(kind):
 )
 @pytest.mark.parametrize("search", [False, True])
 def test_nothing_measured_is_nothing_known(kind, search):
-    tracker = a_tracker(settings=FusionSettings(search=search))
+    tracker = a_tracker(settings=TrackSettings(search=search))
     result = tracker.update([nothing(kind)])
     assert is_finite(result) and result.quality == 0.0 and result.hidden.all() and not result.lost.any()
     assert off(result.state, 0).mean() < 0.02
-    assert a_tracker(start=None, settings=FusionSettings(search=search)).update([nothing(kind)]) is None
+    assert a_tracker(start=None, settings=TrackSettings(search=search)).update([nothing(kind)]) is None
 
 
 WRONG = [
@@ -452,7 +452,7 @@ def test_no_garbage_makes_a_result_that_is_not_finite(data):
 @settings(max_examples=2)
 @given(st.data())
 def test_no_garbage_stops_a_search(data):
-    tracker = a_tracker(start=None, settings=FusionSettings())
+    tracker = a_tracker(start=None, settings=TrackSettings())
     try:
         result = tracker.update([data.draw(garbage(0.0)) for _ in range(2)])
     except KinefitError:
@@ -462,4 +462,4 @@ def test_no_garbage_stops_a_search(data):
 
 def test_public_names():
     assert kinefit.FusionTracker is FusionTracker and kinefit.FusionResult is FusionResult
-    assert kinefit.FusionSettings is FusionSettings
+    assert kinefit.TrackSettings is TrackSettings

@@ -100,7 +100,7 @@ def test_markers_beside_keypoints_count(tmp_path):
     x = x + 0.001 * np.random.default_rng(0).standard_normal(x.shape)
     write_markers(Markers(MARKERS, truth.rate, x, up=truth.up), tmp_path / "few.trc")
     without = track_take(take)[0]
-    take.write_text(take.read_text() + '\n[[markers]]\nfile = "few.trc"\naccuracy = 0.002\n')
+    take.write_text(take.read_text() + '\n[[markers]]\nfile = "few.trc"\nsigma = 0.002\n')
     fused = track_take(take)[0]
 
     def off(motion):

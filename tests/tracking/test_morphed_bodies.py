@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
 from tests.sensors.test_silhouette import at, ring
 
 from kinefit.bodies import load_body
@@ -13,8 +14,7 @@ from kinefit.errors import BodyError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
-from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.fused_fit import FusedFit
 from kinefit.tracking.fusion import FusionTracker
 
@@ -60,7 +60,7 @@ def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
     """The morphing body finds the arms' angles; the same one held stiff is off."""
     model, ends = Morphing(body), {}
     for name, own in (("morphing", body), ("stiff", replace(body, morphs=()))):
-        follow = FusionTracker(own, rig, rate=30.0, settings=FusionSettings(search=False))
+        follow = FusionTracker(own, rig, rate=30.0, settings=TrackSettings(search=False))
         follow.start_at(posture(body, 0))
         for i in range(8):
             truth, frames = posture(body, i), []
@@ -107,7 +107,7 @@ def test_without_moving_joints_the_derivative_is_the_trees(body, rig):
 
 
 def test_depth_says_that_it_does_not_know_of_moving_joints(body, rig):
-    fit = FusedFit(body, Rig(rig.cameras[:1]), 30.0, {}, FusionSettings(), {})
+    fit = FusedFit(body, Rig(rig.cameras[:1]), 30.0, {}, TrackSettings(), {})
     image = np.full(rig.cameras[0].size[::-1], 3.0, np.float32)
     with pytest.raises(BodyError, match="joints that move with angles.*without morphs"):
         fit.measurements([DepthFrame("c0", 0.0, image)], posture(body, 0))

@@ -97,7 +97,7 @@ def with_detections(take: Take, step: _screen.Step) -> Take:
 
     asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
     videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo or take.silhouettes)
-    if not asked and (take.keypoints or not videos):
+    if not asked and (take.keypoints or take.skin or take.lines or not videos):
         return take
     files = ensure_detections(take, progress=step)
     if take.keypoints:

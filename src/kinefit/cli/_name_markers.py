@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit.bodies.marker_sets import find_marker_set, load_marker_set
 from kinefit.cli._screen import Step
 from kinefit.errors import ObservationError
-from kinefit.identification.marker_sets import find_marker_set, load_marker_set
 from kinefit.identification.model.files import load_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import Finding, training_gate

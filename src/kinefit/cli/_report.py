@@ -86,7 +86,7 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
     ]  # fmt: skip
     out["keypoints"] = [
         {"camera": k.camera, "file": k.file.name if k.file else None, "format": k.format, "set": k.set,
-         "accuracy": k.accuracy}
+         "accuracy": k.sigma}
         for k in take.keypoints
     ]  # fmt: skip
     if take.height:

@@ -98,7 +98,7 @@ def _refine(
             remedy="Mend what is named as a fault first.",
         )
     static = read_static_points(points, found.views.rig.names) if points else None
-    accuracy = min(entry.accuracy for entry in take.keypoints)
+    accuracy = min(entry.sigma for entry in take.keypoints)
     return refine(
         found.views.rig, [k for k in seen.keypoints if k.camera in found.views.rig], load_body(take.body), focal=focal,
         distortion=distortion, time_offsets=time_offsets, static_points=static, height=take.height, up=take.up,

@@ -196,8 +196,8 @@ def audit(
     unit: str | None, verbose: bool,
 ) -> None:  # fmt: skip
     """Find swapped labels, and markers off their segment, in takes that somebody labelled."""
+    from kinefit.bodies.marker_sets import load_marker_set
     from kinefit.identification.audit.audit import audit_take
-    from kinefit.identification.marker_sets import load_marker_set
     from kinefit.identification.model.files import load_model
     from kinefit.readers.markers import read_markers
 

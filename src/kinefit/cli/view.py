@@ -132,9 +132,9 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
 
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
-    from kinefit.initialization.from_points import triangulated
     from kinefit.multiview.association import choose_people
     from kinefit.sensors.channels import make_channels
+    from kinefit.sensors.triangulation import triangulated
 
     if seen.rig is None or not seen.keypoints:
         return None
@@ -143,7 +143,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")
         return None
-    accuracy = [entry.accuracy for entry in take.keypoints]
+    accuracy = [entry.sigma for entry in take.keypoints]
     channels = make_channels(load_body(take.body), seen.rig, seen.keypoints, people, accuracy)
     return triangulated(channels, np.arange(len(channels.uv)))
 

@@ -1,5 +1,6 @@
 """Observations and a body at a state become rows: one file a kind."""
 
+from kinefit.correspondences.anchored import anchored_rows, target_rows
 from kinefit.correspondences.bands import Bands, band_rows, joint_bands
 from kinefit.correspondences.coincidence import coincidence_rows
 from kinefit.correspondences.collisions import collision_rows
@@ -17,6 +18,7 @@ from kinefit.correspondences.surfaces import surface_rows
 
 __all__ = [
     "Bands",
+    "anchored_rows",
     "band_rows",
     "coincidence_rows",
     "collision_rows",
@@ -37,4 +39,5 @@ __all__ = [
     "prior_rows",
     "ray_rows",
     "surface_rows",
+    "target_rows",
 ]

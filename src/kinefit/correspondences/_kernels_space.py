@@ -86,7 +86,7 @@ def nearest_cells(depth, farthest, cell, shown, tolerance, nearest):
 
 @jit
 def free_space_rows(
-    frames, owner, rest, normal, camera, depth, nearest, missing, cell, tolerance, reach, weight,
+    frames, owner, rest, normal, camera, depth, nearest, missing, cell, tolerance, reach, weight, chosen,
     data, segment, group, start,
 ):  # fmt: skip
     """One row for each sample that faces the camera and that the sensor saw through, towards the nearest cell.
@@ -94,7 +94,7 @@ def free_space_rows(
     owner (N,), rest and normal (3, N) in the root frame at rest; camera packed; depth (H, W) [m], 0 for none; nearest
     and missing (h, w) from `nearest_cells`, of all cells and of those that the body does not explain yet: a sample
     more than `OUTLINE` cells astray goes to the latter, where there are any within reach; tolerance, reach [m]; weight
-    [1/px²]. Returns the next free line.
+    [1/px²]. Out: chosen (N,) the cell of every sample, -1 for none. Returns the next free line.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -105,6 +105,7 @@ def free_space_rows(
     half = 0.5 * cell
     i = start
     for k in range(owner.size):
+        chosen[k] = -1
         f = frames[owner[k]]
         a, b, c = rest[0, k], rest[1, k], rest[2, k]
         x = f[0] * a + f[1] * b + f[2] * c + f[9]
@@ -123,7 +124,7 @@ def free_space_rows(
         iu, iv = int(u + 0.5), int(v + 0.5)
         if not abs(depth[iv, iu]) > r20 * x + r21 * y + r22 * z + t2 + tolerance:
             continue
-        gap, gx, gy, gz, g2, g = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        gap, gx, gy, gz, g2, g, goal = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1
         for place in range(2):
             target = nearest[iv // cell, iu // cell] if place == 0 else missing[iv // cell, iu // cell]
             if target < 0 or (place == 1 and gap <= OUTLINE * cell):
@@ -138,20 +139,14 @@ def free_space_rows(
             square = tx * tx + ty * ty + tz * tz
             t = 1.0 / math.sqrt(square)
             if place == 0 or (distance - half) * t <= reach:
-                gap, gx, gy, gz, g2, g = (
-                    distance - half,
-                    tx,
-                    ty,
-                    tz,
-                    square,
-                    t,
-                )  # to the edge of the cell, not its middle
+                gap, gx, gy, gz, g2, g = distance - half, tx, ty, tz, square, t  # to the edge, not the middle
+                goal = target
         if gap <= 0.0 or gap * g > reach:
             continue
         data[0, i], data[1, i], data[2, i] = x, y, z
         data[3, i], data[4, i], data[5, i] = gx * g, gy * g, gz * g
         data[6, i], data[7, i] = gap * g, weight * g2
-        segment[i], group[i] = owner[k], k
+        segment[i], group[i], chosen[k] = owner[k], k, goal
         i += 1
     return i
 

@@ -1,8 +1,11 @@
-"""Nearest points of surfaces as rows."""
+"""Nearest points of surfaces as rows; rows of correspondences that were found before."""
 
 from __future__ import annotations
 
+import math
+
 from kinefit._jit import jit
+from kinefit.geometry._kernels_camera import project_jacobian
 
 
 @jit
@@ -27,3 +30,57 @@ def surface_rows(x, distance, normal, owner, weight, eye, least, data, segment, 
         segment[i], group[i] = owner[k], k
         i += 1
     return i
+
+
+@jit
+def anchored_rows(frames, owner, rest, normal, target, weight, at_surface, data):
+    """One row for each point of a surface: what was measured lies r further along the surface's normal.
+
+    frames (S, 12); owner (N,), rest and normal (N, 3) in the root frame at rest; target (N, 3) [m] in the world, weight
+    (N,) [1/m²]; at_surface: whether a row's point is the target's foot on the tangent plane, or the target itself; the
+    derivative is the same. Out: data (8, N).
+    """
+    for k in range(owner.size):
+        f = frames[owner[k]]
+        a, b, c = normal[k, 0], normal[k, 1], normal[k, 2]
+        nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
+        a, b, c = rest[k, 0], rest[k, 1], rest[k, 2]
+        x = f[0] * a + f[1] * b + f[2] * c + f[9]
+        y = f[3] * a + f[4] * b + f[5] * c + f[10]
+        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        qx, qy, qz = target[k, 0], target[k, 1], target[k, 2]
+        r = nx * (qx - x) + ny * (qy - y) + nz * (qz - z)
+        back = r if at_surface else 0.0
+        data[0, k], data[1, k], data[2, k] = qx - back * nx, qy - back * ny, qz - back * nz
+        data[3, k], data[4, k], data[5, k] = nx, ny, nz
+        data[6, k], data[7, k] = r, weight[k]
+
+
+@jit
+def target_rows(frames, owner, rest, camera, target, slack, weight, data):
+    """One row for each point: its pixel should lie within `slack` [px] of target (N, 2) [px].
+
+    frames (S, 12); owner (N,), rest (N, 3) in the root frame at rest; camera packed; weight [1/px²], which is 0 for
+    points that lie there already or that the camera does not see. Out: data (8, N).
+    """
+    for k in range(owner.size):
+        f = frames[owner[k]]
+        a, b, c = rest[k, 0], rest[k, 1], rest[k, 2]
+        x = f[0] * a + f[1] * b + f[2] * c + f[9]
+        y = f[3] * a + f[4] * b + f[5] * c + f[10]
+        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        data[0, k], data[1, k], data[2, k] = x, y, z
+        data[3, k], data[4, k], data[5, k], data[6, k], data[7, k] = 0.0, 0.0, 1.0, 0.0, 0.0
+        ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(camera, x, y, z)
+        if not ok:
+            continue
+        du, dv = target[k, 0] - u, target[k, 1] - v
+        distance = math.sqrt(du * du + dv * dv)
+        if distance <= slack or distance < 1e-9:
+            continue
+        du, dv = du / distance, dv / distance
+        gx, gy, gz = du * ux + dv * vx, du * uy + dv * vy, du * uz + dv * vz
+        square = gx * gx + gy * gy + gz * gz
+        g = 1.0 / math.sqrt(square)
+        data[3, k], data[4, k], data[5, k] = gx * g, gy * g, gz * g
+        data[6, k], data[7, k] = (distance - slack) * g, weight * square

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences import _kernels, _kernels_depth_image
+from kinefit.correspondences import _kernels, _kernels_depth_image, targets
 from kinefit.correspondences._kernels_depth_image import EMPTY, HIDDEN, MATCHED, UNSEEN
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -61,6 +61,7 @@ def depth_image_rows(
     facing: float = 0.2,
     sigma: float = 0.01,
     verdict: NDArray | None = None,
+    frames: NDArray | None = None,
 ) -> Rows:
     """One row for each sample p that the sensor saw, at x: r = n·(x − p), point to plane along the model's normal n.
 
@@ -80,6 +81,7 @@ def depth_image_rows(
     verdict : (N,) int64, optional
         To be filled with what the image tells of every sample: UNSEEN, HIDDEN (something was measured in front), EMPTY
         (seen through) or MATCHED.
+    frames : (S, 12), optional, of a body whose joints move with its angles.
 
     Raises
     ------
@@ -91,7 +93,7 @@ def depth_image_rows(
         raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of a depth image is {sigma} m", remedy="Give a positive one.")
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    frames = targets.of_segments(body, state, frames)
     n = len(samples)
     data, segment, group = _kernels.buffers(n)
     verdict = np.empty(n, np.int64) if verdict is None else verdict

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences import _kernels
+from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences import _kernels_space as kernels
 from kinefit.correspondences.depth_image import SurfaceSamples
 from kinefit.errors import ObservationError
@@ -81,6 +81,11 @@ class FreeSpace:
             kernels.nearest_cells(depth, farthest, cell, own, tolerance, missing)
         return cls(depth, nearest, missing, cell)
 
+    def middle(self, cells: NDArray) -> NDArray:
+        """(N, 2) [px] middles of cells (N,), row * w + column."""
+        row, column = np.divmod(np.asarray(cells), self.nearest.shape[1])
+        return np.stack([column, row], axis=1) * float(self.cell) + (0.5 * self.cell - 0.5)
+
 
 def free_space_rows(
     body: Body,
@@ -92,6 +97,8 @@ def free_space_rows(
     sigma: float | None = None,
     tolerance: float = 0.1,
     reach: float = 0.5,
+    chosen: NDArray | None = None,
+    frames: NDArray | None = None,
 ) -> Rows:
     """One row for each sample in space that the sensor saw through: sideways to the edge of the nearest cell that fits.
 
@@ -112,6 +119,9 @@ def free_space_rows(
         and what a surface of simple shapes is off.
     reach : float [m]
         Beyond it no row: so far sideways lies another part, or another person.
+    chosen : (N,) int64, optional
+        To be filled with the cell that every sample is drawn to, -1 for none; see `FreeSpace.middle`.
+    frames : (S, 12), optional, of a body whose joints move with its angles.
     """
     if space.depth.shape != (camera.size[1], camera.size[0]):
         problem = f"a depth image of {space.depth.shape[::-1]} px, camera {camera.name} has {camera.size}"
@@ -119,10 +129,11 @@ def free_space_rows(
     sigma = 10.0 * space.cell if sigma is None else sigma
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give a positive one.")
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    frames = targets.of_segments(body, state, frames)
     data, segment, group = _kernels.buffers(len(samples))
+    chosen = np.empty(len(samples), np.int64) if chosen is None else chosen
     end = kernels.free_space_rows(
         frames, samples.segment, samples.point, samples.normal, camera.packed, space.depth, space.nearest,
-        space.missing, space.cell, tolerance, reach, 1.0 / sigma**2, data, segment, group, 0,
+        space.missing, space.cell, tolerance, reach, 1.0 / sigma**2, chosen, data, segment, group, 0,
     )  # fmt: skip
     return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])

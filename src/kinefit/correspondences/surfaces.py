@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces.nearest import nearest_lines
@@ -23,6 +23,7 @@ def surface_rows(
     segment: ArrayLike | None = None,
     viewpoint: ArrayLike | None = None,
     exact: bool = False,
+    frames: NDArray | None = None,
 ) -> Rows:
     """One row a point: the surface's nearest point p = x − d n should lie further along its normal n by d.
 
@@ -40,6 +41,7 @@ def surface_rows(
         Where the sensor was: points whose nearest surface faces away from it make no row.
     exact : bool
         See `nearest`.
+    frames : (S, 12), optional, of a body whose joints move with its angles.
 
     Raises
     ------
@@ -56,7 +58,7 @@ def surface_rows(
         eye, least = np.asarray(viewpoint, float), 0.0
         if eye.shape != (3,) or not np.isfinite(eye).all():
             raise ObservationError(f"the viewpoint is no point: {viewpoint}", remedy="Give three numbers in metres.")
-    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    frames = targets.of_segments(body, state, frames)
     lines = targets.lines(x)
     distance, normal, owner = nearest_lines(body, frames, lines, max_distance, segment, exact=exact)
     data, owners, group = _kernels.buffers(len(x))

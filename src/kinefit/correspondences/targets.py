@@ -35,11 +35,15 @@ def fill(
 
     `frames` (S, 12) are those of a body whose joints move with its angles.
     """
-    if frames is None:
-        frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    frames = of_segments(body, state, frames)
     data, segment, group = _kernels.buffers(lines * len(points))
     end = kernel(frames, points.segments, body.points_rest(points), *arguments, data, segment, group, 0)
     return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])
+
+
+def of_segments(body: Body, state: BodyState, frames: NDArray | None = None) -> NDArray:
+    """(S, 12) frames of a body's segments: those given, of joints that move with angles, or else the tree's."""
+    return body.tree.forward(state.T_world_root, state.angles)[0] if frames is None else frames
 
 
 def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArray, NDArray]:

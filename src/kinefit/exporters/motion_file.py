@@ -16,7 +16,7 @@ from kinefit.bodies.serial import body_to_arrays, text_array
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.motion import Motion
-from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, VERSION
+from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, SURFACE_ARRAYS, VERSION
 
 
 def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
@@ -40,7 +40,7 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     arrays |= {key: getattr(motion, key) for key in ARRAYS}
     arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
     for sensor, residuals in motion.residuals.items():
-        for key in RESIDUAL_ARRAYS:
+        for key in (*RESIDUAL_ARRAYS, *(() if residuals.of_points else SURFACE_ARRAYS)):
             value = getattr(residuals, key)
             array = text_array(value) if key == "names" else np.asarray(value)
             arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = array

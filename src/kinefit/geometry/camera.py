@@ -267,20 +267,18 @@ def _ratio(size: tuple[int, int], of: tuple[int, int]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras in one world; `rig["cam01"]` is one of them.
+    """Cameras in one world; `rig["cam01"]` is one of them. Markers alone need none: `Rig(())`.
 
     Raises
     ------
     CalibrationError
-        Where it is empty, two cameras share a name, or a name is asked for that is not there.
+        Where two cameras share a name, or a name is asked for that is not there.
     """
 
     cameras: tuple[Camera, ...]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(self.cameras))
-        if not self.cameras:
-            raise CalibrationError("a rig without cameras", remedy="Give at least one calibrated camera.")
         twice = [name for name in set(self.names) if self.names.count(name) > 1]
         if twice:
             raise CalibrationError("two cameras of one name", place=f"camera {twice[0]}", remedy="Rename one of them.")
@@ -293,7 +291,7 @@ class Rig:
     @cached_property
     def packed(self) -> NDArray:
         """(C, 29) the cameras for kernels."""
-        return _read_only(np.stack([camera.packed for camera in self.cameras]))
+        return _read_only(np.array([camera.packed for camera in self.cameras]).reshape(len(self.cameras), -1))
 
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""

@@ -267,7 +267,11 @@ def find_face(image: NDArray, models: Models) -> tuple[float, float, float, floa
     people = Follower(models, 30.0, people=1, masks=False).update(image)
     if not people:
         return None
-    points = people[0].points
+    return face_box(people[0].points)
+
+
+def face_box(points: NDArray) -> tuple[float, float, float, float]:
+    """(left, top, width, height) [px] of a face, from hair to chin, by the landmarks (33, 2) of a MEDIAPIPE_33."""
     eyes, mouth, ears = points[[2, 5]].mean(axis=0), points[[9, 10]].mean(axis=0), points[[7, 8]]
     down = float(np.linalg.norm(mouth - eyes))
     width = max(float(np.linalg.norm(ears[0] - ears[1])), 1.6 * down)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,31 +11,47 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.initialization.depth_score import limbs
 from kinefit.initialization.depth_search import Search
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
+from kinefit.losses import SQUARED
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.sensors.base import Measurement
+from kinefit.sensors.channels import joined
 from kinefit.sensors.depth_view import camera_at
+from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.scene import Scene
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
 LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is about this much of a person
-_AGREE = 30.0  # [px] between keypoints of several cameras that may be of one point
 
 
-def find_starts(body: Body, rig: Rig, frames: Sequence[Frame], up: NDArray, count: int = 3) -> list[BodyState]:
-    """States to begin with, the most trusted first; none where nothing of a person's size is seen.
+def starts_from_points(
+    body: Body, frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
+) -> list[BodyState]:
+    """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
 
-    Six points or more of markers and keypoints of several cameras tell by themselves. Else one depth image or cloud is
-    searched; where keypoints or markers show the same body, those states that they agree with come first.
+    Parameters
+    ----------
+    frames, measurements : what was seen, and the measurements made of it where there are any
+    scene : of the body, in any state
+    keypoints : makes one measurement of the keypoints of all cameras
     """
-    points, x = _known_points(body, rig, frames)
-    if len(points) >= 6:
-        try:
-            return [pose_from_points(body, points, x)[0]]
-        except TrackingError:
-            pass
+    points, x = known_points(frames, measurements, scene, keypoints)
+    if np.isfinite(x).all(axis=1).sum() < 6:
+        return []
+    try:
+        return [pose_from_points(body, points, x)[0]]
+    except TrackingError:
+        return []
+
+
+def starts_from_views(
+    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3
+) -> list[BodyState]:
+    """States to begin with from one depth image or cloud; those that known points agree with come first."""
     starts: list[Start] = []
     for frame in frames:
         view = _view(rig, frame)
@@ -43,9 +60,45 @@ def find_starts(body: Body, rig: Rig, frames: Sequence[Frame], up: NDArray, coun
                 starts = start_from_points(body, *view, up=up, count=count)
             except KinefitError:
                 continue
-    if len(points):
-        starts.sort(key=lambda start: float(np.median(np.linalg.norm(body.positions(start.state, points) - x, axis=1))))
+    points, x = known_points(frames, (), scene, keypoints)
+    known = np.isfinite(x).all(axis=1)
+    if known.any():
+        starts.sort(
+            key=lambda start: float(
+                np.median(np.linalg.norm(body.positions(start.state, points)[known] - x[known], axis=1))
+            )
+        )
     return [start.state for start in starts]
+
+
+def find_starts(
+    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, keypoints: KeypointSensor, count: int = 3
+) -> list[BodyState]:
+    """States to begin with, the most trusted first; none where nothing of a person's size is seen."""
+    scene = Scene(body, body.usual_state(np.eye(4)), rig)
+    found = starts_from_points(body, frames, (), scene, keypoints)
+    return found or starts_from_views(body, rig, frames, up, scene, keypoints, count)
+
+
+def known_points(
+    frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
+) -> tuple[PointSet, NDArray]:
+    """Points of the body with their places (K, 3) [m] in the world, as all measurements tell them; NaN where not."""
+    told = list(measurements)
+    if not told:
+        pixels = [f for f in frames if isinstance(f, KeypointFrame)]
+        told = [f for f in frames if isinstance(f, Measurement)]
+        told += [keypoints.prepare(pixels, scene)] if pixels else []
+        told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in frames if isinstance(f, MarkerFrame)]
+    sets, places = [], [np.zeros((0, 3))]
+    for m in told:
+        hints = m.hints(scene)
+        if hints.points is not None and hints.x_world is not None:
+            names = tuple(f"{m.sensor}/{name}" for name in hints.points.names)
+            sets.append(PointSet(names, hints.points.segments, hints.points.points))
+            places.append(hints.x_world)
+    empty = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
+    return (joined(sets) if sets else empty), np.concatenate(places)
 
 
 def find_limbs(search: Search, state: BodyState, seek: NDArray, tries: int = 200) -> list[tuple[BodyState, float]]:
@@ -85,43 +138,3 @@ def _view(rig: Rig, frame: Frame) -> tuple[NDArray | None, Camera, NDArray | Non
     if isinstance(frame, PointCloud) and frame.on_body and frame.segment is None and len(frame):
         return frame.points, camera_at(frame.points, frame.viewpoint), None
     return None
-
-
-def _known_points(body: Body, rig: Rig, frames: Sequence[Frame]) -> tuple[PointSet, NDArray]:
-    """Points of the body that are known in space: markers, and keypoints of several cameras."""
-    names: list[str] = []
-    segments: list[NDArray] = []
-    places: list[NDArray] = []
-    x: list[NDArray] = []
-    seen: dict[str, dict[str, KeypointFrame]] = {}
-    for frame in frames:
-        if isinstance(frame, MarkerFrame):
-            known = body.markers(frame.marker_set) if frame.marker_set else body.landmarks
-            for name, position in zip(frame.names, frame.positions):
-                if name in known.names and np.isfinite(position).all():
-                    one = known.select((name,))
-                    names.append(f"{frame.sensor}/{name}")
-                    segments.append(one.segments[0])
-                    places.append(one.points[0])
-                    x.append(position)
-        elif isinstance(frame, KeypointFrame):
-            seen.setdefault(frame.keypoint_set, {})[frame.sensor] = frame
-    for kind, views in seen.items():
-        known = body.keypoints(kind) if kind else body.landmarks
-        uv = np.full((len(known), len(rig), 2), np.nan)
-        confidence = np.zeros(uv.shape[:2])
-        for camera, frame in views.items():
-            for name, pixel, trust in zip(frame.names, frame.uv, frame.confidence):
-                if name in known.names:
-                    at = known.names.index(name), rig.index(camera)
-                    uv[at], confidence[at] = pixel, trust
-        if len(views) > 1:
-            found = triangulate_robust(rig, uv, confidence, max_residual_px=_AGREE)[0]
-            for k in np.flatnonzero(np.isfinite(found).all(axis=1)):
-                names.append(f"{kind}/{known.names[k]}")
-                segments.append(known.segments[k])
-                places.append(known.points[k])
-                x.append(found[k])
-    shape = (len(names), 3)
-    points = PointSet(tuple(names), np.array(segments, np.int64), np.array(places, float).reshape(shape))
-    return points, np.array(x, float).reshape(shape)

@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteMeasurement
 from kinefit.tracking.fused_fit import FusedFit, FusionResult
 
@@ -48,7 +48,7 @@ class FarFit(NamedTuple):
 def coarse_to_fine(
     body: Body, rig: Rig, frames: Sequence[SilhouetteFrame], state: BodyState, *,
     accuracy: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
-    smooth: Sequence[Body] = (), settings: FusionSettings | None = None,
+    smooth: Sequence[Body] = (), settings: TrackSettings | None = None,
 ) -> FarFit:  # fmt: skip
     """Fit silhouettes of one time from a pose that may be tens of degrees off in every joint.
 
@@ -71,7 +71,7 @@ def coarse_to_fine(
     bodies = tuple(smooth) or (body,) * len(levels)
     if len(bodies) != len(levels):
         raise ObservationError(f"{len(bodies)} bodies for {len(levels)} levels", remedy="Give one body for each.")
-    settings = settings or FusionSettings()
+    settings = settings or TrackSettings()
     fits = []
     for own_body, level in zip(bodies, levels):
         steps = settings.iterations * _PATIENCE

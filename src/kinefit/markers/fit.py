@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.losses import Loss
-from kinefit.markers.placement import find_placement
-from kinefit.markers.poses import LOSS, POSTURE, bare, columns, sequence_both_ways
+from kinefit.markers.poses import LOSS, POSTURE, columns, sequence_both_ways
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.smoothing.gaps import bridged
@@ -47,7 +47,7 @@ def fit_markers(
     ----------
     body : Body, of the subject's size, its markers at their own places: from `fit_marker_subject`.
     markers : Markers
-        Labels may carry a subject's prefix ("Anna:LASI"); labels that the set does not have are left out.
+        Labels that the set does not have are left out; prefix ("Anna:LASI"), case and marks do not count.
     marker_set : str
         Default: the set that shares most labels, of the body's own first.
     sigma : scalar or (K,) for each marker of the set that is used [m], along each axis.
@@ -61,8 +61,7 @@ def fit_markers(
     TrackingError
         No frame shows enough markers to start from.
     """
-    labels = {bare(n) for n in markers.names}
-    whole = find_placement(body, labels, marker_set)
+    whole = find_placement(body, markers.names, marker_set)
     points = whole.points
     if np.ndim(sigma) and marker_set is not None and len(np.asarray(sigma)) != len(points):
         own = body.marker_sets.get(str(marker_set), points)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from kinefit.bodies.marker_sets import bare, subject_of
 from kinefit.errors import ObservationError
 from kinefit.observations import Markers
 
@@ -23,12 +24,12 @@ def split_people(markers: Markers) -> dict[str, Markers]:
     """
     columns: dict[str, list[int]] = {}
     for i, name in enumerate(markers.names):
-        columns.setdefault(name.rpartition(":")[0].strip(), []).append(i)
+        columns.setdefault(subject_of(name), []).append(i)
     named = {person: own for person, own in columns.items() if person and len(own) >= FEWEST}
     kept = named or {"": list(range(len(markers.names)))}
     out = {}
     for person, own in kept.items():
-        labels = tuple(markers.names[i].rpartition(":")[2].strip() for i in own)
+        labels = tuple(bare(markers.names[i]) for i in own)
         twice = sorted({n for n in labels if labels.count(n) > 1})
         if twice:
             raise ObservationError(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.marker_sets import bare, matched
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry import se3
 from kinefit.initialization.from_points import aligned_root
@@ -27,15 +28,13 @@ _ROUGH = 0.03  # [m] how far a body that is not yet the subject's may be off
 _NEAR = 0.03  # [m] median distance of a start that needs no other
 
 
-def bare(label: str) -> str:
-    """A label without its subject's prefix: "Anna:LASI" -> "LASI"."""
-    return label.rpartition(":")[2].strip()
-
-
 def columns(markers: Markers, names: Sequence[str]) -> NDArray:
-    """(F, K, 3) [m] the named markers of a recording, NaN for those that it does not have."""
-    labels = [bare(n) for n in markers.names]
-    twice = sorted({n for n in names if labels.count(n) > 1})
+    """(F, K, 3) [m] the named markers of a recording, by the rule for labels; NaN for those that it does not have."""
+    meant = matched(markers.names, names)
+    exact = [label == bare(n) for n, label in zip(markers.names, meant)]
+    where = {n: [i for i, label in enumerate(meant) if label == n] for n in names}
+    where = {n: [i for i in own if exact[i]] or own for n, own in where.items()}  # spelt as the set has it comes first
+    twice = sorted(n for n, own in where.items() if len(own) > 1)
     if twice:
         raise ObservationError(
             f"{len(twice)} labels are there for more than one subject: {', '.join(twice[:6])}",
@@ -43,8 +42,8 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
         )
     out = np.full((len(markers), len(names), 3), np.nan)
     for k, name in enumerate(names):
-        if name in labels:
-            out[:, k] = markers.positions[:, labels.index(name)]
+        if where[name]:
+            out[:, k] = markers.positions[:, where[name][0]]
     return out
 
 

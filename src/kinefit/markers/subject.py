@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.marker_sets import Placement, find_placement
 from kinefit.errors import ObservationError, TrackingError
-from kinefit.markers.placement import Placement, find_placement
-from kinefit.markers.poses import LOSS, bare, columns, sequence_both_ways
+from kinefit.markers.poses import LOSS, columns, sequence_both_ways
 from kinefit.observations import Markers
 from kinefit.solvers.marker_shape import MarkerShape, fit_marker_shape, marker_parameters
 
@@ -88,7 +88,7 @@ def fit_marker_subject(
     ----------
     body : Body, generic.
     trials : labelled; labels may carry a subject's prefix ("Anna:LASI").
-    marker_set : see `placement.find_placement`.
+    marker_set : see `bodies.marker_sets.find_placement`.
     frames : how many are used at most, those of most different postures.
     height : float [m] of the subject, barefoot.
 
@@ -108,7 +108,7 @@ def fit_marker_subject(
         )
     progress = progress or (lambda what, done, total: None)
     progress("marker offsets", 0, _ROUNDS)
-    labels = {bare(n) for t in trials for n in t.names}
+    labels = dict.fromkeys(n for t in trials for n in t.names)
     placed = find_placement(body, labels, marker_set)
     given = [columns(t, placed.points.names)[:: _stride(t)] for t in trials]
     x = np.concatenate(given)

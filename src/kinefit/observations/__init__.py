@@ -5,7 +5,16 @@ one sensor, `frames` what it saw at one time.
 """
 
 from kinefit.observations.depth import CloudVideo, DepthVideo
-from kinefit.observations.frames import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
+from kinefit.observations.features import KeypointVideo, LineVideo
+from kinefit.observations.frames import (
+    DepthFrame,
+    Frame,
+    KeypointFrame,
+    LineFrame,
+    MarkerFrame,
+    PointCloud,
+    SilhouetteFrame,
+)
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.silhouettes import SilhouetteVideo
 
@@ -17,7 +26,10 @@ __all__ = [
     "Detections",
     "Frame",
     "KeypointFrame",
+    "KeypointVideo",
     "Keypoints",
+    "LineFrame",
+    "LineVideo",
     "MarkerEvent",
     "MarkerFrame",
     "Markers",

@@ -142,6 +142,9 @@ class CloudVideo(_Recording):
     viewpoint : bool
         Whether the sensor stood at the origin of its frame: only surfaces that face it can have been seen.
     on_body : bool
+        Whether everything but the body was taken out already.
+    segment : str or None
+        The one segment of the body that all points are on, where that is known.
     source : str
     """
 
@@ -151,6 +154,7 @@ class CloudVideo(_Recording):
     near: float = 0.0
     far: float = np.inf
     on_body: bool = False
+    segment: str | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -168,4 +172,5 @@ class CloudVideo(_Recording):
         away = np.linalg.norm(x, axis=1)
         x = x[(away > 0.0) & (away >= self.near) & (away <= self.far)]
         viewpoint = T[:3, 3] if self.viewpoint else None
-        return PointCloud(self.sensor, float(self.times[i]), x @ T[:3, :3].T + T[:3, 3], viewpoint, self.on_body)
+        x = x @ T[:3, :3].T + T[:3, 3]
+        return PointCloud(self.sensor, float(self.times[i]), x, viewpoint, self.on_body, self.segment)

@@ -209,4 +209,46 @@ class SilhouetteFrame:
         return self.mask.shape[1], self.mask.shape[0]
 
 
-Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame
+@dataclass(frozen=True, eq=False)
+class LineFrame:
+    """Lines in one image that points or edges of the body lie on (P1 2.3).
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the camera in the rig.
+    time : float [s]
+    names : (L,) of the lines
+    landmarks : (L,) of one or two names each
+        The body's landmarks that lie on a line: the two ends of an edge, or a single point.
+    ends : (L, 2, 2) [px]
+        Two points of every line in the calibration's image frame, in any order; NaN for one that was not seen.
+
+    Raises
+    ------
+    ObservationError
+        Shapes that do not agree; a line through one or two equal points, or of no or more than two landmarks.
+    """
+
+    sensor: str
+    time: float
+    names: tuple[str, ...]
+    landmarks: tuple[tuple[str, ...], ...]
+    ends: NDArray
+
+    def __post_init__(self) -> None:
+        ends = _frozen(self.ends, float)
+        if ends.shape != (len(self.names), 2, 2) or len(self.landmarks) != len(self.names):
+            problem = f"lines of {self.sensor} have shape {ends.shape}, with landmarks of {len(self.landmarks)}"
+            raise ObservationError(problem, remedy=f"Give ({len(self.names)}, 2, 2), and landmarks for each line.")
+        for name, own, (a, b) in zip(self.names, self.landmarks, ends):
+            if not 1 <= len(set(own)) == len(own) <= 2:
+                problem = f"line '{name}' of {self.sensor} has the landmarks {', '.join(own) or 'none'}"
+                raise ObservationError(problem, remedy="Give the two ends of an edge, or one point that lies on it.")
+            if np.linalg.norm(a - b) < 1.0:
+                problem = f"the points of line '{name}' of {self.sensor} are less than a pixel apart"
+                raise ObservationError(problem, remedy="Give two points of it far from each other.")
+        object.__setattr__(self, "ends", ends)
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame

@@ -42,6 +42,7 @@ from kinefit.motion import UP_AXES, Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
 ARRAYS = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
+SURFACE_ARRAYS = ("rms", "count")
 RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured", "swapped")
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
@@ -111,7 +112,12 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
 
 def _residuals(arrays: Mapping[str, NDArray], sensor: str, F: int, S: int) -> Residuals:
     K, N = len(arrays["names"]), {"px": 2, "m": 3}[str(arrays["unit"])]
-    shapes = {"segments": (K,), "values": (F, K, N), "measured": (F, K, N), "weights": (F, K), "swapped": (F,)}
+    surface = "rms" in arrays
+    N = 1 if surface else N
+    shapes: dict[str, tuple[int, ...]] = {
+        "segments": (K,), "values": (F, K, N), "measured": (F, K, N), "weights": (F, K), "swapped": (F,),
+        **({"rms": (F, K), "count": (F, K)} if surface else {}),
+    }  # fmt: skip
     for key, shape in shapes.items():
         _check(f"residuals/{sensor}/{key}", arrays[key], shape)
         arrays[key].flags.writeable = False

@@ -17,7 +17,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import DepthFrame, Frame
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
@@ -36,7 +36,7 @@ def depth_fusion(
     up: str = "y",
     start: BodyState | None = None,
     size: bool = True,
-    settings: FusionSettings | None = None,
+    settings: TrackSettings | None = None,
     progress: Progress | None = None,
 ) -> Motion:
     """Motion of a person from what any sensors saw, step by step.
@@ -51,7 +51,7 @@ def depth_fusion(
     up : vertical axis of the world
     start : state of the first step; default: sought.
     size : whether the person's size is found from the first depth images (some seconds of one core each).
-    settings : FusionSettings
+    settings : TrackSettings
 
     Raises
     ------

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kinefit.bodies import BodyState
+from kinefit.bodies.marker_sets import bare
 from kinefit.errors import TrackingError
 from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
 from kinefit.initialization.from_points import pose_from_points
-from kinefit.markers.poses import bare
 from kinefit.markers.subject import MarkerSubject
 from kinefit.observations import MarkerFrame
 

@@ -16,16 +16,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, DofRows, PairRows, Rows
 from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
+
+if TYPE_CHECKING:
+    from kinefit.sensors.occlusion import DepthSeen
 
 
 @dataclass(frozen=True)
@@ -56,12 +60,68 @@ class Hints:
     view: DepthView | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Leftover:
+    """What the fit leaves over of one measurement, point by point or segment by segment.
+
+    Parameters
+    ----------
+    label : name under which a report has it: a camera's, a marker system's
+    names : (K,) of the points, or of the segments
+    segments : (K,) int
+    values : (K, N) measured minus fitted, N = 2 [px] or 3 [m]; of segments the signed median, N = 1; NaN where unseen
+    weights : (K,) robust weight in 0..1; 0 where unseen
+    unit : "px" or "m"
+    measured : (K, N) the measurements as used; NaN for segments
+    swapped : whether left and right were exchanged
+    rms, count : (K,) of the residuals of each segment; None for points
+    """
+
+    label: str
+    names: tuple[str, ...]
+    segments: NDArray
+    values: NDArray
+    weights: NDArray
+    unit: str
+    measured: NDArray
+    swapped: bool = False
+    rms: NDArray | None = None
+    count: NDArray | None = None
+
+
 class Matched(ABC):
-    """A measurement with its correspondences."""
+    """A measurement with its correspondences.
+
+    Attributes
+    ----------
+    sensor : name of the sensor
+    of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
+    shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
+    """
+
+    sensor: str = ""
+    of_points: bool = True
+    shows_surface: bool = False
+
+    @property
+    def key(self) -> bytes:
+        """The same for matches that make the same rows: what tells a fit that nothing discrete changes any more."""
+        return b""
 
     @abstractmethod
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Rows at a scene's state: a pure function of the scene, not softened, each kind with its loss."""
+
+    def squares(self, scene: Scene) -> NDArray:
+        """(M,) squared residual of each of its points, in variances; by default of each group of rows."""
+        return np.concatenate([np.zeros(0), *(np.array([s for _, s in _groups(r)]) for r in self.rows(scene))])
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """What the fit leaves over; by default of each segment the rows' signed median, RMS and number [m]."""
+        parts = [r for r in self.rows(scene) if isinstance(r, Rows)]
+        residual = np.concatenate([np.zeros(0), *(r.residual for r in parts)])
+        segment = np.concatenate([np.zeros(0, np.int64), *(r.segment for r in parts)])
+        return [by_segments(self.sensor, scene.body, residual, segment, "m")]
 
     def evidence(self, scene: Scene) -> Evidence:
         """What it says of each segment; by default every group of rows speaks for its segments, or against them."""
@@ -95,6 +155,10 @@ class Measurement(ABC):
         """What it tells where no pose is known."""
         return Hints()
 
+    def depth_image(self) -> DepthSeen | None:
+        """A depth image that other sensors may ask what is in front of something."""
+        return None
+
     def compact(self) -> Measurement:
         """What a smoother keeps of it: no whole images."""
         return self
@@ -116,7 +180,7 @@ class Sensor(ABC):
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
         """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from a step that was accepted; `sure` where no segment is lost."""
 
 
@@ -131,6 +195,36 @@ class RowsOf(Matched):
         """As the function makes them."""
         made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
         return [made] if isinstance(made, AnyRows) else list(made)
+
+
+def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
+    """A measurement, matched; a match that names no sensor is the measurement's.
+
+    Raises
+    ------
+    ObservationError
+        What a sensor's `match` gave is no match.
+    """
+    matched = measurement.match(scene, reach)
+    if not isinstance(matched, Matched):
+        problem = f"`match` of sensor '{measurement.sensor}' gave a {type(matched).__name__}"
+        raise ObservationError(problem, remedy="It must return a Matched, such as RowsOf(function).")
+    if not matched.sensor:
+        object.__setattr__(matched, "sensor", measurement.sensor)
+    return matched
+
+
+def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
+    """Residuals (N,) of points on segments (N,), told segment by segment."""
+    count = np.bincount(segment, minlength=len(body.tree.segments))
+    median, rms = np.full(len(count), np.nan), np.full(len(count), np.nan)
+    for s in np.flatnonzero(count):
+        own = residual[segment == s]
+        median[s], rms[s] = np.median(own), np.sqrt(np.mean(own**2))
+    names, nothing = body.tree.segments, np.full((len(count), 1), np.nan)
+    every = np.arange(len(count))
+    weights = (count > 0).astype(float)
+    return Leftover(label, names, every, median[:, None], weights, unit, nothing, rms=rms, count=count)
 
 
 def _groups(rows: AnyRows) -> list[tuple[set[int], float]]:

@@ -53,10 +53,30 @@ class Channels:
         seen = np.isfinite(self.uv).all(axis=-1)
         return np.where(seen, self.confidence / np.square(self.sigma), 0.0)
 
+    def part(self, frames: Sequence[int]) -> Channels:
+        """The same channels in some frames."""
+        return replace(self, uv=self.uv[frames], confidence=self.confidence[frames])
+
+    @classmethod
+    def none(cls, rig: Rig, frames: int) -> Channels:
+        """No keypoints in so many frames."""
+        numbers, points = np.zeros(0, np.int64), PointSet((), np.zeros(0, np.int64), np.zeros((0, 3)))
+        return cls(
+            rig, points, {}, (), numbers, numbers, numbers, numbers, np.zeros(0), np.zeros((frames, 0, 2)),
+            np.zeros((frames, 0)),
+        )  # fmt: skip
+
     def with_points(self, body: Body) -> Channels:
         """The same measurements of another body's points."""
-        parts = [body.keypoints(name).select(self.points.names[span]) for name, span in self.sets.items()]
+        parts = [known_points(body, name).select(self.points.names[span]) for name, span in self.sets.items()]
+        if not parts:
+            return self
         return replace(self, points=joined(parts))
+
+
+def known_points(body: Body, keypoint_set: str) -> PointSet:
+    """Where a keypoint set's points sit on a body; the body's landmarks for no set."""
+    return body.keypoints(keypoint_set) if keypoint_set else body.landmarks
 
 
 def joined(parts: Sequence[PointSet]) -> PointSet:
@@ -94,13 +114,13 @@ def make_channels(
     for record in keypoints:
         if record.camera not in rig:
             raise ObservationError(choices("camera", record.camera, rig.names), file=record.source or None)
-        known = body.keypoints(record.keypoint_set).names
+        known = known_points(body, record.keypoint_set).names
         names.setdefault(record.keypoint_set, [n for n in record.names if n in known])
     sets, parts, start = {}, [], 0
     for name, chosen in names.items():
         if not chosen:
             raise ObservationError(f"body '{body.name}' has none of the points of {name}")
-        parts.append(body.keypoints(name).select(tuple(chosen)))
+        parts.append(known_points(body, name).select(tuple(chosen)))
         sets[name] = slice(start, start := start + len(chosen))
     source: list[int] = []
     camera: list[int] = []

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,144 +15,245 @@ from kinefit.correspondences.free_space import FreeSpace
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.observations import DepthFrame
-from kinefit.rows import Rows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors import _kernels_depth_image as kernels
 from kinefit.sensors.background import Background
-from kinefit.sensors.depth_view import DepthView, view_of
+from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
+from kinefit.sensors.depth_gate import gathered, person_view, window_of
+from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.occlusion import DepthSeen
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
+from kinefit.sensors.surface_match import FreePairs, SegmentResiduals, SurfacePairs, by_segment
 from kinefit.sensors.visibility import judge_segments
 
 AGREES = 3.0  # standard deviations of a measurement that agrees
 _SHAPE = 0.03  # [m] by which a surface of simple shapes is off
 _LIMB = 0.04  # [m] radius of a forearm
+_MOST_PIXELS, _MOST_POINTS = 25_000, 5_000  # of what is kept: 100 kB and 80 kB
 
 
-class DepthMeasurement:
-    """A depth image: measured points towards the surface, the visible surface towards what was measured, free space.
+class DepthImageSensor(Sensor):
+    """A depth camera: measured points towards the surface, the visible surface towards what was measured, free space.
 
     Parameters
     ----------
-    frame : DepthFrame
+    name : as its frames are named
     camera : Camera
-    surface : Surface of the body
-    vertices : (V, 3) [m]
-        Its mesh where the body is thought to be: about it, measured points are gathered.
     sigma : float [m] standard deviation of a depth.
-    background : Background of this camera, None where it moves.
-
-    Raises
-    ------
-    ObservationError
-        An image of another size than the camera's.
+    settings : TrackSettings
+    background : Background of this camera, None where it moves, or shows nothing but the body.
     """
 
     def __init__(
-        self, frame: DepthFrame, camera: Camera, surface: Surface, vertices: NDArray, sigma: float,
-        settings: FusionSettings, background: Background | None = None,
-    ) -> None:  # fmt: skip
+        self, name: str, camera: Camera, sigma: float, settings: TrackSettings, background: Background | None
+    ) -> None:
+        self.name, self.camera, self.sigma, self.settings, self.background = name, camera, sigma, settings, background
+        self._coarse: dict[int, Camera] = {1: camera}
+
+    def prepare(self, frame: DepthFrame, scene: Scene) -> DepthImageMeasurement:
+        """The part of an image that is about the body.
+
+        Raises
+        ------
+        ObservationError
+            An image of another size than the camera's.
+        BodyError
+            A body without surfaces.
+        """
+        return DepthImageMeasurement(self, frame, scene)
+
+    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+        """Let the background learn from a whole image, with the body where it was found."""
+        if self.background is None or not isinstance(measurement, DepthImageMeasurement) or measurement.is_compact:
+            return
+        shown = measurement.drawn_alone(scene)
+        self.background.learn(np.abs(measurement.depth), shown, measurement.box, sure)
+
+    def coarse(self, step: int) -> Camera:
+        """The camera of an image of every `step`-th row and column, from the middle of the first `step` on."""
+        if step not in self._coarse:
+            (width, height), first = self.camera.size, (step - 1) // 2
+            S = np.array([[1.0 / step, 0.0, -first / step], [0.0, 1.0 / step, -first / step], [0.0, 0.0, 1.0]])
+            size = len(range(first, width, step)), len(range(first, height, step))
+            self._coarse[step] = replace(self.camera, size=size, matrix=S @ self.camera.matrix)
+        return self._coarse[step]
+
+
+class DepthImageMeasurement(Measurement):
+    """A depth image of one time.
+
+    Parameters
+    ----------
+    of : DepthImageSensor
+    frame : DepthFrame
+    scene : Scene with the body where it is expected: about it, measured points are gathered.
+
+    Attributes
+    ----------
+    camera : Camera of `depth`
+    sigma : float [m] standard deviation of a depth
+    box : (3,), (3,) [m] corners of what is about the body
+    is_compact : bool, whether only the part about the body is kept.
+    """
+
+    settled = False
+
+    def __init__(self, of: DepthImageSensor, frame: DepthFrame, scene: Scene) -> None:
+        camera, s, surface = of.camera, of.settings, scene.surface
         if frame.size != camera.size:
             problem = f"depth images of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
             raise ObservationError(problem, remedy="Give the camera of these images, or camera.scaled(size).")
-        self.sensor, self.camera, self.surface, self.sigma, self._settings = (
-            frame.sensor, camera, surface, sigma, settings,
-        )  # fmt: skip
-        self._raw, self._background = frame.depth, background
-        box = np.empty((2, 3))
-        kernels.box(vertices, box)
-        self._low, self._high = box[0] - settings.reach, box[1] + settings.reach
-        first, last, self._back = self._window()
-        self._depth = frame.depth if background is None else background.marked(frame.depth, first, last)
-        self._shown = surface.depth(vertices, camera)
-        self._space = self._free()
-        self._calls = 0
-        patch = settings.patch**2
-        self._points, share = self._gather(first, last, patch)
-        self._point_sigma = sigma / np.sqrt(share / 2.0)  # halved: a patch is told of by its points and by its samples
-        per_sample = min(surface.areas.sum() / (patch * max(len(surface.samples), 1)), 1.0)
-        self._sample_sigma = sigma / np.sqrt(per_sample / 2.0)
-        # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
-        # points draw thin limbs towards the sensor: by 2 to 5 cm with deviations of 3 cm. Pixels do not.
-        self._blur = min(_LIMB / (4.0 * sigma), 1.0) ** 2
+        self.sensor, self.time, self.of, self.camera, self.sigma = of.name, frame.time, of, camera, of.sigma
+        vertices, corners = surface.posed(scene.state), np.empty((2, 3))
+        kernels.box(vertices, corners)
+        self.box = corners[0] - s.reach, corners[1] + s.reach
+        first, last, self._farthest = window_of(camera, *self.box)
+        self._window, self._at = (first, last), (0, 0)
+        self._kept = frame.depth if of.background is None else of.background.marked(frame.depth, first, last)
+        self._shown: NDArray | None = surface.depth(vertices, camera).copy()
+        self._space = self._free(self._shown)
+        self._matches, self.is_compact = 0, False
+        self._judged: tuple[BodyState, NDArray] | None = None
+        self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
+        patches = surface.areas.sum() / (s.patch**2 * max(len(surface.samples), 1))
+        self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is told of by both
 
-    def _window(self) -> tuple[tuple[int, int], tuple[int, int], float]:
-        """First and last row and column of the image that the body may be in, and its largest depth [m] there."""
-        corners = np.stack(np.meshgrid(*zip(self._low, self._high)), axis=-1).reshape(-1, 3)
-        z = corners @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
-        uv, (width, height) = self.camera.project(corners), self.camera.size
-        if not (z > 0.0).all() or not np.isfinite(uv).all():  # part of the box is behind the camera
-            return (0, 0), (height, width), max(float(z.max()), 1e-3)
-        low = np.clip(np.floor(uv.min(axis=0)), 0, (width, height)).astype(int)
-        high = np.clip(np.ceil(uv.max(axis=0)) + 1, 0, (width, height)).astype(int)
-        return (int(low[1]), int(low[0])), (int(high[1]), int(high[0])), float(z.max())
-
-    def _gather(self, first: tuple[int, int], last: tuple[int, int], patch: float) -> tuple[NDArray, NDArray]:
-        """(3, N) [m] measured points about the body, and (N,) the share of an independent measurement each is."""
-        camera, K = self.camera, self.camera.matrix
-        drawn = np.isfinite(self._shown).mean() * camera.size[0] * camera.size[1]  # pixels that the body fills, about
-        step = max(int(np.sqrt(max(drawn, 1.0) / self._settings.points)), 1)
-        rows, columns = (-(-(b - a) // step) for a, b in zip(first, last))
-        out, share = np.empty((3, rows * columns)), np.empty(rows * columns)
-        count = kernels.gated_points(
-            self._depth, camera.ray_table, camera.packed, self._low, self._high, first[0], last[0], first[1], last[1],
-            step, step * step / (K[0, 0] * K[1, 1] * patch), out, share,
-        )  # fmt: skip
-        return np.ascontiguousarray(out[:, :count]), share[:count]
-
-    def _free(self) -> FreeSpace | None:
-        """Where the body can be, and where some of it is missing, with the body as it is drawn now."""
-        if not np.isfinite(self._settings.through):
-            return None
-        reach = AGREES * self.sigma + _SHAPE
-        return FreeSpace.of(self._depth, farthest=self._back, shown=self._shown, tolerance=reach)
-
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
-        """Rows at a state, softened at half the bound."""
-        body, samples, s = self.surface.body, self.surface.samples, self._settings
-        bound = max(bound, AGREES * self.sigma)
-        if self._calls and self._calls % s.render_every == 0:
-            self._shown = self.surface.depth(self.surface.posed(state), self.camera)
-            self._space = self._free()
-        self._calls += 1
-        points = surface_rows(
-            body, state, self._points.T, max_distance=bound, sigma=self._point_sigma,
-            viewpoint=self.camera.centre_world,
-        )  # fmt: skip
-        pixels = depth_image_rows(
-            body, state, samples, self.camera, self._depth, self._shown, before=bound, behind=bound,
-            sigma=self._sample_sigma,
-        )  # fmt: skip
-        for rows in (points, pixels):
-            kernels.soften(rows.data, bound / 2.0)
-        if bound <= max(s.near, AGREES * self.sigma):
-            points.data[7] *= self._blur
-        out = [points, pixels]
-        if self._space is not None:
-            reach, sigma = AGREES * self.sigma + _SHAPE, s.through * self._space.cell
-            out.append(free_space_rows(body, state, samples, self._space, self.camera, tolerance=reach, sigma=sigma))
-        for rows in out:
-            rows.group[:] = -1  # softened already
+    @property
+    def depth(self) -> NDArray:
+        """(H, W) float32 [m] of its camera: 0 where nothing was measured or kept, negative where it is background."""
+        width, height = self.camera.size
+        if self._kept.shape == (height, width):
+            return self._kept
+        out, (row, column) = np.zeros((height, width), np.float32), self._at
+        out[row : row + self._kept.shape[0], column : column + self._kept.shape[1]] = self._kept
         return out
 
-    def evidence(self, state: BodyState) -> Evidence:
+    def _free(self, shown: NDArray) -> FreeSpace | None:
+        """Where the body can be, and where some of it is missing, with the body as it is drawn."""
+        if not np.isfinite(self.of.settings.through):
+            return None
+        return FreeSpace.of(self.depth, farthest=self._farthest, shown=shown, tolerance=self._astray)
+
+    @property
+    def _astray(self) -> float:
+        """[m] by which a measurement lies behind the surface and speaks against it."""
+        return AGREES * self.sigma + _SHAPE
+
+    def _drawn(self, scene: Scene) -> tuple[NDArray, FreeSpace | None]:
+        """The body's own depth and free space, drawn anew after every `render_every` matches."""
+        due = self._shown is None or (self._matches > 0 and self._matches % self.of.settings.render_every == 0)
+        self._matches += 1
+        if not due and self._shown is not None:
+            return self._shown, self._space
+        shown = scene.surface.depth(scene.surface.posed(scene.state), self.camera).copy()
+        space = self._free(shown)
+        if not self.is_compact:
+            self._shown, self._space = shown, space
+        return shown, space
+
+    def match(self, scene: Scene, reach: float) -> DepthImageMatched:
+        """Nearest points of the surface, the visible samples' pixels, and where samples in free space should go."""
+        body, state, samples, s, sigma = scene.body, scene.state, scene.surface.samples, self.of.settings, self.sigma
+        bound, depth = max(reach, AGREES * sigma), self.depth
+        shown, space = self._drawn(scene)
+        measured = np.ascontiguousarray(self._points.T, float)
+        points = surface_rows(
+            body, state, measured, max_distance=bound, sigma=sigma / np.sqrt(self._share / 2.0),
+            viewpoint=self.camera.centre_world, frames=scene.frames,
+        )  # fmt: skip
+        pixels = depth_image_rows(
+            body, state, samples, self.camera, depth, shown, before=bound, behind=bound, sigma=self._sample_sigma,
+            frames=scene.frames,
+        )  # fmt: skip
+        # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
+        # points draw thin limbs towards the sensor: by 2 to 5 cm with deviations of 3 cm. Pixels do not.
+        blur = min(_LIMB / (4.0 * sigma), 1.0) ** 2 if bound <= max(s.near, AGREES * sigma) else 1.0
+        free = None
+        if space is not None:
+            sigma = s.through * space.cell
+            free = FreePairs.found(scene, samples, space, self.camera, tolerance=self._astray, sigma=sigma)
+        return DepthImageMatched(
+            self, SurfacePairs.nearest(points, measured, scene, bound / 2.0, blur),
+            SurfacePairs.seen(pixels, samples, scene, bound / 2.0), free,
+        )  # fmt: skip
+
+    def evidence(self, scene: Scene) -> Evidence:
         """Pixels for and against each segment; see `judge_segments`."""
-        layers, vertices = self.surface.layers(self.camera), self.surface.posed(state)
-        self.surface.judged = state
-        return judge_segments(vertices, layers, self._depth, self.camera, noise=(self.sigma / 2.0, 0.0)).evidence
+        layers, vertices = scene.surface.layers(self.camera), scene.surface.posed(scene.state)
+        told = judge_segments(vertices, layers, self.depth, self.camera, noise=(self.sigma / 2.0, 0.0))
+        self._judged = None if self.is_compact else (scene.state, layers.front.copy())
+        return told.evidence
 
-    def view(self) -> DepthView | None:
+    def drawn_alone(self, scene: Scene) -> NDArray:
+        """(h, w) [m] the body's own depth at a scene's state, small; what evidence has drawn is not drawn twice."""
+        if self._judged is not None and self._judged[0] is scene.state:
+            return self._judged[1]
+        return scene.surface.depth(scene.surface.posed(scene.state), self.camera)
+
+    def depth_image(self) -> DepthSeen:
+        """For other sensors, what stands still among it."""
+        return DepthSeen(np.abs(self.depth), self.camera, self.sigma)
+
+    def hints(self, scene: Scene) -> Hints:
         """All that was measured about the body and is not background."""
-        rays, T = self.camera.ray_table, self.camera.T_world_camera
-        x = np.stack([*rays, np.ones_like(rays[0])], axis=-1) * self._depth[..., None] @ T[:3, :3].T + T[:3, 3]
-        person = (self._depth > 0) & (x > self._low).all(axis=-1) & (x < self._high).all(axis=-1)
-        return view_of(self._raw, person, self.camera) if person.any() else None
+        return Hints(view=person_view(self.depth, self.camera, self.box))
 
-    def learn(self, state: BodyState, sure: bool) -> None:
-        """Let the background learn from the image, with the body where it was found."""
-        if self._background is not None:
-            if self.surface.judged is state:  # drawn already
-                shown = self.surface.layers(self.camera).front
-            else:
-                shown = self.surface.depth(self.surface.posed(state), self.camera)
-            self._background.learn(self._raw, shown, (self._low, self._high), sure)
+    def compact(self) -> DepthImageMeasurement:
+        """The part of the image about the body, of every n-th row and column, and its points: at most 200 kB."""
+        if self.is_compact:
+            return self
+        out = copy(self)
+        thin = max(-(-self._share.size // _MOST_POINTS), 1)
+        out._points = np.ascontiguousarray(self._points[:, ::thin], np.float32)
+        out._share = np.minimum(thin * self._share[::thin], 1.0).astype(np.float32)
+        (top, left), (bottom, right) = self._window
+        step = max(int(np.ceil(np.sqrt((bottom - top) * (right - left) / _MOST_PIXELS))), 1)
+        out.camera, first = self.of.coarse(step), (step - 1) // 2
+        out._at = max(-((first - top) // step), 0), max(-((first - left) // step), 0)
+        end = -((first - bottom) // step), -((first - right) // step)
+        out._kept = self._kept[first::step, first::step][out._at[0] : end[0], out._at[1] : end[1]].copy()
+        out._shown = out._space = out._judged = None
+        out._matches, out.is_compact = 0, True
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImageMatched(Matched):
+    """A depth image with its correspondences.
+
+    Parameters
+    ----------
+    measurement : DepthImageMeasurement
+    points : SurfacePairs of measured points and the nearest ones of the surface
+    samples : SurfacePairs of visible samples of the surface
+    free : FreePairs of samples that the sensor saw through; None where these are not asked for.
+    """
+
+    measurement: DepthImageMeasurement
+    points: SurfacePairs
+    samples: SurfacePairs
+    free: FreePairs | None
+    of_points = False
+    shows_surface = True
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the depth camera."""
+        return self.measurement.sensor
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """One row a measured point, one a visible sample, one a sample in free space."""
+        return [pairs.rows(scene) for pairs in (self.points, self.samples, self.free) if pairs is not None]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """Pixels for and against each segment; see `judge_segments`."""
+        return self.measurement.evidence(scene)
+
+    def summary(self, scene: Scene) -> SegmentResiduals:
+        """Distances [m] of what was measured from the surface, by segments."""
+        both = [pairs.on_segments(scene) for pairs in (self.points, self.samples)]
+        residual, segment = (np.concatenate([getattr(r, name) for r in both]) for name in ("residual", "segment"))
+        return by_segment(residual, segment, len(scene.body.tree.segments))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.correspondences.planes import plane_rows
+from kinefit.bodies import PointSet
 from kinefit.geometry.camera import Camera
-from kinefit.observations import DepthFrame
-from kinefit.rows import Rows
+from kinefit.rows import DofRows, Rows
+from kinefit.sensors.scene import Scene
 
 SEEN = 0.8  # confidence from which a keypoint is taken to be seen; detectors are less sure of what they guess
 BESIDE = np.radians(10.0)  # between two cameras' views of the body: at 0.5 m behind a hand they are 9 cm apart
@@ -20,49 +21,90 @@ _SKIN = 0.05  # [m] of a joint below it, give or take as much
 _AROUND = 1  # pixels about a keypoint, of which the median counts
 
 
-class InSight:
-    """Points of the body that are seen, and a depth image from about the same place.
+class DepthSeen(NamedTuple):
+    """A depth image for other sensors to ask: (H, W) [m], its camera, its standard deviation [m]."""
+
+    depth: NDArray
+    camera: Camera
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Keypoints of one camera that lie too deep behind what was measured in front of them.
 
     Parameters
     ----------
-    body : Body
-    points : PointSet of the body that are seen
-    frame : DepthFrame
-    camera : Camera of the depth image
-    sigma : float [m] standard deviation of a depth
+    index : (K,) int, channels
+    target, sight : (K, 3) [m] where each should lie, along the unit line of sight
+    sigma : float [m]
+    far : int, channels that lie so deep that they could not be seen
     """
 
-    def __init__(self, body: Body, points: PointSet, frame: DepthFrame, camera: Camera, sigma: float) -> None:
-        self.points, self._body, self._camera, self._sigma = points, body, camera, sigma
-        self._depth = frame.depth
+    index: NDArray
+    target: NDArray
+    sight: NDArray
+    sigma: float
+    far: NDArray
 
-    def behind(self, state: BodyState) -> NDArray:
-        """(K,) [m] how far behind the surface that was measured there each point lies; NaN where nothing was."""
-        return self._surface(state)[1]
+    @property
+    def key(self) -> bytes:
+        """The same for the same channels."""
+        return self.index.tobytes()
 
-    def rows(self, state: BodyState) -> Rows:
-        """One row for every point that lies deeper than a joint below the skin, up to it again."""
-        x, behind = self._surface(state)
+    def rows(self, scene: Scene, points: PointSet) -> Rows | DofRows:
+        """One row a channel, up to a joint's depth below the skin; points (N,) are those of all channels."""
+        mine = PointSet(
+            tuple(points.names[k] for k in self.index), points.segments[self.index], points.points[self.index]
+        )
+        gap = np.einsum("ki,ki->k", self.sight, self.target - scene.positions(mine))
+        return scene.along(mine, self.sight, gap, self.sigma)
+
+
+def hidden_points(scene: Scene, points: PointSet, camera: NDArray, sure: NDArray) -> Iterator[Hidden]:
+    """Points of keypoints that depth images of the same time, from beside their cameras, have something in front of.
+
+    Parameters
+    ----------
+    points : PointSet of N channels; camera (N,) int, index in the rig of each
+    sure : (N,) bool, those that are surely seen
+    """
+    seen = [d for m in scene.measurements if (d := m.depth_image()) is not None]
+    if not seen:
+        return
+    root = scene.state.T_world_root[:3, 3]
+    for c in np.unique(camera[sure]):
+        near = beside(scene.rig.cameras[c], [d.camera for d in seen], root)
+        if not near:
+            continue
+        index = np.flatnonzero(sure & (camera == c))
+        shown = seen[near[0]]
+        mine = PointSet(tuple(points.names[k] for k in index), points.segments[index], points.points[index])
+        x = scene.positions(mine)
+        behind = depth_behind(x, shown)
         deep = np.flatnonzero(behind > 2.0 * _SKIN)
-        sight = x[deep] - self._camera.centre_world
-        sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        few = self.points.select(tuple(self.points.names[k] for k in deep))
-        target = x[deep] - (behind[deep, None] - _SKIN) * sight
-        return plane_rows(self._body, state, few, target, sight, sigma=float(np.hypot(_SKIN, self._sigma)))
+        if len(deep):
+            sight = x[deep] - shown.camera.centre_world
+            sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+            target = x[deep] - (behind[deep, None] - _SKIN) * sight
+            sigma = float(np.hypot(_SKIN, shown.sigma))
+            yield Hidden(index[deep], target, sight, sigma, index[behind > THICK])
 
-    def _surface(self, state: BodyState) -> tuple[NDArray, NDArray]:
-        x, camera, (width, height) = self._body.positions(state, self.points), self._camera, self._camera.size
-        uv = camera.project(x)
-        z = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-        behind = np.full(len(x), np.nan)
-        for k in np.flatnonzero(np.isfinite(uv).all(axis=1) & (z > 0.0)):
-            u, v = np.rint(uv[k]).astype(int)
-            if 0 <= u < width and 0 <= v < height:
-                near = self._depth[max(v - _AROUND, 0) : v + _AROUND + 1, max(u - _AROUND, 0) : u + _AROUND + 1]
-                near = near[(near > 0.0) & (near < np.inf)]
-                if len(near):
-                    behind[k] = z[k] - np.median(near)
-        return x, behind
+
+def depth_behind(x_world: NDArray, seen: DepthSeen) -> NDArray:
+    """(K,) [m] how far behind the surface that was measured there each point (K, 3) lies; NaN where nothing was."""
+    camera, (width, height) = seen.camera, seen.camera.size
+    uv = camera.project(x_world)
+    z = x_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    behind = np.full(len(x_world), np.nan)
+    for k in np.flatnonzero(np.isfinite(uv).all(axis=1) & (z > 0.0)):
+        u, v = np.rint(uv[k]).astype(int)
+        if 0 <= u < width and 0 <= v < height:
+            near = seen.depth[max(v - _AROUND, 0) : v + _AROUND + 1, max(u - _AROUND, 0) : u + _AROUND + 1]
+            near = near[(near > 0.0) & (near < np.inf)]
+            if len(near):
+                behind[k] = z[k] - np.median(near)
+    return behind
 
 
 def beside(camera: Camera, others: Sequence[Camera], x_world: NDArray) -> list[int]:

@@ -13,7 +13,7 @@ from kinefit.sensors import _kernels_depth_image as kernels
 from kinefit.sensors.depth_image import AGREES
 from kinefit.sensors.depth_view import DepthView, camera_at, splat, view_of
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
 
 _PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
@@ -34,7 +34,7 @@ class CloudMeasurement:
     """
 
     def __init__(
-        self, frame: PointCloud, surface: Surface, vertices: NDArray, sigma: float, settings: FusionSettings
+        self, frame: PointCloud, surface: Surface, vertices: NDArray, sigma: float, settings: TrackSettings
     ) -> None:
         self.sensor, self.surface, self.sigma, self._eye = frame.sensor, surface, sigma, frame.viewpoint
         self._segment = None if frame.segment is None else np.int64(surface.body.tree.segment(frame.segment))

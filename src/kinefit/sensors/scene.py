@@ -128,7 +128,8 @@ class Scene:
         if self.morphing is None:
             return targets.fill(kernel, lines, self.body, self.state, points, *given)
         pose = self.morphing.pose(self.state)
-        return on_moved_joints(pose, targets.fill(kernel, lines, self.body, self.state, points, *given, frames=pose.frames))
+        rows = targets.fill(kernel, lines, self.body, self.state, points, *given, frames=pose.frames)
+        return on_moved_joints(pose, rows)
 
     def along(
         self, points: PointSet, direction: NDArray, residual: NDArray, sigma: NDArray | float, **options: Any

@@ -1,4 +1,4 @@
-"""How a fusion of sensors runs: every number in one place, with its reason."""
+"""How a track runs: every number in one place, with its reason."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from kinefit.losses import Loss, geman_mcclure
 
 
 @dataclass(frozen=True)
-class FusionSettings:
-    """Settings of the fusion tracker.
+class TrackSettings:
+    """Settings of the tracker and of the smoother.
 
     Parameters
     ----------
@@ -58,12 +58,20 @@ class FusionSettings:
     search : bool
         Whether what is lost is sought: a limb takes 50 ms of one core, a whole body 2 s. Without it every frame takes
         as long as any other, and `start_at` is the only start.
+    support : float in 0..1
+        Share of the evidence that agrees below which a start from points that are known in space is tried.
     poor : float in 0..1
         Mean quality below which the whole body counts as lost, and is sought as at the start.
     doubtful : float in 0..1
         Quality of a segment below which its limb is sought together with one that is lost.
     search_after, search_every : float [s]
         How long something must have been lost, and how long to wait between two searches.
+    smooth_memory : float [s]
+        Time constant of a velocity that nothing confirms, where a whole take is smoothed.
+    acceleration_memory : float [s]
+        Time constant of an acceleration, where a whole take is smoothed.
+    smooth_rounds : int
+        How often process noise and the sensors' noise are estimated anew, at most.
     """
 
     points: int = 1000
@@ -92,7 +100,11 @@ class FusionSettings:
     loss: Loss = field(default_factory=geman_mcclure)
     pause: float = 1.0
     search: bool = True
+    support: float = 0.5
     poor: float = 0.4
     doubtful: float = 0.6
     search_after: float = 0.0
     search_every: float = 0.1
+    smooth_memory: float = 1.0
+    acceleration_memory: float = 0.2
+    smooth_rounds: int = 8

@@ -17,7 +17,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import scaled
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface import Surface
 
 _AGREES = 3.0  # standard deviations of a rim that agrees
@@ -27,7 +27,7 @@ _SPACING = 2.0  # [px] between points of an outline, in the image in which they 
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
 
 
-def outline_camera(camera: Camera, settings: FusionSettings) -> Camera:
+def outline_camera(camera: Camera, settings: TrackSettings) -> Camera:
     """The camera with an image in which outlines are compared, a whole number of times smaller than its own."""
     return scaled(camera, 1.0 / max(round(max(camera.size) / settings.outline), 1))
 
@@ -52,7 +52,7 @@ class SilhouetteMeasurement:
 
     def __init__(
         self, frame: SilhouetteFrame, camera: Camera, surface: Surface, vertices: NDArray, sigma: float,
-        settings: FusionSettings,
+        settings: TrackSettings,
     ) -> None:  # fmt: skip
         if frame.size != camera.size:
             problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {camera.size}"

@@ -63,7 +63,11 @@ class Surface:
         if self.mesh is self.morphing.mesh:
             return self.pose(state).vertices
         if self._posed is None or self._posed[0] is not state:
-            self._posed = state, self.mesh.posed(self.body.tree.forward(state.T_world_root, state.angles)[0])
+            if self.morphing.moves_joints:
+                frames = self.morphing.pose(state).frames
+            else:
+                frames = self.body.tree.forward(state.T_world_root, state.angles)[0]
+            self._posed = state, self.mesh.posed(frames)
         return self._posed[1]
 
     def pose(self, state: BodyState) -> MorphedPose:

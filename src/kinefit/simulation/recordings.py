@@ -170,7 +170,7 @@ def _write_sensor(job: _Job, sensor: str, chosen: Sequence[str], folder: Path) -
         for name in names:
             _write_video(job, name, STEREO, folder / f"{name}.mkv", grey=True)
         entries = [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mkv"\n' for name in names]
-        pair = f'[[stereo]]\nleft = "{names[0]}"\nright = "{names[1]}"\naccuracy = {_DISPARITY_ACCURACY}  # px\n'
+        pair = f'[[stereo]]\nleft = "{names[0]}"\nright = "{names[1]}"\nsigma = {_DISPARITY_ACCURACY}  # px\n'
         return [*entries, pair]
     if sensor == "colour":
         _write_video(job, "colour", COLOUR, folder / "colour.mp4", grey=False)
@@ -189,7 +189,7 @@ def _write_depth(job: _Job, sensor: DepthSensor, folder: Path) -> list[str]:
     away = float(np.linalg.norm(places(motion).mean(axis=0) - camera.centre_world))
     return [
         f'[[depth]]\nname = "{sensor.name}"\nfile = "{sensor.name}"\nunit = {_UNIT}\nrate = {float(motion.rate)}\n'
-        f"range = [{sensor.near}, {sensor.far}]\naccuracy = {float(sensor.sigma(away)):.4f}\n"
+        f"range = [{sensor.near}, {sensor.far}]\nsigma = {float(sensor.sigma(away)):.4f}\n"
     ]
 
 
@@ -221,7 +221,7 @@ def _write_keypoints(job: _Job, folder: Path) -> str:
     np.save(folder / "mediapipe_colour.npy", np.nan_to_num(points).astype(np.float32))
     return (
         f'[[keypoints]]\ncamera = "colour"\nfile = "mediapipe_colour.npy"\nformat = "mediapipe"\n'
-        f"accuracy = {_KEYPOINT_ACCURACY}\n"
+        f"sigma = {_KEYPOINT_ACCURACY}\n"
     )
 
 

@@ -92,7 +92,7 @@ def _take(motion: Motion, rig: Rig) -> str:
     parts += [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mp4"\n' for name in rig.names]
     parts += [
         f'[[keypoints]]\ncamera = "{name}"\nfile = "mediapipe_{name}.npy"\nformat = "mediapipe"\n'
-        f"accuracy = {_ACCURACY}\n"
+        f"sigma = {_ACCURACY}\n"
         for name in rig.names
     ]
     return "\n".join(parts)

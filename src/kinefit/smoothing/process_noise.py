@@ -7,16 +7,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.losses import Loss
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
+from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
 
 INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
 _RAYLEIGH = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ²
+_MEDIAN = 0.4549  # of a squared normal variable
+_ROWS = 30  # of a sensor, with fewer of which its standard deviation stays as it is stated
 _LOOK = 0.25  # [s] for which a detector errs alike, so that its frames count as one look at a point
 _SAMPLES = 30.0  # looks at a point that count as much as all the others of its source together
 _FRAMES = 10.0  # changes of a degree of freedom that count as much as what was assumed of it
@@ -40,7 +43,7 @@ class Strength:
     def change(self, other: Strength) -> float:
         """Largest relative difference of anything in it."""
         pairs = zip(*((s.acceleration, s.sigma) for s in (self, other)), strict=True)
-        return max(float(np.abs(np.log(a / b)).max()) for a, b in pairs)
+        return max(float(np.abs(np.log(a / b)).max(initial=0.0)) for a, b in pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,8 @@ class SmoothTake:
     """Measurements of all frames as used (left and right put right), and states to start from.
 
     `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): how much livelier
-    than usual each degree of freedom is.
+    than usual each degree of freedom is; `others`: what all sensors but the keypoints measured, `linear` the same about
+    the states.
     """
 
     body: Body
@@ -64,11 +68,22 @@ class SmoothTake:
     loss: Loss
     memory: tuple[float, float]
     contacts: Contacts | None = None
+    others: OtherSensors | None = None
+    linear: Linearised | None = None
+
+    def renewed(self) -> SmoothTake:
+        """With all other sensors matched and linearised anew about the states."""
+        if self.others is None:
+            return self
+        return replace(self, linear=self.others.linearised(self.body, self.roots, self.angles))
 
     def part(self, frames: slice) -> SmoothTake:
         """A stretch of it."""
         cut = {name: getattr(self, name)[frames] for name in ("uv", "confidence", "roots", "angles", "told", "live")}
-        return replace(self, **cut, contacts=self.contacts and self.contacts.part(frames))
+        return replace(
+            self, **cut, contacts=self.contacts and self.contacts.part(frames),
+            others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),
+        )  # fmt: skip
 
     def seen(self, sigma: NDArray) -> SeenPoints:
         """Its pixels and contacts as the solver takes them; sigma (N,) [px]."""
@@ -103,7 +118,11 @@ class SmoothTake:
         lower[:, never] = upper[:, never] = usual[:, never]
         prior = MotionPrior(strength.acceleration, self.memory, self.dt, usual, self.body.tree.spread, self.live)
         make = self.seen(strength.sigma).equations(self.body)
-        fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=(lower, upper), tolerance=tolerance)
+        dense = self.linear is not None
+        if self.linear is not None:
+            make = with_quadratic(self.body, make, self.linear)
+        bounds = lower, upper
+        fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
         return fit, posterior(self.body, fit)
 
 
@@ -131,6 +150,7 @@ def estimate(
     while count < rounds:
         count += 1
         squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
+        takes = [take.renewed() for take in takes]
         for i, take in enumerate(takes):
             fit, post = take.fit(strength, tolerance=1e-3)
             of_r, of_gamma = _changes(take, fit, post)
@@ -147,6 +167,10 @@ def estimate(
         found = Strength(acceleration, _noise(channels, r2, variance, looks))
         change = found.change(strength)
         strength = found
+        if takes[0].others is not None:
+            scale = sensor_scales(takes)
+            change = max(change, _largest_change(takes[0].others.scale, scale))
+            takes = [replace(t, others=t.others and replace(t.others, scale=scale)) for t in takes]
         if change < _SETTLED:
             break
     return strength, takes, count
@@ -155,10 +179,36 @@ def estimate(
 def enliven(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
     """The same take with its liveliness, where the rest is known."""
     for _ in range(rounds):
+        take = take.renewed()
         fit, post = take.fit(strength, tolerance=1e-3)
         live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
     return take
+
+
+def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
+    """Factor of each sensor's standard deviation that its residuals ask for, 1 at least.
+
+    What is left over of the nearest points of a surface is smaller than their errors, so that a stated standard
+    deviation is never made smaller.
+    """
+    squares: dict[str, list[NDArray]] = {}
+    for take in takes:
+        assert take.others is not None and take.linear is not None
+        for f, matched in enumerate(take.linear.matched):
+            scene = take.others.scene(f, BodyState(take.roots[f], take.angles[f]))
+            for m in matched:
+                for rows in m.rows(scene):
+                    square, factor = squares_of(rows)
+                    squares.setdefault(m.sensor, []).append(square[factor > INLIER])
+    told = {name: np.concatenate(parts) for name, parts in squares.items()}
+    return {
+        name: float(np.sqrt(max(np.median(s) / _MEDIAN, 1.0))) if len(s) >= _ROWS else 1.0 for name, s in told.items()
+    }
+
+
+def _largest_change(old: dict[str, float], new: dict[str, float]) -> float:
+    return max((abs(np.log(v / old.get(name, 1.0))) for name, v in new.items()), default=0.0)
 
 
 def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray, NDArray]:

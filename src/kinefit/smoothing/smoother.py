@@ -1,112 +1,168 @@
-"""A whole take at once: every frame fitted together with a motion prior whose strength the take itself tells."""
+"""A whole take at once: every frame fitted together with a motion prior whose process noise the take itself tells."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.multiview.left_right import find_swaps, limb_groups
 from kinefit.multiview.observability import SHORTEST, levers, near
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.results import BLIND, FrameResult, judged
+from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
+from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.equations import Covariance, joint_std
-from kinefit.tracking.tracker import FrameResult, Settings, informing, judged, prior_alone
+from kinefit.solvers.equations import inverse
 
-_PARTS = 3  # of a long take, from which its strength is estimated
-_ENOUGH = 6  # pixels that hold a root; with fewer a frame is lost
+_PARTS = 3  # of a long take, from which its process noise is estimated
+_ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
+_PASSES = 2  # of matching all other sensors anew and solving, once the process noise is known
 
 
-def smooth_results(
-    body: Body,
-    channels: Channels,
-    results: Sequence[FrameResult],
-    rate: float,
-    settings: Settings,
-    *,
-    contacts: bool = False,
-    up: str = "z",
-    window: int = 600,
-    overlap: int = 60,
-) -> tuple[list[FrameResult], dict[str, Any]]:
-    """Tracked frames, smoothed together.
-
-    Outliers and exchanged sides are those of the track, judged anew once.
+@dataclass(frozen=True, eq=False)
+class SmoothedTake:
+    """A take, smoothed.
 
     Parameters
     ----------
-    results : F frames from a `Tracker`.
+    results : F frames
+    take : SmoothTake as it was solved last
+    weight : (F, N) [1/px²] with which every channel took part, robust factor included
+    provenance : what was estimated, as `Motion.provenance` has it
+    """
+
+    results: list[FrameResult]
+    take: SmoothTake
+    weight: NDArray
+    provenance: dict[str, Any]
+
+
+def smooth_results(
+    body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings,
+    scene_of: SceneOf, *, others: OtherSensors | None = None, contacts: bool = False, up: str = "z",
+    window: int = 600, overlap: int = 60,
+) -> SmoothedTake:  # fmt: skip
+    """Tracked frames of any sensors, smoothed together.
+
+    Outliers and exchanged sides are those of the track, judged anew once; correspondences of other sensors than
+    keypoints are found anew in every round.
+
+    Parameters
+    ----------
+    channels : keypoints of the F frames, of no points where there are none
+    results : F frames from a `Tracker`
     rate : float [Hz]
+    scene_of : (state, time) -> scene
+    others : what all sensors but the keypoints measured
     contacts : bool
         Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
     window, overlap : frames of a part that is solved at once, and how many it shares with the next.
-
-    Returns
-    -------
-    results, and what was estimated, as `Motion.provenance` has it.
     """
-    swapped = np.stack([r.swapped for r in results])
-    take = _take(body, channels, results, swapped, rate, settings)
+    swapped = swapped_channels(channels, results)
+    take = _take(body, channels, results, swapped, rate, settings, others)
     strength, take, rounds = _estimate(take, settings, window, overlap)
-    roots, angles, covariances = _solve(take, strength, window, overlap)
-    again = _swaps(take, strength, roots, angles)
+    take, covariances = _solve(take, strength, window, overlap)
+    again = _swaps(take)
     if not np.array_equal(again, swapped):
-        uv, confidence = _exchanged(channels, again)
-        take, swapped = replace(take, uv=uv, confidence=confidence, roots=roots, angles=angles), again
-        roots, angles, covariances = _solve(take, strength, window, overlap)
+        uv, confidence = exchanged(channels, again)
+        take, swapped = replace(take, uv=uv, confidence=confidence), again
+        take, covariances = _solve(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
-        found = find_contacts(body, roots, angles, rate, up)
-        take = replace(take, roots=roots, angles=angles, contacts=found)
-        roots, angles, _ = _solve(take, strength, window, overlap)
-    angles = unwrap(body.tree, angles)
-    fitted, weight = take.fitted(roots, angles), take.confidence / np.square(channels.sigma)
-    # Outliers and quality are told by the accuracy that was stated, as for a single frame: they compare between takes.
-    factor, informs = take.factors(channels.sigma, fitted), informing(body, channels)
+        found = find_contacts(body, take.roots, take.angles, rate, up)
+        take, _ = _solve(replace(take, contacts=found), strength, window, overlap)
+    take = replace(take, angles=unwrap(body.tree, take.angles))
+    fitted = take.fitted(take.roots, take.angles)
+    # Outliers and quality are judged by the stated standard deviations, as for a single frame: they compare between takes.
     took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
+    weight = take.confidence / np.square(channels.sigma)
     smoothed = []
-    for f in range(len(roots)):
-        state, used = BodyState(roots[f], angles[f]), np.where(weight[f][:, None] > 0, take.uv[f], np.nan)
-        std = _deviations(body, state, covariances[f], take.told[f])
-        result = judged(channels, informs, state, std, used, weight[f], factor[f], fitted[f], swapped[f])
-        smoothed.append(replace(result, weight=took_part[f]))
-    return smoothed, _told(take, strength, rounds)
+    for f, result in enumerate(results):
+        state = BodyState(take.roots[f], take.angles[f])
+        matched = tuple(
+            replace(m, uv=np.where(weight[f][:, None] > 0, take.uv[f], np.nan), weight=weight[f], swapped=swapped[f])
+            for m in result.matched if isinstance(m, KeypointMatched)
+        )  # fmt: skip
+        matched += () if take.linear is None else take.linear.matched[f]
+        scene = scene_of(state, result.time)
+        told = take.told[f]
+        smoothed.append(judged(scene, covariances[f], matched, result.iterations, observed=told))
+    return SmoothedTake(smoothed, take, took_part, _told(take, strength, rounds))
 
 
-def _deviations(body: Body, state: BodyState, covariance: NDArray, told: NDArray) -> tuple[NDArray, NDArray]:
-    """Of the degrees of freedom (n,), inf for coordinates known from the prior alone; of the joint centres (S, 3)."""
-    cov = Covariance(covariance, np.empty((len(covariance), 0)))
-    blind = np.concatenate([np.zeros(6, bool), ~told | prior_alone(body, cov.std)])
-    return np.where(blind, np.inf, cov.std), joint_std(body, state, cov)
+def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDArray:
+    """(F, N) bool: channels that the track exchanged with their partner."""
+    out = np.zeros((len(results), len(channels.column)), bool)
+    for f, result in enumerate(results):
+        for m in result.matched:
+            if isinstance(m, KeypointMatched):
+                out[f] = m.swapped
+    return out
 
 
-def _take(
-    body: Body, channels: Channels, results: Sequence[FrameResult], swapped: NDArray, rate: float, settings: Settings
+def pixels_of_track(
+    body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings
 ) -> SmoothTake:
-    """What was tracked, in angles without jumps."""
+    """The pixels of a track as they were used, with its states, not smoothed."""
     roots, angles = (np.stack([getattr(r.state, n) for r in results]) for n in ("T_world_root", "angles"))
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
-    inliers = np.stack([r.factor for r in results]) > INLIER
-    told = np.stack([np.isfinite(r.dof_std[6:]) for r in results])  # in its own frame, not only through others
-    told &= levers(body, points, inliers, roots, angles) > SHORTEST
-    lost = inliers.sum(axis=1) < _ENOUGH
-    roots, angles = bridged(roots, unwrap(body.tree, angles), lost, settings.smooth_memory * rate)
+    everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
     return SmoothTake(
-        body, channels, points, *_exchanged(channels, swapped), roots, angles,
-        near(told, round(settings.smooth_memory * rate)), np.ones((len(roots), body.tree.n_dofs)), 1.0 / rate,
-        settings.loss, (settings.acceleration_memory, settings.smooth_memory),
+        body, channels, points, *exchanged(channels, swapped_channels(channels, results)), roots, angles, everything,
+        np.ones((len(roots), body.tree.n_dofs)), 1.0 / rate, settings.loss,
+        (settings.acceleration_memory, settings.smooth_memory),
     )  # fmt: skip
 
 
-def _exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
+def _take(
+    body: Body, channels: Channels, results: Sequence[FrameResult], swapped: NDArray, rate: float,
+    settings: TrackSettings, others: OtherSensors | None,
+) -> SmoothTake:  # fmt: skip
+    """What was tracked, in angles without jumps."""
+    take = pixels_of_track(body, channels, results, rate, settings)
+    inliers = take.factors(channels.sigma, take.fitted(take.roots, take.angles)) > INLIER
+    alone, rows = _observed(take, channels, others)
+    told = alone[0] & (levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST) | alone[1]
+    lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
+    roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)
+    told = near(told, round(settings.smooth_memory * rate))
+    return replace(take, roots=roots, angles=angles, told=told, others=others)
+
+
+def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
+    """Coordinates (F, D) that each frame observes by itself: by all sensors, by all but keypoints; rows of the latter."""
+    tree, (T, D) = take.body.tree, take.angles.shape
+    packed, _, _ = take.seen(channels.sigma).equations(take.body)(take.roots, take.angles)
+    more = np.zeros((T, tree.n_dofs, tree.n_dofs))
+    rows = np.zeros(T)
+    if others is not None:
+        linear = others.linearised(take.body, take.roots, take.angles)
+        more, rows = linear.H, linear.rows
+    prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
+    out = [np.zeros((T, D), bool), np.zeros((T, D), bool)]
+    for f in range(T):
+        pixels = np.zeros_like(prior)
+        for k in range(len(tree.depth)):
+            above = tree.chain[k, : tree.depth[k] + 1]
+            pixels[k, above] = pixels[above, k] = packed[f, k, : tree.depth[k] + 1]
+        for which, H in enumerate((pixels + more[f], more[f])):
+            if which == 0 or others is not None:
+                std = np.sqrt(np.maximum(np.diag(inverse(H + prior)), 0.0))[6:]
+                out[which][f] = std <= BLIND * tree.spread
+    return out, rows
+
+
+def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
     """Pixels (F, N, 2) and confidences (F, N) with sides put right, 0 where unseen."""
     order = np.where(swapped, channels.partner, np.arange(swapped.shape[1]))
     uv = np.take_along_axis(channels.uv[: len(swapped)], order[:, :, None], axis=1)
@@ -124,13 +180,17 @@ def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
     return [(slice(int(a), int(a) + window), slice(cuts[i], cuts[i + 1])) for i, a in enumerate(starts)]
 
 
-def _estimate(take: SmoothTake, settings: Settings, window: int, overlap: int) -> tuple[Strength, SmoothTake, int]:
+def _estimate(
+    take: SmoothTake, settings: TrackSettings, window: int, overlap: int
+) -> tuple[Strength, SmoothTake, int]:
     """Strength of a few parts of the take, and the take with the liveliness of all."""
     windows = [whole for whole, _ in parts(len(take.roots), window, overlap)]
     chosen = np.unique(np.linspace(0, len(windows) - 1, _PARTS).round().astype(int))
     start = settings.root_acceleration, settings.angle_acceleration
     strength, pieces, rounds = estimate([take.part(windows[i]) for i in chosen], start, settings.smooth_rounds)
     done = dict(zip(chosen.tolist(), pieces, strict=True))
+    if take.others is not None and pieces[0].others is not None:
+        take = replace(take, others=replace(take.others, scale=pieces[0].others.scale))
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else enliven(take.part(whole), strength)
@@ -139,24 +199,31 @@ def _estimate(take: SmoothTake, settings: Settings, window: int, overlap: int) -
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
 
 
-def _solve(take: SmoothTake, strength: Strength, window: int, overlap: int) -> tuple[NDArray, NDArray, NDArray]:
-    """Roots, angles and covariances of all frames."""
-    roots, angles = np.array(take.roots), np.array(take.angles)
+def _solve(take: SmoothTake, strength: Strength, window: int, overlap: int) -> tuple[SmoothTake, NDArray]:
+    """The take at its minimum, and covariances of all frames."""
     n = take.body.tree.n_dofs
-    covariances = np.empty((len(roots), n, n))
-    for whole, kept in parts(len(roots), window, overlap):
-        fit, post = take.part(whole).fit(strength)
-        inside = slice(kept.start - whole.start, kept.stop - whole.start)
-        roots[kept], angles[kept], covariances[kept] = fit.roots[inside], fit.angles[inside], post.frames[inside]
-    return roots, angles, covariances
+    for _ in range(1 if take.others is None else _PASSES):
+        take = take.renewed()
+        roots, angles = np.array(take.roots), np.array(take.angles)
+        covariances = np.empty((len(roots), n, n))
+        for whole, kept in parts(len(roots), window, overlap):
+            fit, post = take.part(whole).fit(strength)
+            inside = slice(kept.start - whole.start, kept.stop - whole.start)
+            roots[kept], angles[kept], covariances[kept] = fit.roots[inside], fit.angles[inside], post.frames[inside]
+        take = replace(take, roots=roots, angles=angles)
+    return take, covariances
 
 
-def _swaps(take: SmoothTake, strength: Strength, roots: NDArray, angles: NDArray) -> NDArray:
+def _swaps(take: SmoothTake) -> NDArray:
     """(F, N) bool, channels to exchange with their partner, judged by the smoothed motion."""
     channels, groups = take.channels, limb_groups(take.body, take.channels)
-    fitted, (uv, confidence) = take.fitted(roots, angles), _exchanged(channels, np.zeros(take.confidence.shape, bool))
+    if not len(channels.column):
+        return np.zeros((len(take.roots), 0), bool)
+    fitted, (uv, confidence) = (
+        take.fitted(take.roots, take.angles), exchanged(channels, np.zeros(take.confidence.shape, bool)),
+    )  # fmt: skip
     weight = confidence / np.square(channels.sigma)
-    return np.stack([find_swaps(channels, groups, uv[f], weight[f], fitted[f]) for f in range(len(roots))])
+    return np.stack([find_swaps(channels, groups, uv[f], weight[f], fitted[f]) for f in range(len(fitted))])
 
 
 def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
@@ -169,11 +236,13 @@ def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
         }
         for q, label in enumerate(take.channels.sources)
     }
+    scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
         "acceleration": {name: round(float(v), 2) for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
         "pixel_sigma": sigma,
+        "sigma_factor": scale,
         "liveliest": round(float(take.live.max()), 2),
         "contacts": 0 if take.contacts is None else int(np.any(take.contacts.weight > 0, axis=1).sum()),
         "rounds": rounds,

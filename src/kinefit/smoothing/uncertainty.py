@@ -7,7 +7,7 @@ change of the shape θ (bone lengths, places of points), the pose being fitted a
     Cov = C + P (Jᵀ W Σ W J + Σ_c s_c s_cᵀ) P + D Σ_θ Dᵀ,        D = −P H_qθ
 
 where C is the smoothed fit's covariance, Σ the variance of every channel's drift and s_c = Jᵀ W 1_c · shift that of a
-camera as a whole.
+camera, or of another sensor, as a whole.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.results import ANYWHERE, FrameResult
+from kinefit.smoothing.process_noise import SmoothTake
+from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.shape import ShapeParameters, shape_parameters
 from kinefit.subject.keypoints import Subject
-from kinefit.tracking.tracker import FrameResult
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
 _TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
-_ANYWHERE = 1.0  # [m, rad] spread of a root that nothing holds, as a prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,19 +47,23 @@ class Lasting:
 
 
 def with_lasting_errors(
-    frames: Sequence[FrameResult], subject: Subject, channels: Channels, rate: float
-) -> tuple[list[FrameResult], DetectorNoise]:
-    """The same results with the standard deviations that lasting errors and the shape add; and the noise found.
+    results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
+    others: OtherNoise | None = None,
+) -> tuple[list[FrameResult], DetectorNoise]:  # fmt: skip
+    """The same results with the standard deviations that lasting errors and the shape add; and the detectors' noise.
 
     Parameters
     ----------
-    frames : results of neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
+    results : F neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
     subject : with the shape that the take told; without one it is taken for exact.
-    channels : of the subject's points.
+    take : the pixels as they were used, and the states
+    weight : (F, N) [1/px²] with which every channel took part, robust factor included
+    others : noise of all other sensors
     """
-    body = subject.body
-    factor, values = np.stack([r.factor for r in frames]), np.stack([r.uv - r.fitted for r in frames])
-    seen = float(np.mean(np.sum(factor > 0, axis=1)))
+    body, channels = subject.body, take.channels
+    fitted = take.fitted(take.roots, take.angles)
+    values, factor = take.uv - fitted, take.factors(channels.sigma, fitted)
+    seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
     if subject.shape is None or subject.covariance is None:
@@ -66,36 +71,42 @@ def with_lasting_errors(
         theta, Sigma = parameters.mean, np.zeros((len(parameters.mean),) * 2)
     else:
         parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
-    weights = _pooled(np.stack([r.weight for r in frames]), round(_TIED * rate))
+    half, n = round(_TIED * rate), body.tree.n_dofs
+    weights = pooled(weight, half)
+    nothing = np.zeros((len(results), n, n))
+    more = (nothing, nothing) if others is None else (pooled(others.information, half), pooled(others.lasting, half))
     out = []
-    for result, weight in zip(frames, weights, strict=True):
-        more = lasting(parameters, theta, Sigma, channels, result.state, weight, noise)
+    for f, result in enumerate(results):
+        add = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, more[0][f], more[1][f])
         out.append(replace(
             result,
-            dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(more.dofs), 0.0)),
-            joint_std=np.sqrt(np.square(result.joint_std) + more.joints),
+            dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(add.dofs), 0.0)),
+            joint_std=np.sqrt(np.square(result.joint_std) + add.joints),
         ))  # fmt: skip
     return out, noise
 
 
-def _pooled(weights: NDArray, half: int) -> NDArray:
-    """Weights (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
-    total = np.concatenate([np.zeros((1, weights.shape[1])), np.cumsum(weights, axis=0)])
-    frames = np.arange(len(weights))
-    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(weights))
-    return np.maximum(total[high] - total[low], 0.0) / (high - low)[:, None]
+def pooled(values: NDArray, half: int) -> NDArray:
+    """Values (F, ...), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
+    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
+    frames = np.arange(len(values))
+    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(values))
+    count = (high - low).reshape(-1, *[1] * (values.ndim - 1))
+    mean: NDArray = (total[high] - total[low]) / count
+    return np.maximum(mean, 0.0) if values.ndim == 2 else mean
 
 
 def lasting(
     parameters: ShapeParameters, theta: NDArray, Sigma_shape: NDArray, channels: Channels, state: BodyState,
-    weight: NDArray, noise: DetectorNoise,
-) -> Lasting:
-    """Covariance of one frame's pose from drift, camera shifts and shape.
+    weight: NDArray, noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
+) -> Lasting:  # fmt: skip
+    """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
     Parameters
     ----------
     parameters, theta : of the shape; Sigma_shape (p, p) their covariance.
     weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
+    other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
     tree = parameters.body.tree
     n = tree.n_dofs
@@ -103,9 +114,10 @@ def lasting(
     Jq = J[:, :, :n].reshape(-1, n)
     each = np.repeat(weight, 2)
     H = (Jq * each[:, None]).T @ J.reshape(len(each), -1)
-    alone = inverse(H[:, :n] + np.diag(np.concatenate([np.full(6, _ANYWHERE**-2), np.square(1.0 / tree.spread)])))
+    prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
+    alone = inverse(H[:, :n] + other_information + prior)
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
-    meat = last.T @ last
+    meat = last.T @ last + other_lasting
     for q, shift in enumerate(noise.shift):
         mine = np.where(channels.source == q, weight, 0.0)
         push = np.einsum("k,kin->in", mine, J[:, :, :n]) * shift[:, None]
@@ -116,4 +128,3 @@ def lasting(
     whole = moves @ answer + stretch
     joints = np.sum((moves @ dofs) * moves, axis=-1) + np.sum((whole @ Sigma_shape) * whole, axis=-1)
     return Lasting(dofs + answer @ Sigma_shape @ answer.T, np.maximum(joints, 0.0))
-

@@ -62,6 +62,22 @@ def velocities(roots, angles, out):
 
 
 @jit
+def differences(roots, other_roots, angles, other_angles, out):
+    """Steps (F, n) from states to others, frame by frame."""
+    for t in range(roots.shape[0]):
+        difference(roots[t], other_roots[t], angles[t], other_angles[t], out[t])
+
+
+@jit
+def add_packed(packed, chain, depth, dense):
+    """Add matrices (F, n, m), packed as the tree has them, to the lower triangles of dense ones (F, n, n)."""
+    for t in range(packed.shape[0]):
+        for k in range(depth.size):
+            for i in range(depth[k] + 1):
+                dense[t, k, chain[k, i]] += packed[t, k, i]
+
+
+@jit
 def _inverse_left_jacobian(w, sign, J):
     """J_l⁻¹ of SO(3) at sign · w; at −w it is J_r⁻¹."""
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]

@@ -107,7 +107,7 @@ def normal_equations(
             )  # fmt: skip
         for d in dense:
             cost += _add_dense(d, body, loss, H, g)
-        return Equations(body, state, rows, factor, H, g, float(cost), *_dense(n))
+        return Equations(body, state, rows, factor, H, g, float(cost), *dense_pattern(n))
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
@@ -126,7 +126,7 @@ def _add_dense(rows: DofRows, body: Body, loss: Loss, H: NDArray, g: NDArray) ->
 
 
 @lru_cache(maxsize=8)
-def _dense(n: int) -> tuple[NDArray, NDArray]:
+def dense_pattern(n: int) -> tuple[NDArray, NDArray]:
     """Chain and depth of a matrix in which all degrees of freedom meet."""
     chain, depth = np.tile(np.arange(n), (n, 1)), np.arange(n)
     chain.flags.writeable = depth.flags.writeable = False
@@ -136,9 +136,22 @@ def _dense(n: int) -> tuple[NDArray, NDArray]:
 def inverse(matrix: NDArray) -> NDArray:
     """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
     out = np.empty_like(matrix)
-    if not _kernels_linear.invert(np.array(matrix), *_dense(len(matrix)), out):
+    if not _kernels_linear.invert(np.array(matrix), *dense_pattern(len(matrix)), out):
         out = np.linalg.inv(matrix)
     return 0.5 * (out + out.T)
+
+
+def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
+    """(N, n) how far each row's point moves along its direction with every degree of freedom."""
+    if isinstance(rows, DofRows):
+        return rows.jacobian
+    _, screws = body.tree.forward(state.T_world_root, state.angles)
+    a = np.concatenate([rows.direction, np.cross(rows.point - state.T_world_root[:3, 3], rows.direction)], axis=1)
+    out = np.empty((len(rows), body.tree.n_dofs))
+    for s in np.unique(rows.segment):
+        of = rows.segment == s
+        out[of] = a[of] @ body.tree.segment_jacobian(screws, int(s))
+    return out
 
 
 def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
@@ -223,8 +236,13 @@ def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covari
 
 def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:
     """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is free."""
+    return cov.of(joint_moves(body, state))
+
+
+def joint_moves(body: Body, state: BodyState) -> NDArray:
+    """(S, 3, n) how far every joint centre moves along the world's axes with every degree of freedom."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     moves = np.empty((len(tree.segments), 3, tree.n_dofs))
     _kernels.joint_moves(frames, screws, tree.rest, state.T_world_root, tree.dof_parent, tree.last_dof, moves)
-    return cov.of(moves)
+    return moves

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.marker_sets import bare, matched
 from kinefit.errors import ObservationError, choices
 from kinefit.observations import Markers
 from kinefit.solvers.rigid_clusters import local, middle, rigid_frames, shape_of
@@ -168,16 +169,17 @@ def _sphere(x: NDArray) -> tuple[NDArray, float, NDArray]:
 
 def _columns(markers: Markers, labels: Sequence[str], least: int) -> NDArray:
     """(F, k, 3) [m] of the named markers."""
-    names = [n.rpartition(":")[2] for n in markers.names]
-    for label in labels:
-        if label not in markers.names and label not in names:
+    names = [bare(n) for n in markers.names]
+    meant = [n if n in markers.names else m for n, m in zip(labels, matched(labels, names))]
+    for label, name in zip(labels, meant):
+        if name is None:
             problem = choices("marker", label, markers.names)
             raise ObservationError(problem, file=markers.source or None, remedy="Give labels of the take.")
     if len(set(labels)) < max(least, len(labels)):
         raise ObservationError(
             f"{len(set(labels))} markers of a segment: {', '.join(labels)}", remedy=f"Give {least} at least, each once."
         )
-    where = [markers.names.index(n) if n in markers.names else names.index(n) for n in labels]
+    where = [markers.names.index(n) if n in markers.names else names.index(str(n)) for n in meant]
     return np.asarray(markers.positions)[:, where]
 
 

@@ -19,6 +19,7 @@ from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.solvers import _kernels_band, _kernels_smoothing
 from kinefit.solvers._kernels_linear import adapt
+from kinefit.solvers.equations import dense_pattern
 
 _NEVER = 1e12  # of damping, beyond which no step is small enough
 
@@ -129,6 +130,7 @@ class Smoothed:
     converged: bool
     prior: MotionPrior
     system: _System
+    pattern: tuple[NDArray, NDArray]
 
     @property
     def changes(self) -> NDArray:
@@ -169,6 +171,7 @@ def smooth(
     prior: MotionPrior,
     *,
     bounds: tuple[NDArray, NDArray] | None = None,
+    dense: bool = False,
     max_iterations: int = 30,
     tolerance: float = 1e-5,
 ) -> Smoothed:
@@ -180,6 +183,9 @@ def smooth(
     equations : (roots, angles) -> (C (T, n, m) packed as the tree has it, g (T, n), cost (T,))
         Called anew at every state tried; its arrays are changed.
     bounds : (T, D) lower and upper ends of every angle.
+    dense : bool
+        The equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower triangle
+        is read.
     tolerance : stop when the predicted fall of the cost is below this share of it.
 
     Raises
@@ -188,10 +194,11 @@ def smooth(
         The equations are not finite.
     """
     tree, first, width = body.tree, *blocks(body)
+    chain, depth = pattern = dense_pattern(tree.n_dofs) if dense else (tree.chain, tree.depth)
     lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
     roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
-    now = _system(body, roots, angles, equations, prior)
-    mean = float(now.C[:, np.arange(tree.n_dofs), tree.depth].mean() + now.band[0, :, :, 0].mean())
+    now = _system(body, roots, angles, equations, prior, depth)
+    mean = float(now.C[:, np.arange(tree.n_dofs), depth].mean() + now.band[0, :, :, 0].mean())
     if not np.isfinite(now.cost) or not np.isfinite(mean):
         raise ObservationError("a take that cannot be smoothed", remedy="Are all weights and pixels finite?")
     damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
@@ -204,11 +211,11 @@ def smooth(
             held[:, :6] = not tree.root_free
             any_held = bool(held.any())
             if any_held:
-                _kernels_smoothing.hold(held, first, width, tree.chain, tree.depth, now.C, now.band, now.g)
+                _kernels_smoothing.hold(held, first, width, chain, depth, now.C, now.band, now.g)
         tried, fresh = tried + 1, False
         delta[:, : tree.n_dofs] = now.g
         if not _kernels_band.factor_band(
-            now.C, tree.chain, tree.depth, now.band, first, width, damping, W, below, delta
+            now.C, chain, depth, now.band, first, width, damping, W, below, delta
         ):
             damping, growth = 100.0 * damping, 2.0
             continue
@@ -218,13 +225,13 @@ def smooth(
         converged = predicted <= tolerance * now.cost + nothing or damping > _NEVER * mean
         new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
         _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
-        new = _system(body, new_roots, new_angles, equations, prior)
+        new = _system(body, new_roots, new_angles, equations, prior, depth)
         damping, growth = adapt(damping, growth, now.cost - new.cost, predicted)
         if new.cost < now.cost:
             fresh, now, roots, angles = True, new, new_roots, new_angles
     if any_held and not fresh:
-        now = _system(body, roots, angles, equations, prior)  # with what was held
-    return Smoothed(roots, angles, now.cost, tried, converged, prior, now)
+        now = _system(body, roots, angles, equations, prior, depth)  # with what was held
+    return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
 
 
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
@@ -232,12 +239,14 @@ def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
     return np.empty((T, p, p)), np.empty((T, 3 * p, p)), np.zeros((T, p))
 
 
-def _system(body: Body, roots: NDArray, angles: NDArray, equations: MakeEquations, prior: MotionPrior) -> _System:
-    tree, T, n = body.tree, len(roots), body.tree.n_dofs
+def _system(
+    body: Body, roots: NDArray, angles: NDArray, equations: MakeEquations, prior: MotionPrior, depth: NDArray
+) -> _System:
+    T, n = len(roots), body.tree.n_dofs
     C, g, cost = equations(roots, angles)
     usual = np.ascontiguousarray(np.broadcast_to(prior.usual, angles.shape))
     weight = np.ascontiguousarray(np.broadcast_to(1.0 / np.square(prior.spread), angles.shape))
-    _kernels_smoothing.add_posture(angles, usual, weight, tree.depth, C, g, cost)
+    _kernels_smoothing.add_posture(angles, usual, weight, depth, C, g, cost)
     steps, band = np.empty((max(T - 1, 0), n)), np.zeros((4, T, n, 3))
     _kernels_smoothing.velocities(roots, angles, steps)
     past, weight = prior.rows(len(steps))
@@ -253,13 +262,13 @@ def posterior(body: Body, smoothed: Smoothed) -> Posterior:
 
     Limits are left out, as they are of a frame's covariance.
     """
-    tree, s, prior = body.tree, smoothed.system, smoothed.prior
+    s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
     T, n = s.g.shape
     C = s.C.copy()
-    C[:, np.arange(6, n), tree.depth[6:]] += prior.posture_share - 1.0 / np.square(prior.spread)
+    C[:, np.arange(6, n), depth[6:]] += prior.posture_share - 1.0 / np.square(prior.spread)
     W, below, nothing = _workspace(T, n)
-    p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), tree.depth].mean())
-    while not _kernels_band.factor_band(C, tree.chain, tree.depth, s.band, *blocks(body), tiny, W, below, nothing):
+    p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), depth].mean())
+    while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, W, below, nothing):
         tiny *= 10.0
     frames, following = np.empty((T, n, n)), np.empty((max(T - 1, 0), n, n))
     past, _ = prior.rows(max(T - 1, 0))

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
-from kinefit.initialization.from_points import first_scales, pose_from_points, triangulated
-from kinefit.multiview.left_right import find_swaps, limb_groups
+from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.sensors.channels import Channels, fitted_pixels
+from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.triangulation import triangulated
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.shape import PixelFrames, Shape, fit_shape
 

@@ -21,10 +21,11 @@ from kinefit.correspondences.morphed import toward_tangents
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
-from kinefit.rows import DofRows, Rows
-from kinefit.sensors.settings import FusionSettings
+from kinefit.rows import Rows
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteMeasurement
 from kinefit.sensors.surface import Surface as Drawn
+from kinefit.solvers.equations import design
 from kinefit.solvers.least_squares import bounds_of
 
 # Standard deviations between people: of a length that is about known, of the logarithm of a half axis (ANSUR II: girths
@@ -130,7 +131,7 @@ def fit_silhouettes(
     *,
     sigma: float = 4.0,
     iterations: int = 8,
-    settings: FusionSettings | None = None,
+    settings: TrackSettings | None = None,
 ) -> ShapeFit:
     """Shape of a body from its silhouettes in poses that are about known (`BodyFamily`).
 
@@ -148,7 +149,7 @@ def fit_silhouettes(
     if not frames or len(frames) != len(states) or not all(len(several) for several in frames):
         problem = f"{len(frames)} frames of silhouettes with {len(states)} states"
         raise ObservationError(problem, remedy="Give one state for each frame, and silhouettes in each.")
-    settings = settings or FusionSettings()
+    settings = settings or TrackSettings()
     values, poses = np.zeros(len(family.names)), list(states)
     before = 0.0
     for k in range(iterations + 1):
@@ -188,7 +189,7 @@ class _Linearised:
 
     def __init__(
         self, family: BodyFamily, values: NDArray, body: Body, growth: _Growth, rig: Rig,
-        frames: Sequence[Sequence[SilhouetteFrame]], sigma: float, settings: FusionSettings,
+        frames: Sequence[Sequence[SilhouetteFrame]], sigma: float, settings: TrackSettings,
     ) -> None:  # fmt: skip
         self.family, self.values, self.body, self.rig, self.frames = family, values, body, rig, frames
         self.growth, self.sigma, self.settings, self.surface = growth, sigma, settings, Drawn(body, 1)
@@ -212,7 +213,7 @@ class _Linearised:
                 x = points.on(world)
                 direction = rows.direction if isinstance(rows, Rows) else toward_tangents(x, seen.camera, tangents)[0]
                 A = np.empty((len(rows), n + P))
-                A[:, :n] = _pose_columns(self.body, state, rows)
+                A[:, :n] = design(self.body, state, rows)
                 one, two, share = points.vertices[:, 0], points.vertices[:, 1], points.share[:, None]
                 shifts = (1.0 - share) * moves[:, one] + share * moves[:, two]
                 A[:, n:] = np.einsum("ij,kij->ik", direction, shifts)
@@ -229,16 +230,3 @@ class _Linearised:
         H[at, at] += 1.0 / self.family.std**2
         g[at] -= self.values / self.family.std**2
         return H, g, square, count
-
-
-def _pose_columns(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
-    """(N, 6 + D) how far each point moves along its direction with every degree of freedom."""
-    if isinstance(rows, DofRows):
-        return rows.jacobian
-    _, screws = body.tree.forward(state.T_world_root, state.angles)
-    a = np.concatenate([rows.direction, np.cross(rows.point - state.T_world_root[:3, 3], rows.direction)], axis=1)
-    out = np.empty((len(rows), body.tree.n_dofs))
-    for s in np.unique(rows.segment):
-        of = rows.segment == s
-        out[of] = a[of] @ body.tree.segment_jacobian(screws, int(s))
-    return out

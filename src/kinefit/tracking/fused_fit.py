@@ -22,7 +22,7 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.sensors.occlusion import beside
 from kinefit.sensors.point_cloud import CloudMeasurement
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteMeasurement, outline_camera
 from kinefit.sensors.surface import Surface
 from kinefit.solvers.equations import Covariance, inverse, joint_std
@@ -80,12 +80,12 @@ class FusedFit:
     rate : float [Hz] of the frames
     accuracy : {sensor: standard deviation}, [m] or [px], "silhouette CAMERA" for silhouettes;
         others have those of the settings.
-    settings : FusionSettings
+    settings : TrackSettings
     backgrounds : {depth camera: Background}, added to when one is seen first; None for one that is to have none.
     """
 
     def __init__(
-        self, body: Body, rig: Rig, rate: float, accuracy: Mapping[str, float], settings: FusionSettings,
+        self, body: Body, rig: Rig, rate: float, accuracy: Mapping[str, float], settings: TrackSettings,
         backgrounds: dict[str, Background | None],
     ) -> None:  # fmt: skip
         self.body, self.rig, self.rate, self.accuracy, self.settings = body, rig, rate, accuracy, settings

@@ -21,7 +21,7 @@ from kinefit.sensors.background import Background
 from kinefit.sensors.depth_image import DepthMeasurement
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, Measurement
 from kinefit.sensors.point_cloud import CloudMeasurement
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 from kinefit.tracking.fused_fit import FusedFit, FusionResult, Held
 from kinefit.tracking.prediction import Prediction, forgetting
@@ -52,12 +52,12 @@ class FusionTracker:
 
     def __init__(
         self, body: Body, rig: Rig, *, rate: float = 30.0, accuracy: Mapping[str, float] | None = None,
-        up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: FusionSettings | None = None,
+        up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: TrackSettings | None = None,
     ) -> None:  # fmt: skip
         if not 0.0 < rate < np.inf:
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
         self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
-        self.settings = settings or FusionSettings()
+        self.settings = settings or TrackSettings()
         self.accuracy = dict(accuracy or {})
         bad = [f"{name}: {value}" for name, value in self.accuracy.items() if not 0.0 < value < np.inf]
         if bad:

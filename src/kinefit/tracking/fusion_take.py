@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies.marker_sets import bare, known_set, matched
 from kinefit.errors import CalibrationError, KinefitError, TakeError
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.images.stereo import StereoRectifier
-from kinefit.markers.placement import known_set
-from kinefit.markers.poses import bare
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
 from kinefit.observations import (
@@ -33,7 +32,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.video import Video
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.settings import FusionSettings
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress, fit_subject
 from kinefit.tracking.fusion import FusionTracker
 from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
@@ -45,7 +44,7 @@ _EMPTY = 30  # images of an empty scene that are looked at: more tell no more
 
 
 def fuse_take(
-    take: Take, seen: Observations, *, settings: FusionSettings | None = None, size: bool = True,
+    take: Take, seen: Observations, *, settings: TrackSettings | None = None, size: bool = True,
     progress: Progress | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of the person of a take from depth, keypoints and markers at once.
@@ -167,17 +166,17 @@ class FrameSource:
 
     def accuracy(self, take: Take) -> dict[str, float]:
         """Standard deviation of every sensor, [m] or [px]; of stereo at two thirds of its range."""
-        out = {entry.name: entry.accuracy for entry in take.depth}
+        out = {entry.name: entry.sigma for entry in take.depth}
         for stereo in take.stereo:
             video = next(v for v in self.depth if v.sensor == stereo.name)
             assert video.camera is not None
             left, right = self.rig[stereo.left], self.rig[stereo.right]
             baseline = float(np.linalg.norm(left.centre_world - right.centre_world))
             z = 0.67 * stereo.range[1]
-            out[stereo.name] = stereo.accuracy * z**2 / (video.camera.matrix[0, 0] * baseline)
-        out |= {f"silhouette {entry.camera}": entry.accuracy for entry in take.silhouettes}
-        out |= {entry.camera: entry.accuracy for entry in take.keypoints}
-        return out | {f"markers {k}": entry.accuracy for k, entry in enumerate(take.markers)}
+            out[stereo.name] = stereo.sigma * z**2 / (video.camera.matrix[0, 0] * baseline)
+        out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
+        out |= {entry.camera: entry.sigma for entry in take.keypoints}
+        return out | {f"markers {k}": entry.sigma for k, entry in enumerate(take.markers)}
 
     def at(self, i: int, body: Body) -> list[Frame]:
         """Frames of step `i` of the take; of keypoints the person that is followed."""
@@ -222,15 +221,17 @@ class FrameSource:
 def _markers(
     markers: Markers, frame: int, sensor: str, body: Body, given: str | None, time: float
 ) -> MarkerFrame:
-    names = tuple(bare(n) for n in markers.names)
-    return MarkerFrame(sensor, time, names, markers.positions[frame], known_set(body, names, given))
+    own = known_set(body, markers.names, given)
+    known = body.markers(own) if own else body.landmarks
+    names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))
+    return MarkerFrame(sensor, time, names, markers.positions[frame], own)
 
 
 def _sized(body: Body, take: Take, source: FrameSource, up: NDArray, progress: Progress | None) -> Sized:
     """The body in the person's size: by keypoints of two cameras where there are, else by depth."""
     seen = source.seen
     if len({k.camera for k in seen.keypoints}) >= 2:
-        accuracy = [entry.accuracy for entry in take.keypoints]
+        accuracy = [entry.sigma for entry in take.keypoints]
         channels = make_channels(body, source.rig, seen.keypoints, source.people, accuracy)
         subject = fit_subject(body, channels, height=take.height, progress=progress)
         return Sized(subject.body, told={"length_std_m": subject.length_std})

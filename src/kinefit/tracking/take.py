@@ -45,7 +45,7 @@ def track_take(
         observations.rig,
         observations.keypoints,
         body,
-        accuracy=[entry.accuracy for entry in take.keypoints],
+        accuracy=[entry.sigma for entry in take.keypoints],
         trial=trial_of(take),
         contacts=contacts,
         smooth=smooth,
@@ -82,6 +82,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
         )
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
-    accuracy = [entry.accuracy for entry in trial.keypoints]
+    accuracy = [entry.sigma for entry in trial.keypoints]
     channels = make_channels(body, seen.rig, seen.keypoints, choose_people(seen.rig, seen.keypoints), accuracy)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height)

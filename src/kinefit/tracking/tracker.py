@@ -1,241 +1,242 @@
-"""The loop over frames: predict, put left and right right, fit, judge, recover."""
+"""The tracker of any mix of sensors, frame by frame: predict, match, solve, judge, recover."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from copy import copy
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
-from kinefit.correspondences import _kernels, prior_rows, targets
-from kinefit.errors import TrackingError
-from kinefit.initialization.from_points import pose_from_points, triangulated_frame
-from kinefit.losses import Loss, geman_mcclure
-from kinefit.multiview.left_right import find_swaps, limb_groups
-from kinefit.rows import AnyRows, ParameterRows
-from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.solvers.equations import Covariance, covariance, inverse, joint_std, normal_equations
-from kinefit.solvers.least_squares import Fit, levenberg_marquardt
-from kinefit.tracking.prediction import Prediction, belief
+from kinefit.bodies.parts import carry_dofs, carry_state
+from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.point_cloud import PointCloudSensor
+from kinefit.sensors.results import FrameResult
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.fit import Fitted, FrameFit
+from kinefit.tracking.prediction import Prediction
+from kinefit.tracking.recovery import Recovery
+from kinefit.tracking.routing import Sensors, time_of
 
-_LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a track runs.
-
-    Parameters
-    ----------
-    loss : Loss of a keypoint, in its standard deviations.
-    angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
-        How abruptly a person moves: one standard deviation.
-    velocity_memory : float [s]
-        How long a velocity lasts that nothing confirms.
-    poor : float in 0..1
-        Support below which a frame is started anew from its own keypoints.
-    smooth_memory : float [s]
-        The same as velocity_memory, where a whole take is smoothed.
-    acceleration_memory : float [s]
-        How long an acceleration lasts, where a whole take is smoothed.
-    smooth_rounds : int
-        How often the strength of the motion prior and the pixels' noise are estimated anew, at most.
-    """
-
-    loss: Loss = field(default_factory=geman_mcclure)
-    angle_acceleration: float = 150.0
-    root_acceleration: float = 15.0
-    velocity_memory: float = 0.1
-    poor: float = 0.5
-    smooth_memory: float = 1.0
-    acceleration_memory: float = 0.2
-    smooth_rounds: int = 8
-
-
-@dataclass(frozen=True, eq=False)
-class FrameResult:
-    """One tracked frame.
-
-    Parameters
-    ----------
-    state : BodyState
-    dof_std : (6 + D,) [m, rad]
-    joint_std : (S, 3) [m]
-    factor : (N,) robust factor of every channel, 0 where unseen.
-    weight : (N,) [1/px²] with which every channel took part, that factor included.
-    uv, fitted : (N, 2) [px] measurements as used, and where the body is seen.
-    swapped : (N,) bool, channels exchanged with their partner.
-    quality : float, and segment_quality (S,), in 0..1.
-    support : float in 0..1, mean robust factor of what was seen: low where the body is not where the pixels are.
-    """
-
-    state: BodyState
-    dof_std: NDArray
-    joint_std: NDArray
-    factor: NDArray
-    weight: NDArray
-    uv: NDArray
-    fitted: NDArray
-    swapped: NDArray
-    quality: float
-    segment_quality: NDArray
-    support: float
+__all__ = ["FrameResult", "TrackSettings", "Tracker"]
 
 
 class Tracker:
-    """Follows one body from frame to frame.
+    """Follows one body from frame to frame in whatever its sensors see.
 
     Parameters
     ----------
-    body : Body, fitted to the person.
-    channels : Channels
-        Layout of the measurements (`uv` and `confidence` of it are not used).
-    rate : float [Hz]
+    body : Body, with surfaces where depth or silhouettes are to be used.
+    rig : Rig of all cameras, depth cameras among them; without cameras `Rig(())`.
+    rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
+    accuracy : {sensor: standard deviation}
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
+    up : (3,) upwards in the world, for a start with no pose given.
+    on_body : depth cameras whose images show nothing but the body: no background is learnt.
+    settings : TrackSettings
+    sensors : of one's own (`kinefit.sensors.base`); the built-in kinds need not be named.
+    values : {sensor: {name: value}} of the sensors' own unknowns, as a subject fit estimated them.
+
+    Attributes
+    ----------
+    dropped : int, frames that were missed so far, by their times.
+    late : int, updates that came after a later one and were left out.
     """
 
-    def __init__(self, body: Body, channels: Channels, rate: float, settings: Settings | None = None) -> None:
-        self.body, self.channels = body, channels
-        self.settings = settings or Settings()
-        names = tuple(channels.points.names[c] for c in channels.column)
-        place = channels.points.points[channels.column]
-        self._points = PointSet(names, channels.points.segments[channels.column], place)  # one for every channel
-        self._groups = limb_groups(body, channels)
-        self._informs = informing(body, channels)
-        self._angles = np.arange(6, body.tree.n_dofs)
-        self._posture = np.square(1.0 / body.tree.spread)
-        self._prediction = Prediction(
-            body,
-            1.0 / rate,
-            angle_acceleration=self.settings.angle_acceleration,
-            root_acceleration=self.settings.root_acceleration,
-            memory=self.settings.velocity_memory,
+    def __init__(
+        self, body: Body, rig: Rig, *, rate: float = 30.0, accuracy: Mapping[str, float] | None = None,
+        up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: TrackSettings | None = None,
+        sensors: Sequence[Sensor] = (), values: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:  # fmt: skip
+        if not 0.0 < rate < np.inf:
+            raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
+        self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
+        self.settings, self.values = settings or TrackSettings(), values or {}
+        self.sensors = Sensors(rig, rate, accuracy or {}, self.settings, sensors, tuple(on_body))
+        self.dropped = self.late = 0
+        self._last: FrameResult | None = None
+        self._time: float | None = None
+        self._wear(body)
+
+    def _wear(self, body: Body) -> None:
+        s = self.settings
+        self.body = body
+        self._fit = FrameFit(body, s)
+        self._scene = Scene(
+            body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples
         )
+        self._recovery = Recovery(body, self.rig, self.up, s, self.rate)
+        self._prediction = Prediction(
+            body, 1.0 / self.rate, angle_acceleration=s.angle_acceleration, root_acceleration=s.root_acceleration,
+            memory=s.velocity_memory,
+        )  # fmt: skip
+
+    @property
+    def state(self) -> BodyState | None:
+        """The last frame's, None before a start."""
+        return self._prediction.state
+
+    @property
+    def sees_surfaces(self) -> bool:
+        """Whether some sensor so far shows a person as a whole: searches in it take long."""
+        return any(isinstance(s, DepthImageSensor | PointCloudSensor) for s in self.sensors)
+
+    @property
+    def accuracy(self) -> Mapping[str, float]:
+        """Standard deviations as they were given, by sensor."""
+        return self.sensors.sigma
+
+    def know_background(self, sensor: str, depth: NDArray) -> None:
+        """State what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known.
+
+        Raises
+        ------
+        CalibrationError
+            A camera that the rig does not have.
+        ObservationError
+            An image of another size.
+        """
+        self.sensors.know_background(sensor, depth)
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
+        if len(state.angles) != len(self.body.tree.coordinates):
+            problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
+            raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
 
-    def update(self, uv: NDArray, confidence: NDArray) -> FrameResult | None:
-        """Track a frame: uv (N, 2) [px], NaN where unseen; confidence (N,). None until there is a start."""
-        seen = np.isfinite(uv).all(axis=1)
-        weight = np.where(seen, confidence / np.square(self.channels.sigma), 0.0)
-        uv = np.where(seen[:, None], uv, np.nan)
-        result = None
+    def backwards(self, state: BodyState) -> Tracker:
+        """A tracker of the same body and sensors that knows the same background, for the time before a state."""
+        out = Tracker(
+            self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings,
+            values=self.values,
+        )  # fmt: skip
+        out.sensors = self.sensors.anew()
+        out.start_at(state)
+        return out
+
+    def change_body(self, body: Body) -> None:
+        """Go on with another size, another surface, a part more or less (`bodies.parts`); pose and speed are kept."""
+        old, before = self.body, self._prediction
+        self._wear(body)
+        if before.state is not None:
+            state = carry_state(before.state, old, body)
+            std = carry_dofs(before.std, old, body, missing=np.inf)
+            self._prediction.go_on(state, std, carry_dofs(before.velocity, old, body))
+        self._last = None
+
+    def update(self, frames: Sequence[Any], time: float | None = None) -> FrameResult | None:
+        """Track one step of time from what the sensors saw then.
+
+        Parameters
+        ----------
+        frames : of any sensors, or measurements; none where `time` is given: the body is then where it was going.
+        time : float [s], default the frames' mean.
+
+        Returns
+        -------
+        FrameResult, or None until there is a start
+            Frames that are older than the last ones are counted in `late`, and the last result is given again.
+
+        Raises
+        ------
+        ObservationError
+            No frame, or a time that is not finite; an image of another size than its camera's; a sensor of one's own
+            whose rows are none of this body.
+        CalibrationError, BodyError
+            A camera, segment or keypoint set that is not known.
+        """
+        time = time_of(frames, time, self.sensors)
+        before = self._time, self._recovery.clocks(), self.dropped, copy(self._prediction)
+        try:
+            return self._updated(frames, time)
+        except KinefitError:  # as if they had never come
+            self._time, clocks, self.dropped, self._prediction = before
+            self._recovery.set_clocks(clocks)
+            raise
+
+    def _updated(self, frames: Sequence[Any], time: float) -> FrameResult | None:
+        steps = self._steps(time)
+        if steps is None:
+            return self._last
+        result: FrameResult | None = None
+        measurements: list[Measurement] = []
         if self._prediction.state is not None:
-            if not weight.any():
+            if not len(frames):
                 self._prediction.halt()
-            predicted, information = self._prediction.ahead()
-            fit, result = self._fit(predicted, (predicted, information), uv, weight)
-            self._prediction.correct(result.state, inverse(fit.equations.matrix))
-            chart = off_the_limits(self.body.tree, result.state.angles)
-            if chart is not None:
-                self._prediction.change_chart(*chart)
-        if result is None or result.support < self.settings.poor:
-            again = self._start(uv, weight, confidence)
-            if again is not None and (result is None or again.support > result.support + 0.1):
-                result = again
-                self._prediction.start(result.state, result.dof_std)
+            held = self._prediction.ahead(steps)
+            scene, measurements = self._scene_of(frames, held[0], time)
+            fitted = self._fit.run(scene, held, measurements)
+            self._take(fitted)
+            result = fitted.result
+        result = self._recovery.run(self, time, frames, measurements, result)
+        self._last = result
+        if result is not None:
+            scene = self._scene.at(result.state, time=time)
+            for m in measurements:
+                sensor = self.sensors.of(m.sensor)
+                if sensor is not None:
+                    sensor.learn(m, scene, not result.lost.any())
         return result
 
-    def _start(self, uv: NDArray, weight: NDArray, confidence: NDArray) -> FrameResult | None:
-        x, _ = triangulated_frame(self.channels, uv, confidence)
-        try:
-            state, _ = pose_from_points(self.body, self.channels.points, x)
-        except TrackingError:
+    def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:
+        """What comes of a fit that begins at a state; nothing of it is remembered."""
+        scene, measurements = self._scene_of(frames, state, time)
+        return self._fit.run(scene, held, measurements)
+
+    def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
+        """The tracker's body in a state."""
+        return self._scene.at(state, time=time)
+
+    def apart(self, scene: Scene) -> list[AnyRows]:
+        """Rows that keep parts of the body from running into each other."""
+        return self._fit.apart(scene)
+
+    def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
+        scene = self._scene.at(state, time=time, velocity=self._prediction.velocity * self.rate)
+        measurements = self.sensors.measurements(frames, scene)
+        return scene.at(state, measurements=tuple(measurements)), measurements
+
+    def _steps(self, time: float) -> float | None:
+        """Frames since the last update, which is remembered; None for one that came too late."""
+        s, before = self.settings, self._time
+        steps = 1.0 if before is None else (time - before) * self.rate
+        if before is not None and -s.pause < time - before <= 0.0:
+            self.late += 1
             return None
-        return self._fit(state, None, uv, weight)[1]
+        self._time = time
+        if before is not None and abs(time - before) > s.pause:
+            self._recovery.forget()
+            if self._prediction.state is not None:
+                self._prediction.start(self._prediction.state)
+            steps = 1.0 if steps < 0 else steps
+        self.dropped += max(round(steps) - 1, 0)
+        return min(steps, 10.0)
 
-    def _fit(
-        self, start: BodyState, predicted: tuple[BodyState, NDArray] | None, uv: NDArray, weight: NDArray
-    ) -> tuple[Fit, FrameResult]:
-        swapped = find_swaps(self.channels, self._groups, uv, weight, fitted_pixels(self.body, self.channels, start))
-        partner = np.arange(len(swapped))
-        for _ in range(3):
-            order = np.where(swapped, self.channels.partner, partner)
-            used, used_weight = np.ascontiguousarray(uv[order]), np.ascontiguousarray(weight[order])
-            fit = levenberg_marquardt(
-                self.body, start, lambda s: self._rows(s, predicted, used, used_weight),  # noqa: B023
-                loss=self.settings.loss, max_iterations=40, tolerance=1e-4,
-                damping=None if predicted is None else _LIGHT,
-            )  # fmt: skip
-            fitted = fitted_pixels(self.body, self.channels, fit.state)
-            again = find_swaps(self.channels, self._groups, uv, weight, fitted)
-            if np.array_equal(again, swapped):
-                break
-            swapped, start = again, fit.state
-        return fit, self._judge(fit, used, used_weight, fitted, swapped)
+    def _take(self, fitted: Fitted) -> None:
+        """Go on from a fit that took its prediction into account."""
+        state = fitted.result.state
+        self._prediction.correct(state, fitted.filtered)
+        chart = off_the_limits(self.body.tree, state.angles)
+        if chart is not None:
+            self._prediction.change_chart(*chart)
 
-    def _rows(
-        self, state: BodyState, predicted: tuple[BodyState, NDArray] | None, uv: NDArray, weight: NDArray
-    ) -> list[AnyRows]:
-        cameras, camera = self.channels.rig.packed, self.channels.camera
-        rows = targets.fill(_kernels.pixel_rows, 2, self.body, state, self._points, cameras, camera, uv, weight)
-        tree = self.body.tree
-        parts: list[AnyRows] = [rows, ParameterRows(self._angles, tree.usual - state.angles, self._posture)]
-        if predicted is not None:
-            parts.append(belief(state, *predicted))
-        return parts
+    def restart(self, result: FrameResult, velocity: NDArray | None = None) -> None:
+        """Go on from a result that was found without a prediction; its velocity (n,) [m, rad] a frame, or unknown."""
+        if velocity is None:
+            self._prediction.start(result.state, result.dof_std)
+        else:
+            self._prediction.go_on(result.state, result.dof_std, velocity)
 
-    def _judge(self, fit: Fit, uv: NDArray, weight: NDArray, fitted: NDArray, swapped: NDArray) -> FrameResult:
-        factor = np.zeros(len(weight))
-        factor[fit.equations.rows.group] = fit.equations.factor
-        own = normal_equations(
-            self.body, fit.state, [fit.equations.rows, prior_rows(self.body, fit.state)], loss=self.settings.loss
-        )
-        cov = covariance(own)
-        blind = 6 + np.flatnonzero(prior_alone(self.body, cov.std))
-        if blind.size:
-            cov = Covariance(cov.observed, np.concatenate([cov.free, np.eye(len(cov.observed))[:, blind]], axis=1))
-        std = cov.std, joint_std(self.body, fit.state, cov)
-        return judged(self.channels, self._informs, fit.state, std, uv, weight, factor, fitted, swapped)
-
-
-def prior_alone(body: Body, dof_std: NDArray) -> NDArray:
-    """(..., D) bool: coordinates that are known from the prior alone, by standard deviations (..., 6 + D)."""
-    return np.asarray(dof_std[..., 6:] > 0.95 * body.tree.spread)
-
-
-def judged(
-    channels: Channels, informs: NDArray, state: BodyState, std: tuple[NDArray, NDArray],
-    uv: NDArray, weight: NDArray, factor: NDArray, fitted: NDArray, swapped: NDArray,
-) -> FrameResult:  # fmt: skip
-    """A fitted frame with its quality.
-
-    Parameters
-    ----------
-    informs : (S, N) from `informing`.
-    std : (n,) of the degrees of freedom and (S, 3) [m] of the joint centres.
-    uv, fitted : (N, 2) [px] measured as used, and where the body is seen.
-    weight, factor : (N,) [1/px²] and in 0..1, of every measurement, 0 where unseen; swapped (N,).
-    """
-    seen = weight > 0
-    support = informs @ factor
-    cameras = np.stack(
-        [informs[:, channels.camera == c] @ (factor > 0.3)[channels.camera == c] > 0 for c in range(len(channels.rig))]
-    ).sum(axis=0)
-    share = support / np.maximum(informs @ seen, 1.0)
-    quality = share * np.minimum(cameras, 2) / 2.0
-    return FrameResult(
-        state, *std, factor, weight * factor, uv, fitted, swapped, float(np.mean(quality)), quality,
-        float(factor.sum() / max(int(seen.sum()), 1)),
-    )  # fmt: skip
-
-
-def informing(body: Body, channels: Channels) -> NDArray:
-    """(S, N) 0 or 1: channels that tell where a segment is: those on it and those at its children's joints.
-
-    A segment without any is known through its children.
-    """
-    tree = body.tree
-    owner, place = channels.points.segments[channels.column], channels.points.points[channels.column]
-    near = np.linalg.norm(place, axis=1) < 0.05
-    out = np.zeros((len(tree.segments), len(owner)))
-    for s in range(len(tree.segments)):
-        out[s] = (owner == s) | (near & (tree.parents[owner] == s))
-    for s in range(len(tree.segments) - 1, 0, -1):
-        if not out[s].any():
-            children = [c for c in range(len(tree.segments)) if tree.parents[c] == s]
-            out[s] = np.max([out[c] for c in children], axis=0) if children else 0.0
-    return out
+    @property
+    def velocity(self) -> NDArray:
+        """(n,) [m, rad] a frame, of the last one."""
+        return self._prediction.velocity

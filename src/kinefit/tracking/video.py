@@ -1,4 +1,4 @@
-"""From 2D keypoints of calibrated cameras to a motion: the main job."""
+"""From a recording of any sensors to a motion: the main job."""
 
 from __future__ import annotations
 
@@ -8,53 +8,45 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
-from kinefit.errors import ObservationError, TrackingError
-from kinefit.geometry.camera import Rig
+from kinefit.errors import ObservationError
 from kinefit.motion import Motion, Residuals
-from kinefit.multiview.association import choose_people
-from kinefit.observations import Keypoints
-from kinefit.sensors.channels import Channels, make_channels
-from kinefit.smoothing.smoother import smooth_results
+from kinefit.sensors.base import Leftover
+from kinefit.sensors.results import FrameResult
+from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.linearised import OtherSensors
+from kinefit.smoothing.sensor_noise import other_noise
+from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.uncertainty import with_lasting_errors
-from kinefit.subject.keypoints import Progress, Subject, fit_subject
+from kinefit.subject.keypoints import Progress, Subject
 from kinefit.tracking.interrupted import TrackingInterrupted
-from kinefit.tracking.tracker import FrameResult, Settings, Tracker
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.run import Tracked, run
+from kinefit.tracking.sizing import fitted_to_person
 
 
 def track(
-    rig: Rig,
-    keypoints: Sequence[Keypoints],
-    body: Body,
-    *,
-    accuracy: float | Sequence[float] = 8.0,
-    subject: Subject | None = None,
-    trial: Subject | None = None,
-    height: float | None = None,
-    settings: Settings | None = None,
-    smooth: bool = True,
-    contacts: bool = False,
-    shape_frames: int = 25,
-    up: str = "z",
-    name: str = "motion",
-    progress: Progress | None = None,
-) -> Motion:
-    """Motion of one person from keypoints of several calibrated cameras, with no pose given.
+    recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
+    height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
+    contacts: bool = False, shape_frames: int = 25, progress: Progress | None = None,
+) -> Motion:  # fmt: skip
+    """Motion of one person from whatever sensors saw, with no pose given.
 
-    The person is chosen among all detected, bone lengths are found from frames spread over the take, then every frame
-    is fitted straight to the pixels, with outliers and exchanged sides set right and error bars from the normal matrix.
+    The body is fitted to the person, every frame is fitted to all that was measured then, with outliers and exchanged
+    sides set right, lost limbs sought; in the end all frames are fitted together with a motion prior whose process
+    noise the take itself tells.
 
     Parameters
     ----------
-    rig : Rig
-    keypoints : records of the same number of frames and the same rate.
+    recording : Recording
     body : Body, generic.
-    accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
     subject : Subject
-        Known already; default: fitted from this take.
+        Known already; default: fitted from this recording.
     trial : Subject
-        Of another trial of the same person: the fit of this take starts from its lengths.
+        Of another trial of the same person, from keypoints: the fit of this one starts from its lengths.
     height : float [m]
         Stature, where it is known: the length of bones that nobody sees follows it.
+    size : whether the body is fitted to the person
+    settings : TrackSettings
     smooth : bool
         Fit all frames together in the end; without it each frame knows only of those before it.
     contacts : bool
@@ -64,109 +56,121 @@ def track(
 
     Raises
     ------
+    ObservationError
+        Contacts without smoothing, which would be ignored; a height that cannot be.
     TrackingError
         Nobody can be found, or no frame shows enough of the person.
     TrackingInterrupted
         Ctrl-C after at least one tracked frame.
     """
-    if not keypoints:
-        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
-    lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
-    if len(lengths) > 1 or len(rates) > 1:
-        told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
-        raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
-    sigma = _accuracies(accuracy, len(keypoints))
-    if len({k.camera for k in keypoints}) < 2:
-        raise TrackingError(
-            f"the keypoints are of one camera only, {keypoints[0].camera}", remedy="Tracking needs two cameras or more."
-        )
+    if contacts and not smooth:
+        raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need the whole take.")
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
-    channels = make_channels(body, rig, keypoints, choose_people(rig, keypoints), sigma)
-    if subject is None:
-        subject = fit_subject(body, channels, frames=shape_frames, height=height, trial=trial, progress=progress)
-    channels = channels.with_points(subject.body)
-    settings = settings or Settings()
-    results = _run(Tracker(subject.body, channels, keypoints[0].rate, settings), channels, progress)
-    frames = [r for r in results if r is not None]
-    assert len(frames) == len(results)
-    provenance = {}
-    if smooth and len(frames) == len(channels.uv):
-        frames, provenance["smoothing"] = smooth_results(
-            subject.body, channels, frames, keypoints[0].rate, settings, contacts=contacts, up=up
-        )
-    frames, noise = with_lasting_errors(frames, subject, channels, keypoints[0].rate)
-    provenance["length_std_m"] = subject.length_std
-    provenance["detector noise"] = noise.as_told(channels.sources)
-    motion = _motion(subject.body, channels, frames, keypoints[0], up, name, provenance)
-    if len(motion) < len(channels.uv):
-        raise TrackingInterrupted(motion, len(channels.uv))
+    settings = settings or TrackSettings()
+    person = fitted_to_person(
+        recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
+        progress=progress,
+    )  # fmt: skip
+    tracked = run(
+        person.recording, person.subject.body, person.channels, settings, start=person.start, values=person.values,
+        progress=progress,
+    )  # fmt: skip
+    motion = _motion(person.recording, person, tracked, settings, smooth and tracked.complete, contacts)
+    if not tracked.complete:
+        raise TrackingInterrupted(motion, len(recording))
     return motion
 
 
-def _accuracies(accuracy: float | Sequence[float], count: int) -> list[float]:
-    """One standard deviation [px] for each of the records."""
-    values = np.asarray(accuracy, float).ravel()
-    if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
-        raise ObservationError(f"accuracies {values}", remedy=f"Give one positive number of pixels, or {count}.")
-    return [float(v) for v in np.broadcast_to(values, count)]
-
-
-def _run(tracker: Tracker, channels: Channels, progress: Progress | None) -> list[FrameResult | None]:
-    """Results of all frames; of fewer where Ctrl-C came once the person had been found."""
-    total = len(channels.uv)
-    results: list[FrameResult | None] = []
-    try:
-        for f in range(total):
-            results.append(tracker.update(channels.uv[f], channels.confidence[f]))
-            if progress:
-                progress("frames", f + 1, total)
-    except KeyboardInterrupt:
-        if not any(r is not None for r in results):
-            raise
-    first = next((f for f, r in enumerate(results) if r is not None), None)
-    if first is None:
-        raise TrackingError("the body was found in no frame", remedy="Check the calibration and the keypoints.")
-    if first > 0:  # what came before the first good frame, backwards from it
-        found = results[first]
-        assert found is not None
-        tracker.start_at(found.state)
-        for f in range(first - 1, -1, -1):
-            results[f] = tracker.update(channels.uv[f], channels.confidence[f])
-    return results
-
-
 def _motion(
-    body: Body, channels: Channels, frames: list[FrameResult], record: Keypoints, up: str, name: str,
-    provenance: dict[str, Any],
-) -> Motion:  # fmt: skip
-    factor, uv = np.stack([r.factor for r in frames]), np.stack([r.uv for r in frames])
-    fitted, swapped = np.stack([r.fitted for r in frames]), np.stack([r.swapped for r in frames])
-    residuals = {}
-    for q, label in enumerate(channels.sources):
-        mine = channels.source == q
-        columns = channels.column[mine]
-        residuals[label] = Residuals(
-            names=tuple(channels.points.names[c] for c in columns),
-            segments=channels.points.segments[columns],
-            values=uv[:, mine] - fitted[:, mine],
-            weights=factor[:, mine],
-            unit="px",
-            measured=uv[:, mine],
-            swapped=np.any(swapped[:, mine], axis=1),
-        )
+    recording: Recording, person: Any, tracked: Tracked, settings: TrackSettings, smooth: bool, contacts: bool
+) -> Motion:
+    """The motion of what was tracked, smoothed where that is asked for, with lasting errors in its deviations."""
+    tracker, subject, rate = tracked.tracker, person.subject, recording.rate
+    body, results, leftovers = subject.body, tracked.results, tracked.leftovers
+    times = recording.times[tracked.steps]
+    channels = person.channels.part(tracked.steps)
+    provenance: dict[str, Any] = dict(person.told)
+    others = None
+    if any(tracked.measurements):
+        others = OtherSensors(
+            times, tuple(tracked.measurements), tracker.scene_of, tracker.apart, settings.near,
+            {name: 1.0 for name in {m.sensor for several in tracked.measurements for m in several}},
+        )  # fmt: skip
+    matched = None
+    if smooth:
+        done = smooth_results(
+            body, channels, results, rate, settings, tracker.scene_of, others=others, contacts=contacts,
+            up=recording.up,
+        )  # fmt: skip
+        results, take, weight = done.results, done.take, done.weight
+        provenance["smoothing"] = done.provenance
+        others, matched = take.others, take.linear and take.linear.matched
+        leftovers = [
+            [rest for m in r.matched for rest in m.leftovers(tracker.scene_of(r.state, r.time))] for r in results
+        ]
+    else:
+        take = pixels_of_track(body, channels, results, rate, settings)
+        factor = take.factors(channels.sigma, take.fitted(take.roots, take.angles))
+        weight = take.confidence / np.square(channels.sigma) * factor
+        if others is not None:
+            matched = others.linearised(body, take.roots, take.angles).matched
+    noise_of_others = None
+    if others is not None and matched is not None:
+        noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
+        provenance["sensor noise"] = noise_of_others.as_told()
+    results, noise = with_lasting_errors(results, subject, take, weight, rate, noise_of_others)
+    if channels.sources:
+        provenance["detector noise"] = noise.as_told(channels.sources)
+    provenance["length_std_m"] = subject.length_std
+    provenance["estimate"] = "smoothed" if smooth else "filtered"
+    provenance["frames"] = {"dropped": tracker.dropped, "late": tracker.late}
     return Motion(
         body=body,
-        rate=record.rate,
-        times=record.times[: len(frames)],
-        Ts_world_root=np.stack([r.state.T_world_root for r in frames]),
-        angles=np.stack([r.state.angles for r in frames]),
-        dof_std=np.stack([r.dof_std for r in frames]),
-        joint_std=np.stack([r.joint_std for r in frames]),
-        quality=np.array([r.quality for r in frames]),
-        segment_quality=np.stack([r.segment_quality for r in frames]),
-        residuals=residuals,
-        up=up,
-        name=name,
+        rate=rate,
+        times=times,
+        Ts_world_root=np.stack([r.state.T_world_root for r in results]),
+        angles=np.stack([r.state.angles for r in results]),
+        dof_std=np.stack([r.dof_std for r in results]),
+        joint_std=np.stack([r.joint_std for r in results]),
+        quality=np.array([r.quality for r in results]),
+        segment_quality=np.stack([r.segment_quality for r in results]),
+        residuals=residuals_of(leftovers, results),
+        up=recording.up,
+        name=recording.name,
         provenance=provenance,
     )
+
+
+def residuals_of(leftovers: Sequence[Sequence[Leftover]], results: Sequence[FrameResult]) -> dict[str, Residuals]:
+    """What every sensor left over in all frames."""
+    F = len(results)
+    frames: dict[str, dict[int, Leftover]] = {}
+    for f, several in enumerate(leftovers):
+        for rest in several:
+            frames.setdefault(rest.label, {})[f] = rest
+    out = {}
+    for label, of in frames.items():
+        names: dict[str, int] = {}
+        for rest in of.values():
+            for name, segment in zip(rest.names, rest.segments):
+                names.setdefault(name, int(segment))
+        place = {name: k for k, name in enumerate(names)}
+        one = next(iter(of.values()))
+        shape = F, len(names), one.values.shape[1]
+        values, measured = np.full(shape, np.nan), np.full(shape, np.nan)
+        weights, swapped = np.zeros(shape[:2]), np.zeros(F, bool)
+        surface = one.count is not None
+        rms, count = np.full(shape[:2], np.nan), np.zeros(shape[:2])
+        for f, rest in of.items():
+            columns = [place[name] for name in rest.names]
+            values[f, columns], weights[f, columns] = rest.values, rest.weights
+            measured[f, columns], swapped[f] = rest.measured, rest.swapped
+            if rest.rms is not None and rest.count is not None:
+                rms[f, columns], count[f, columns] = rest.rms, rest.count
+        out[label] = Residuals(
+            names=tuple(names), segments=np.array(list(names.values()), np.int64), values=values, weights=weights,
+            unit=one.unit, measured=measured, swapped=swapped, rms=rms if surface else None,
+            count=count if surface else None,
+        )  # fmt: skip
+    return out

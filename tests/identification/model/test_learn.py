@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinefit.bodies.marker_sets import load_marker_set
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.geometry.se3 import exp_so3
-from kinefit.identification.marker_sets import load_marker_set
 from kinefit.identification.model.files import load_model, save_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import training_gate

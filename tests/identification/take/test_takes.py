@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.marker_takes import CASES, broken, load, training, truth_of
 
+from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
 from kinefit.identification.frame.identify import Identification
 from kinefit.identification.model.learn import learn_model
@@ -12,14 +13,13 @@ from kinefit.identification.take.people import identify_people, one_after_the_ot
 from kinefit.identification.take.pieces import find_pieces
 from kinefit.identification.take.takes import TakeSettings, identify_take
 from kinefit.identification.take.votes import Votes, assign_pieces
-from kinefit.markers.placement import placement
 from kinefit.observations import Markers
 from kinefit.simulation import squat_and_wave
 
 
 @pytest.fixture(scope="module")
 def labelled():
-    """Two seconds of a person with 42 markers, at 60 Hz."""
+    """Two seconds of a person with 41 markers, at 60 Hz."""
     motion = squat_and_wave(rate=60)
     points = placement(motion.body, "CMU_41").points
     return Markers(points.names, 60.0, motion.positions(points), up="z")

@@ -34,7 +34,7 @@ def load(folder, depth, head="", more=""):
 
 
 def test_a_sensor_alone_is_the_world(folder):
-    seen = load(folder, ALONE + 'rate = 15\nrange = [0.5, 3]\nbackground = "empty"\naccuracy = 0.02\non_body = true')
+    seen = load(folder, ALONE + 'rate = 15\nrange = [0.5, 3]\nbackground = "empty"\nsigma = 0.02\non_body = true')
     assert (seen.rate, seen.frames, seen.rig.names, seen.notes) == (15.0, (0, 20), ("tof",), ())
     camera, video = seen.rig["tof"], seen.depth[0]
     np.testing.assert_array_equal(camera.T_camera_world, np.eye(4))
@@ -74,7 +74,7 @@ def test_frames_that_are_missing_are_told(folder):
         (ALONE + "range = [2, 3]", "rate = 30", "", "depth tof: nothing lies within the range of 2 to 3 m"),
         (ALONE + "range = [3, 2]", "rate = 30", "", r"depth tof: range = \[3.0, 2.0\]"),
         (ALONE + "range = [3]", "rate = 30", "", "Expected `array` of length 2"),
-        (ALONE + "accuracy = 5", "rate = 30", "", "accuracy 5.0 m"),
+        (ALONE + "sigma = 5", "rate = 30", "", "sigma 5.0 m"),
         (ALONE + "unit = 0", "rate = 30", "", "unit = 0"),
         (ALONE + "size = [0, 3]", "rate = 30", "", r"size = \[0, 3\]"),
         ("intrinsics = [60, -61, 31, 23]", "rate = 30", "", "intrinsics = "),
@@ -111,10 +111,10 @@ def test_stereo_pairs_are_two_cameras_with_videos(folder):
         return read_take(folder / "take.toml")
 
     (entry,) = read("rgb", "range = [1, 3]").stereo
-    assert (entry.name, entry.range, entry.accuracy) == ("tof-rgb", (1.0, 3.0), 0.5)
+    assert (entry.name, entry.range, entry.sigma) == ("tof-rgb", (1.0, 3.0), 0.5)
     for right, more, words in [
         ("tof", "", "are one camera"), ("nix", "", "no camera with a video 'nix'; there are: tof"),
-        ("rgb", "accuracy = 0", "accuracy 0.0 px"), ("rgb", "range = [0, 2]", r"range \[0.0, 2.0\] m"),
+        ("rgb", "sigma = 0", "sigma 0.0 px"), ("rgb", "range = [0, 2]", r"range \[0.0, 2.0\] m"),
     ]:  # fmt: skip
         with pytest.raises(TakeError, match=words) as caught:
             read(right, more)

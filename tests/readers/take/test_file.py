@@ -21,7 +21,7 @@ def balancing(data, kind, *, letterbox='image = "letterboxed"', head="", frame=N
         text += f'[[camera]]\nname = "{camera}"\nvideo = "{data}/videos/{camera}.mp4"\n{picture}\n'
         source = {
             "openpose": f'file = "{data}/openpose_json/{camera}"\nset = "BODY_25B"\n',
-            "mediapipe": f'file = "{data}/mediapipe_landmarks_{camera}.npy"\nformat = "mediapipe"\naccuracy = 11\n',
+            "mediapipe": f'file = "{data}/mediapipe_landmarks_{camera}.npy"\nformat = "mediapipe"\nsigma = 11\n',
         }[kind]
         told = {"openpose": "calibration", "mediapipe": "video"}[kind] if frame is None else frame
         text += f'[[keypoints]]\ncamera = "{camera}"\n{source}' + (f'frame = "{told}"\n' if told else "")
@@ -38,7 +38,7 @@ def written(folder, text, name="take.toml"):
 def test_the_balancing_trial(data_dir, tmp_path, kind, count):
     take = read_take(written(tmp_path, balancing(data_dir("video_balancing_4cam"), kind)))
     assert (take.name, take.up, take.height, take.body, take.rate) == ("take", "z", 1.75, "humanoid", None)
-    assert [source.accuracy for source in take.keypoints] == [8.0 if kind == "openpose" else 11.0] * 4
+    assert [source.sigma for source in take.keypoints] == [8.0 if kind == "openpose" else 11.0] * 4
     seen = load_observations(take)
     assert (seen.rate, seen.frames, seen.rig.names, tuple(seen.videos)) == (60, (0, 100), CAMERAS, CAMERAS)
     assert [k.points.shape[0] for k in seen.keypoints] == [100] * 4
@@ -188,7 +188,7 @@ def test_a_camera_without_calibration(small):
 
 def test_markers_alone(data_dir, tmp_path):
     file = next(data_dir("markers").rglob("*Eb015pr.c3d"))
-    seen = load(tmp_path, f'[[markers]]\nfile = "{file}"\naccuracy = 0.003\n')
+    seen = load(tmp_path, f'[[markers]]\nfile = "{file}"\nsigma = 0.003\n')
     assert (seen.rig, seen.keypoints, seen.rate, seen.frames) == (None, (), 50, (0, 450))
     assert seen.markers[0].positions.shape == (450, 26, 3)
 
@@ -210,12 +210,12 @@ WRONG = {
     "empty with head": ('[take]\nname = "x"', "an empty take"),
     "no calibration": ('[[camera]]\nname = "a"', "cameras without calibration"),
     "unknown set": (take_text(keys='set = "BODY_26"'), "no keypoint set 'BODY_26'; there are: BODY_25B"),
-    "set of another detector": (take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "mediapipe gives no COCO_17"),
+    "set of another detector": (take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe .COCO_17"),
     "frames": (take_text(head="frames = [9, 2]"), r"frames \[9, 2\]"),
     "height in cm": (take_text(head="height = 175"), "height 175 m"),
     "rate": (take_text(head="rate = -1"), "rate -1 Hz"),
     "nan": (take_text(a="time_offset = nan"), "time offset nan"),
-    "accuracy": (take_text(keys='accuracy = 0'), "accuracy 0"),
+    "sigma": (take_text(keys='sigma = 0'), "sigma 0"),
     "keypoints without file": (take_text(more='[[keypoints]]\ncamera = "a"'), "no file of openpose keypoints"),
     "marker unit": (take_text(more='[[markers]]\nfile = "a"\nunit = "ell"'), "no unit 'ell'"),
 }

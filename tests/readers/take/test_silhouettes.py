@@ -80,9 +80,9 @@ def take(folder, silhouette, head=""):
 
 def test_a_take_with_silhouettes_alone(tmp_path):
     write_masks(tmp_path / "m")
-    path = take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\naccuracy = 2.0\n')
+    path = take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\nsigma = 2.0\n')
     told = read_take(path)
-    assert told.silhouettes[0].accuracy == 2.0
+    assert told.silhouettes[0].sigma == 2.0
     seen = load_observations(told)
     assert (seen.rate, seen.frames, len(seen.silhouettes)) == (30.0, (0, 3), 1)
     (video,) = silhouettes_of(told, seen)
@@ -100,7 +100,7 @@ def test_silhouettes_with_nothing_to_begin_with_are_refused(tmp_path):
     [
         ('[[silhouette]]\ncamera = "cam9"\nfile = "m"\n', "", "cam1"),
         ('[[silhouette]]\ncamera = "cam1"\n', "", "no file of masks"),
-        ('[[silhouette]]\ncamera = "cam1"\nfile = "m"\naccuracy = 0\n', "", "accuracy"),
+        ('[[silhouette]]\ncamera = "cam1"\nfile = "m"\nsigma = 0\n', "", "sigma"),
         ('[[silhouette]]\ncamera = "cam1"\nformat = "background"\n', "", "video"),
         ('[[silhouette]]\ncamera = "cam1"\nfile = "m"\n[[silhouette]]\ncamera = "cam1"\nfile = "m"\n', "", "two"),
         ('[[silhouette]]\ncamera = "cam1"\nfile = "m"\nformat = "outline"\n', "", "masks"),

@@ -1,5 +1,6 @@
 """Surfaces of a body's segments: tapered elliptical cylinders and meshes."""
 
+from kinefit.bodies.surfaces.anchors import SurfaceAnchors
 from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
@@ -19,6 +20,7 @@ __all__ = [
     "Nearest",
     "SkinnedMesh",
     "Surface",
+    "SurfaceAnchors",
     "SurfaceTables",
     "TaperedCylinder",
     "body_mesh",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from kinefit._jit import jit
 
 
@@ -145,6 +147,35 @@ def finish(corners, features, origin, cell, owner, values):
                 values[i, j, k, 1] = n[0] if on_surface else dx / d
                 values[i, j, k, 2] = n[1] if on_surface else dy / d
                 values[i, j, k, 3] = n[2] if on_surface else dz / d
+
+
+@jit
+def nearest_faces(corners, x, face, squared):
+    """Nearest triangle of corners (T, 3, 3) for points (N, 3): face (N,) int64 and squared distances (N,) [m²]."""
+    count = corners.shape[0]
+    middle, radius = np.empty((count, 3)), np.empty(count)
+    for t in range(count):
+        largest = 0.0
+        for k in range(3):
+            middle[t, k] = (corners[t, 0, k] + corners[t, 1, k] + corners[t, 2, k]) / 3.0
+        for c in range(3):
+            square = 0.0
+            for k in range(3):
+                square += (corners[t, c, k] - middle[t, k]) ** 2
+            largest = square if square > largest else largest
+        radius[t] = math.sqrt(largest)
+    for i in range(x.shape[0]):
+        best, chosen, near = math.inf, 0, math.inf
+        px, py, pz = x[i, 0], x[i, 1], x[i, 2]
+        for t in range(count):
+            dx, dy, dz = px - middle[t, 0], py - middle[t, 1], pz - middle[t, 2]
+            if dx * dx + dy * dy + dz * dz > (near + radius[t]) ** 2:
+                continue
+            a, b, c, _ = closest_on_triangle(px, py, pz, corners[t, 0], corners[t, 1], corners[t, 2])
+            d = (px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2
+            if d < best:
+                best, chosen, near = d, t, math.sqrt(d)
+        face[i], squared[i] = chosen, best
 
 
 @jit

@@ -101,7 +101,7 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         return Check(take.name, ranked(missing), loaded.take, seen)
     accuracy: dict[str, float] = {}
     for entry in loaded.take.keypoints:
-        accuracy[entry.camera] = min(entry.accuracy, accuracy.get(entry.camera, np.inf))
+        accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
     return check_keypoints(
         seen.rig.select(tuple(n for n in seen.rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
         height=take.height, accuracy=accuracy, name=take.name, take=loaded.take, observations=seen,

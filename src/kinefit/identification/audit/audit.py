@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
 from kinefit.identification.audit.swaps import best_run, crossings, pair_gain, swap_gains
-from kinefit.identification.marker_sets import MarkerSet, find_marker_set
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.observations import Markers

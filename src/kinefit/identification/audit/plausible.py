@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.marker_sets import MarkerSet
+from kinefit.bodies.marker_sets import MarkerSet
 from kinefit.identification.model.from_frame import similarity
 from kinefit.identification.model.learn import distances
 from kinefit.identification.model.model import MarkerModel

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.marker_sets import MarkerSet, SetSegment
 from kinefit.geometry.se3 import exp_so3
-from kinefit.identification.marker_sets import MarkerSet, SetSegment
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.model import MarkerModel
 

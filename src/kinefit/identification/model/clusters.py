@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.marker_sets import GIVE, RANGE
+from kinefit.bodies.marker_sets import GIVE, RANGE, bare
 from kinefit.identification.model.from_frame import Skeleton
 from kinefit.identification.model.rigid import joint_residual
 from kinefit.solvers.rigid_clusters import local, middle, rigid_frames, shape_of
@@ -208,5 +208,5 @@ def rooted(cost: NDArray, sizes: Sequence[int]) -> tuple[list[int], list[int]]:
 
 def named(labels: Sequence[str]) -> str:
     """A group's name: its first two labels, without the subject."""
-    plain = [label.rpartition(":")[2] for label in labels]
+    plain = [bare(label) for label in labels]
     return "+".join(plain[:2]) + ("+" if len(plain) > 2 else "")

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit.bodies.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.errors import ObservationError
-from kinefit.identification.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 
 NOISE = 0.001

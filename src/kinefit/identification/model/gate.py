@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kinefit.identification.marker_sets import RANGE, MarkerSet, find_marker_set
+from kinefit.bodies.marker_sets import RANGE, MarkerSet, find_marker_set
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 from kinefit.identification.model.rigid import told
 from kinefit.observations import Markers

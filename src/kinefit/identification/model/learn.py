@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.errors import ObservationError
-from kinefit.identification.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.identification.model.clusters import learn_segments
 from kinefit.identification.model.from_frame import (
     JOINT_SPREAD,

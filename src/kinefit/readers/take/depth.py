@@ -77,16 +77,22 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
 
 
 def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVideo:
+    odd = [key for key in ("size", "intrinsics", "background") if getattr(entry, key) is not None]
+    if odd:
+        raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Leave it out.")
     camera = entry.camera or entry.name
     clouds = read_clouds(
         entry.file, sensor=entry.name, unit=entry.unit or 1.0, rate=entry.rate, usual_rate=rate,
         range=entry.range or (0.0, np.inf), time_unit=entry.time_unit, time_offset=entry.time_offset,
         T_world_sensor=rig[camera].T_world_camera if rig is not None else None,
     )  # fmt: skip
-    return replace(clouds, on_body=entry.on_body)
+    return replace(clouds, on_body=entry.on_body or entry.segment is not None, segment=entry.segment)
 
 
 def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
+    if entry.segment is not None:
+        problem = "'segment' is of clouds of points, these are images"
+        raise TakeError(problem, remedy="Give one PCD or PLY file a frame, of the points on this segment alone.")
     given: dict[str, Any] = {"sensor": entry.name, "unit": entry.unit, "size": entry.size}
     video = read_depth(
         entry.file, rate=entry.rate, usual_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,

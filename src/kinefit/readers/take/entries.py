@@ -12,6 +12,15 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A table of the take file; paths are absolute once it is read."""
 
 
+SKIN_SETS = ("HANDS", "WRISTS")
+"""Which points of the body the skin's patches are: middles of the hands, or wrists of a body without fingers."""
+
+RENAMED: dict[str, dict[str, str]] = {
+    table: {"accuracy": "sigma"} for table in ("keypoints", "silhouette", "markers", "depth", "stereo")
+}
+"""{table: {old key: new key}}: old keys are read with a warning in this version, and are unknown in the next."""
+
+
 class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
@@ -35,12 +44,13 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
 
     camera: str
     file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
-    format: Literal["openpose", "mediapipe", "caliscope", "detect"] = "openpose"
-    set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe
+    format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
+    set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: float | None = None  # [Hz]; default: the camera's video, or the take
-    accuracy: float = 8.0  # [px] standard deviation, in the calibration's image
+    sigma: float = 8.0  # [px] standard deviation, in the calibration's image
     frames: tuple[int, int] | None = None  # steps (start, stop) at which they count; default: all
+    face: tuple[float, float, float, float] | None = None  # [px] of "skin": left, top, width, height in the video
 
 
 class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
@@ -48,10 +58,25 @@ class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
 
     camera: str
     file: Path | None = None  # of "masks": folder or pattern; of "background": picture of the empty scene
-    format: Literal["masks", "background", "detect"] = "masks"
+    format: Literal["masks", "background", "threshold", "detect"] = "masks"
     frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
     rate: float | None = None  # [Hz] of the masks; default: the camera's video, or the take
-    accuracy: float = 4.0  # [px] standard deviation of an outline, in the calibration's image
+    sigma: float = 4.0  # [px] standard deviation of an outline, in the calibration's image
+    low: tuple[int, int, int] | None = None  # of "threshold": least value of each channel that is the body's
+    high: tuple[int, int, int] | None = None  # and the largest
+    channels: Literal["rgb", "hsv", "lab", "ycrcb"] | None = None  # of low and high, 8 bits each; default: rgb
+    smooth: float | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
+
+
+class LinesEntry(_Entry, frozen=True, kw_only=True):
+    """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
+
+    camera: str
+    file: Path  # table of frame, line, u1, v1, u2, v2 [px]
+    landmarks: dict[str, tuple[str, ...]]  # of each line: two ends of an edge of the body, or one point
+    frame: Literal["calibration", "video"] | None = None  # image frame of the lines; needed where the two differ
+    rate: float | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: float = 2.0  # [px] standard deviation, in the calibration's image
 
 
 class MarkersEntry(_Entry, frozen=True, kw_only=True):
@@ -61,7 +86,7 @@ class MarkersEntry(_Entry, frozen=True, kw_only=True):
     unit: str | None = None  # where the file does not tell it
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
     time_offset: float = 0.0  # [s]
-    accuracy: float = 0.005  # [m] standard deviation
+    sigma: float = 0.005  # [m] standard deviation
 
 
 class DepthEntry(_Entry, frozen=True, kw_only=True):
@@ -78,9 +103,10 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     rate: float | None = None  # [Hz]; default: what the file tells, the take's, the videos'
     time_unit: float | None = None  # [s] of the last number in every file's name, where that is the time
     time_offset: float = 0.0  # [s] time of the first frame
-    accuracy: float = 0.01  # [m] standard deviation of a depth
+    sigma: float = 0.01  # [m] standard deviation of a depth
     background: Path | None = None  # the same sensor before the empty scene
     on_body: bool = False  # everything but the body was taken out already
+    segment: str | None = None  # of clouds of points: the one segment of the body that they are on
 
 
 class StereoEntry(_Entry, frozen=True, kw_only=True):
@@ -89,7 +115,7 @@ class StereoEntry(_Entry, frozen=True, kw_only=True):
     left: str
     right: str
     range: tuple[float, float] = (0.5, 6.0)  # [m] along the left camera's axis
-    accuracy: float = 0.5  # [px] standard deviation of a disparity
+    sigma: float = 0.5  # [px] standard deviation of a disparity
 
     @property
     def name(self) -> str:

@@ -11,14 +11,24 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.observations import CloudVideo, DepthVideo, Keypoints, Markers, SilhouetteVideo
+from kinefit.observations import (
+    CloudVideo,
+    DepthVideo,
+    Keypoints,
+    KeypointVideo,
+    LineVideo,
+    Markers,
+    SilhouetteVideo,
+)
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
+from kinefit.readers.take.lines import load_lines
 from kinefit.readers.take.silhouettes import load_silhouettes
+from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, check_rates, common_frames
 
 
@@ -46,6 +56,10 @@ class Observations:
         Those whose files are points without order.
     silhouettes : tuple of SilhouetteVideo
         In the order of `take.silhouettes`, whole, at their own rates.
+    skin : tuple of KeypointVideo
+        In the order of `take.skin`: face and hands by colour, followed as their frames are asked for.
+    lines : tuple of LineVideo
+        In the order of `take.lines`, those frames that have lines.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     """
@@ -60,7 +74,14 @@ class Observations:
     depth: tuple[DepthVideo, ...] = ()
     clouds: tuple[CloudVideo, ...] = ()
     silhouettes: tuple[SilhouetteVideo, ...] = ()
+    skin: tuple[KeypointVideo, ...] = ()
+    lines: tuple[LineVideo, ...] = ()
     notes: tuple[str, ...] = ()
+
+    @property
+    def videos_of_frames(self) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | KeypointVideo | LineVideo, ...]:
+        """Every recording with `at_step(step, rate)` and `frame(i)`: depth, clouds, silhouettes, skin, lines."""
+        return (*self.depth, *self.clouds, *self.silhouettes, *self.skin, *self.lines)
 
 
 def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
@@ -102,8 +123,11 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     for outlines in silhouettes:
         stream = f"silhouettes {outlines.sensor}"
         rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
+    skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None})
+    lines = load_lines(take, images, rates)
+    rates |= {f"lines {video.sensor}": video.rate for video in lines}
     recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
-    if not (lengths or markers or recordings):
+    if not (lengths or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
     check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
@@ -111,39 +135,43 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     rate = take.rate or next(iter(rates.values()), None) or own[0]
     if lengths:
         frames = common_frames(lengths, offsets, rate, take.frames, file=take.path)
-    elif recordings:
-        frames = take.frames or _span(recordings, rate)
+    elif recordings or lines:
+        frames = take.frames or _span(recordings or lines, rate)
     else:
         frames = take.frames or (0, max(round(len(m) * rate / m.rate) for m in markers))
-    _check_depth(recordings, frames, rate, take)
+    _check_times((*recordings, *lines, *skin), frames, rate, take)
     cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
         markers=markers,
         keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
-        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes, notes=sensors.notes(rate),
+        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes, skin=skin, lines=lines,
+        notes=sensors.notes(rate),
     )
 
 
-def _span(recordings: Sequence[DepthVideo | CloudVideo], rate: float) -> tuple[int, int]:
-    """Steps from the first depth image of any sensor to the last."""
+def _span(recordings: Sequence[DepthVideo | CloudVideo | LineVideo], rate: float) -> tuple[int, int]:
+    """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1
 
 
-def _check_depth(
-    recordings: Sequence[DepthVideo | CloudVideo], frames: tuple[int, int], rate: float, take: Take
-) -> None:
-    """Refuse depth that was not recorded at the time of the rest."""
+def _check_times(
+    recordings: Sequence[DepthVideo | CloudVideo | LineVideo | KeypointVideo], frames: tuple[int, int], rate: float,
+    take: Take,
+) -> None:  # fmt: skip
+    """Refuse what was not recorded at the time of the rest."""
     for recording in recordings:
         first, last = float(recording.times[0]), float(recording.times[-1])
         if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
+            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera"}
             raise ObservationError(
                 f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
                 f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,
-                place=f"depth {recording.sensor}", remedy="Correct its time_offset, its rate, or frames.",
-            )
+                place=f"{kinds.get(type(recording), 'depth')} {recording.sensor}",
+                remedy="Correct its time_offset, its rate, or frames.",
+            )  # fmt: skip
 
 
 def _read_rig(take: Take, exteriors: bool) -> Rig | None:

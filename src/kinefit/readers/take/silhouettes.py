@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.images.silhouette import colour_mask
 from kinefit.observations import Detections, SilhouetteVideo
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.take.file import SilhouetteEntry, Take
+from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
+from kinefit.readers.video import Video
 
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
@@ -72,7 +74,7 @@ def load_silhouettes(
     out = []
     for entry in take.silhouettes:
         if entry.format == "background":
-            continue
+            continue  # what is behind the body is learnt by whoever follows it
         try:
             out.append(_silhouettes(entry, take, rig, images[entry.camera], rates))
         except KinefitError as error:
@@ -100,11 +102,37 @@ def _silhouettes(
             entry.file, camera=entry.camera, rate=rate, size=size,
             image_frame=frame if entry.frame == "video" and not same else None, time_offset=offset,
         )  # fmt: skip
+    if entry.format == "threshold":
+        return _coloured(entry, camera, size, frame)
     found = read_detections(entry.file or detections_file(take.path, entry.camera))
     times = offset + np.arange(len(found)) / found.rate
     return SilhouetteVideo(
         entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source
     )
+
+
+_SPACES = {"hsv": cv2.COLOR_RGB2HSV, "lab": cv2.COLOR_RGB2Lab, "ycrcb": cv2.COLOR_RGB2YCrCb}
+
+
+def _coloured(
+    entry: SilhouetteEntry, camera: CameraEntry, size: tuple[int, int], frame: ImageFrame
+) -> SilhouetteVideo:
+    """What has the body's colour in a camera's video (P1 4.1).
+
+    The mask is smoothed before the Laplace operator; where that changes its sign the mask has half its height, which is
+    where an outline is looked for.
+    """
+    assert camera.video is not None and entry.low is not None and entry.high is not None
+    video, low, high = Video(camera.video), entry.low, entry.high
+    smooth, space = 1.0 if entry.smooth is None else entry.smooth, _SPACES.get(entry.channels or "rgb")
+
+    def image(i: int) -> NDArray:
+        picture = video.read(i)
+        mask = colour_mask(picture if space is None else cv2.cvtColor(picture, space), low, high)
+        return in_calibration(np.asarray(cv2.GaussianBlur(mask, (0, 0), smooth)), size, frame)
+
+    times = camera.time_offset + np.arange(len(video)) / video.rate
+    return SilhouetteVideo(entry.camera, video.rate, times, size, image, str(camera.video))
 
 
 def _everybody(found: Detections, i: int) -> NDArray:

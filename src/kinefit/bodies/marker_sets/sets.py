@@ -1,31 +1,25 @@
-"""Marker sets: which labels belong to which segment, where on a body, and where segments meet."""
+"""Marker sets for identification: which labels belong to which segment, where on a body, and where segments meet."""
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from os import PathLike
-from pathlib import Path
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, ObservationError, choices
+from kinefit.bodies.marker_sets.files import GIVE, RANGE, SegmentRecord, SetRecord, catalogue, find_record, set_names
+from kinefit.bodies.marker_sets.labels import matched, plain
+from kinefit.errors import FileError, choices
+
+__all__ = [
+    "FEWEST", "GIVE", "RANGE", "MarkerSet", "SetSegment", "find_marker_set", "load_marker_set", "marker_set_names",
+]  # fmt: skip
 
 FEWEST = 4
 """Labels that a set and a take must have in common, and half of the take's or the set's: fewer agree by chance."""
-
-GIVE = 0.004
-"""[m] give of a marker where the set does not tell."""
-
-RANGE = 1.5
-"""[rad] range of a joint where the set does not tell."""
-
-_Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,23 +73,18 @@ class MarkerSet:
     def match(self, labels: Iterable[str]) -> tuple[str | None, ...]:
         """What the set calls each of a take's labels; None where it does not know it.
 
-        A prefix up to a colon (the subject's name), letter case, and the marks . _ - and blank do not count.
+        See `labels.matched`: the subject's prefix, letter case, and the marks . _ - and blank do not count.
         """
-        plain = {_plain(name): name for name in self.labels}
-        return tuple(plain.get(_plain(label)) for label in labels)
+        return matched(labels, self.labels)
 
     def is_computed(self, label: str) -> bool:
         """Whether a label names a computed point, not a marker."""
-        return _plain(label) in {_plain(c) for c in self.computed}
-
-
-def _plain(label: str) -> str:
-    return "".join(c for c in label.rpartition(":")[2].lower() if c not in "._- ")
+        return plain(label) in {plain(c) for c in self.computed}
 
 
 def marker_set_names() -> tuple[str, ...]:
     """Names of the marker sets that come with kinefit."""
-    return tuple(sorted(_catalogue()))
+    return set_names()
 
 
 def load_marker_set(name_or_file: str | PathLike[str]) -> MarkerSet:
@@ -106,19 +95,10 @@ def load_marker_set(name_or_file: str | PathLike[str]) -> MarkerSet:
     ObservationError
         Unknown name.
     FileError
-        A file that cannot be read, or is no marker set: with the place.
+        A file that cannot be read, or is no marker set with segments: with the place.
     """
-    name = str(name_or_file)
-    if name.lower().endswith(".toml"):
-        try:
-            text = Path(name_or_file).read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise FileError(f"cannot read the marker set ({error})", file=name, remedy="Give a TOML file.") from error
-        return _parse(text, name)
-    for found in _catalogue().values():
-        if _plain(name) in {_plain(n) for n in (found.name, *found.also)}:
-            return found
-    raise ObservationError(choices("marker set", name, marker_set_names()), remedy="Or give a file of one (.toml).")
+    record, source = find_record(name_or_file, marker_set_names())
+    return _sets()[source] if source in _sets() else _built(record, source)
 
 
 def find_marker_set(labels: Iterable[str]) -> MarkerSet | None:
@@ -128,7 +108,7 @@ def find_marker_set(labels: Iterable[str]) -> MarkerSet | None:
     """
     labels = tuple(labels)
     best, best_key = None, (FEWEST - 1, 0)
-    for found in _catalogue().values():
+    for found in _sets().values():
         known = sum(n is not None or found.is_computed(label) for label, n in zip(labels, found.match(labels)))
         key = (known, -len(found.labels))
         if key > best_key and (2 * known >= len(labels) or 2 * known >= len(found.labels)):
@@ -136,58 +116,14 @@ def find_marker_set(labels: Iterable[str]) -> MarkerSet | None:
     return best
 
 
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class _Segment(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    name: str
-    markers: list[str]
-    parent: str | None = None
-    joint: _Vector | None = None
-    give: float = GIVE
-    loose: dict[str, float] = {}
-    range: float = np.degrees(RANGE)
-
-
-class _File(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    name: str
-    segment: list[_Segment]
-    places: dict[str, _Vector] = {}
-    also: list[str] = []
-    sides: list[tuple[str, str]] = []
-    single: list[str] = []
-    computed: list[str] = []
-
-
 @cache
-def _catalogue() -> dict[str, MarkerSet]:
-    folder = resources.files("kinefit.identification") / "marker_sets"
-    files = sorted((e for e in folder.iterdir() if e.name.endswith(".toml")), key=lambda e: e.name)
-    return {found.name: found for e in files if (found := _parse(e.read_text("utf-8"), e.name))}
+def _sets() -> dict[str, MarkerSet]:
+    return {name: _built(record, name) for name, record in catalogue().items()}
 
 
-def _parse(text: str, source: str) -> MarkerSet:
-    try:
-        record = msgspec.convert(tomllib.loads(text), _File)
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"not valid TOML ({error})", file=source, remedy="See https://toml.io.") from error
-    except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$")
-        remedy = "It has name, sides, [places] [m] and [[segment]] with name, parent, joint [m], markers."
-        place = place.strip(".`")
-        raise FileError(f"not a marker set: {problem}", file=source, place=place or None, remedy=remedy) from error
-    return _built(record, source)
-
-
-def _built(record: _File, source: str) -> MarkerSet:
+def _built(record: SetRecord, source: str) -> MarkerSet:
     """The set with its left side: labels of `sides`, segments that end in _r; z changes its sign."""
-
-    def mirror(label: str) -> str | None:
-        if label in record.single:
-            return None
-        return next((left + label[len(right):] for right, left in record.sides if label.startswith(right)), None)
-
+    mirror = record.mirror
     segments: list[SetSegment] = []
     names: list[str] = []
     for s in record.segment:
@@ -226,7 +162,7 @@ def _built(record: _File, source: str) -> MarkerSet:
     return MarkerSet(record.name, labels, places, tuple(segments), tuple(record.also), tuple(dict.fromkeys(computed)))
 
 
-def _wrong(s: _Segment, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
+def _wrong(s: SegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
     """What is wrong with a segment, and what to do; empty if nothing is."""
     if name in names:
         return "a segment is there twice", "Give each its own name."

@@ -5,9 +5,9 @@ import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import load_body
-from kinefit.multiview.left_right import find_swaps, limb_groups
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import fitted_pixels, make_channels
+from kinefit.sensors.left_right import find_swaps, limb_groups
 
 BODY = load_body("humanoid")
 SET = "BODY_25B"

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from kinefit.bodies.marker_sets import find_marker_set, load_marker_set, marker_set_names
 from kinefit.errors import FileError, ObservationError
-from kinefit.identification.marker_sets import find_marker_set, load_marker_set, marker_set_names
 
 MINIMAL = """
 name = "X"

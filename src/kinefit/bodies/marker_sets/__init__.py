@@ -1,0 +1,33 @@
+"""The catalogue of marker sets: labels, segments, places on a body; and the rule by which labels agree."""
+
+from kinefit.bodies.marker_sets.labels import bare, matched, subject_of
+from kinefit.bodies.marker_sets.placement import Placement, find_placement, known_set, placed_set_names, placement
+from kinefit.bodies.marker_sets.sets import (
+    FEWEST,
+    GIVE,
+    RANGE,
+    MarkerSet,
+    SetSegment,
+    find_marker_set,
+    load_marker_set,
+    marker_set_names,
+)
+
+__all__ = [
+    "FEWEST",
+    "GIVE",
+    "RANGE",
+    "MarkerSet",
+    "Placement",
+    "SetSegment",
+    "bare",
+    "find_marker_set",
+    "find_placement",
+    "known_set",
+    "load_marker_set",
+    "marker_set_names",
+    "matched",
+    "placed_set_names",
+    "placement",
+    "subject_of",
+]

@@ -1,0 +1,147 @@
+"""Files of marker sets (TOML): segments for identification, places on a body for fitting, read and checked."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from kinefit.bodies.marker_sets.labels import plain
+from kinefit.errors import FileError, ObservationError, choices
+
+GIVE = 0.004
+"""[m] give of a marker where the set does not tell."""
+
+RANGE = 1.5
+"""[rad] range of a joint where the set does not tell."""
+
+LANDMARK_SPREAD = 0.015
+"""[m] of a marker on a bony landmark, along each axis: a palpated landmark varies by about 1 cm between examiners
+(della Croce et al. 2005), and a marker's own radius and the body's average shape come on top."""
+
+_Vector = tuple[float, float, float]
+_REMEDY = (
+    "It has name, sides, [places] [m], [markers], each with a landmark, or a segment and `at` [m], and a spread, and "
+    "[[segment]] with name, parent, joint [m], markers."
+)
+
+
+class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class SegmentRecord(_Record, frozen=True, kw_only=True):
+    """`[[segment]]`: labels that move as one, and the joint to its parent."""
+
+    name: str
+    markers: list[str]
+    parent: str | None = None
+    joint: _Vector | None = None
+    give: float = GIVE
+    loose: dict[str, float] = {}
+    range: float = np.degrees(RANGE)
+
+
+class MarkerRecord(_Record, frozen=True, kw_only=True):
+    """A row of `[markers]`: on a landmark of the body, or on a segment at a place."""
+
+    landmark: str | None = None
+    segment: str | None = None
+    at: _Vector | None = None
+    offset: _Vector = (0.0, 0.0, 0.0)
+    spread: float = LANDMARK_SPREAD
+
+
+class SetRecord(_Record, frozen=True, kw_only=True):
+    """A file: `[places]` and `[[segment]]` are of identification, `[markers]` are of fitting a body."""
+
+    name: str
+    segment: list[SegmentRecord] = []
+    places: dict[str, _Vector] = {}
+    markers: dict[str, MarkerRecord] = {}
+    also: list[str] = []
+    sides: list[tuple[str, str]] = []
+    single: list[str] = []
+    computed: list[str] = []
+
+    def mirror(self, label: str) -> str | None:
+        """The label of the left side that a label of the right one has; None for one without."""
+        if label in self.single:
+            return None
+        return next((left + label[len(right) :] for right, left in self.sides if label.startswith(right)), None)
+
+
+def set_names(*, placed: bool = False) -> tuple[str, ...]:
+    """Names of the sets of the catalogue; `placed`: of those that tell where markers sit on a body."""
+    return tuple(sorted(n for n, record in catalogue().items() if record.markers or not placed))
+
+
+def find_record(name_or_file: str | PathLike[str], known: tuple[str, ...]) -> tuple[SetRecord, str]:
+    """A set of the catalogue by any of its names, or of a file (.toml), and where it came from.
+
+    Parameters
+    ----------
+    known : names to choose from, for the message
+
+    Raises
+    ------
+    ObservationError
+        Unknown name.
+    FileError
+        A file that cannot be read, or is no marker set: with the place.
+    """
+    name = str(name_or_file)
+    if name.lower().endswith(".toml"):
+        try:
+            text = Path(name_or_file).read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise FileError(f"cannot read the marker set ({error})", file=name, remedy="Give a TOML file.") from error
+        return parsed(text, name), name
+    for record in catalogue().values():
+        if plain(name) in map(plain, (record.name, *record.also)):
+            return record, record.name
+    raise ObservationError(choices("marker set", name, known), remedy="Or give a file of one (.toml).")
+
+
+@cache
+def catalogue() -> dict[str, SetRecord]:
+    """The sets that come with kinefit, by name."""
+    folder = resources.files("kinefit.bodies") / "marker_sets"
+    files = sorted((e for e in folder.iterdir() if e.name.endswith(".toml")), key=lambda e: e.name)
+    return {record.name: record for e in files if (record := parsed(e.read_text("utf-8"), e.name))}
+
+
+def parsed(text: str, source: str) -> SetRecord:
+    """A file's text as a record.
+
+    Raises
+    ------
+    FileError
+        No TOML, or no marker set: with the place.
+    """
+    try:
+        record = msgspec.convert(tomllib.loads(text), SetRecord)
+    except tomllib.TOMLDecodeError as error:
+        raise FileError(f"not valid TOML ({error})", file=source, remedy="See https://toml.io.") from error
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at `$")
+        where = place.strip(".`") or None
+        raise FileError(f"not a marker set: {problem}", file=source, place=where, remedy=_REMEDY) from error
+    if not record.segment and not record.markers:
+        raise FileError("no segment and no markers", file=source, remedy=_REMEDY)
+    for label, entry in record.markers.items():
+        numbers: list[Any] = [entry.spread, *entry.offset, *(entry.at or ())]
+        if (entry.landmark is None) == (entry.segment is None or entry.at is None):
+            raise FileError(
+                "a marker sits on a landmark, or on a segment `at` a place", file=source, place=label,
+                remedy='Such as { landmark = "r_asis" } or { segment = "thigh_r", at = [0.0, -0.2, 0.08] }.',
+            )  # fmt: skip
+        if not np.isfinite(numbers).all() or not entry.spread > 0:
+            raise FileError("numbers that are not finite, or no spread", file=source, place=label, remedy="In metres.")
+    return record

@@ -1,0 +1,157 @@
+"""Where the markers of a set sit on a body, before a subject's own offsets are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, find_record, set_names
+from kinefit.bodies.marker_sets.labels import matched
+from kinefit.bodies.marker_sets.sets import FEWEST
+from kinefit.errors import FileError, ObservationError
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Markers of a set on a body.
+
+    Parameters
+    ----------
+    name : str of the set.
+    points : PointSet of K markers.
+    spread : (K,) [m] standard deviation of a marker about its place, along each axis.
+    """
+
+    name: str
+    points: PointSet
+    spread: NDArray
+
+    def select(self, names: Iterable[str]) -> Placement:
+        """The named markers, in that order."""
+        names = tuple(names)
+        rows = [self.points.index(n) for n in names]
+        return Placement(self.name, self.points.select(names), self.spread[rows])
+
+
+def placed_set_names() -> tuple[str, ...]:
+    """Names of the marker sets of the catalogue that tell where their markers sit on a body."""
+    return set_names(placed=True)
+
+
+def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
+    """A marker set on a body: one of the catalogue, one of the body's own, or a file of your own (.toml).
+
+    Markers on segments or landmarks that the body does not have are left out.
+
+    Raises
+    ------
+    ObservationError
+        Unknown name.
+    FileError
+        A file that cannot be read, or is no marker set, or one that tells no places on a body.
+    """
+    name = str(marker_set)
+    if name in body.marker_sets:
+        points = body.markers(name)
+        return Placement(name, points, np.full(len(points), LANDMARK_SPREAD))
+    record, source = find_record(marker_set, (*body.marker_sets, *placed_set_names()))
+    if not record.markers:
+        raise FileError(
+            "does not tell where its markers sit on a body", file=source, place="markers",
+            remedy=f"Add [markers] to a file of your own, or use one of: {', '.join(placed_set_names())}.",
+        )  # fmt: skip
+    return _placed(body, record)
+
+
+def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> Placement:
+    """The markers of a set that are among the labels; default: of the set that shares most labels.
+
+    Which label stands for which marker is told by `labels.matched`.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than four labels are known to the set, or to any.
+    """
+    labels = tuple(labels)
+    names = [marker_set] if marker_set else [*body.marker_sets, *placed_set_names()]
+    best: Placement | None = None
+    for name in names:
+        whole = placement(body, name)
+        known = set(matched(labels, whole.points.names))
+        shared = whole.select(n for n in whole.points.names if n in known)
+        if best is None or len(shared.points) > len(best.points):
+            best = shared
+    if best is None or len(best.points) < FEWEST:
+        count = 0 if best is None else len(best.points)
+        sets = f"set '{marker_set}'" if marker_set else "any marker set"
+        raise ObservationError(
+            f"only {count} of the labels are known to {sets}: {_listed(labels)}",
+            remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or give a file.",
+        )
+    return best
+
+
+def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) -> str:
+    """The body's own marker set that labels belong to; "" where they are landmarks of the body.
+
+    Raises
+    ------
+    ObservationError
+        The body knows none of them.
+    BodyError
+        It has no such set.
+    """
+    labels = tuple(labels)
+    sets = {marker_set: body.markers(marker_set)} if marker_set else {**body.marker_sets, "": body.landmarks}
+    shared = {name: len(set(matched(labels, points.names)) - {None}) for name, points in sets.items()}
+    best = max(shared, key=lambda name: shared[name])
+    if not shared[best]:
+        raise ObservationError(
+            f"none of the labels is known to body '{body.name}': {_listed(tuple(sorted(labels)))}",
+            remedy=f"Marker sets of the body: {', '.join(body.marker_sets) or 'none'}; or name its landmarks.",
+        )
+    return best
+
+
+def _listed(labels: tuple[str, ...]) -> str:
+    return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
+
+
+def _placed(body: Body, record: SetRecord) -> Placement:
+    names, segments, at, spread = [], [], [], []
+    for label, entry in record.markers.items():
+        for name, mirrored in _with_image(label, record):
+            found = _place(body, entry, mirrored)
+            if found is not None and name not in names:
+                names.append(name)
+                segments.append(found[0])
+                at.append(found[1])
+                spread.append(entry.spread)
+    points = PointSet(tuple(names), np.array(segments, np.int64), np.array(at, float).reshape(-1, 3))
+    return Placement(record.name, points, np.array(spread))
+
+
+def _with_image(label: str, record: SetRecord) -> list[tuple[str, bool]]:
+    image = record.mirror(label)
+    return [(label, False)] + ([(image, True)] if image and image not in record.markers else [])
+
+
+def _place(body: Body, entry: MarkerRecord, mirrored: bool) -> tuple[int, NDArray] | None:
+    side = np.array((1.0, 1.0, -1.0 if mirrored else 1.0))
+    if entry.landmark is not None:
+        name = f"l_{entry.landmark[2:]}" if mirrored and entry.landmark.startswith("r_") else entry.landmark
+        if name not in body.landmarks.names:
+            return None
+        i = body.landmarks.index(name)
+        return int(body.landmarks.segments[i]), body.landmarks.points[i] + side * entry.offset
+    segment = str(entry.segment)
+    segment = f"{segment[:-2]}_l" if mirrored and segment.endswith("_r") else segment
+    if segment not in body.tree.segments:
+        return None
+    return body.tree.segment(segment), side * (np.array(entry.at) + entry.offset)

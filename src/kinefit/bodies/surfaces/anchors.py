@@ -1,0 +1,166 @@
+"""Anchors: points of a body's surfaces in the surfaces' own coordinates, which every body of the same make has.
+
+A tapered cylinder's are (ξ, η, t): shares of the two half axes at a height, and of the length, so that the point is
+(a(t) ξ, b(t) η, t L). A mesh's are a face, two barycentric coordinates and a height along the face's normal, in square
+roots of twice the face's area. Both hold of points beside the surface too. A surface that is another, longer or wider,
+takes its anchors along, and their normals as any surface's: by the inverse transpose of the map between the two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces._kernels_grid import nearest_faces
+from kinefit.bodies.surfaces.cylinder import TaperedCylinder
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.errors import BodyError
+
+if TYPE_CHECKING:
+    from kinefit.bodies.body import Body
+
+
+class _Places(NamedTuple):
+    """Of N anchors: the surface, the face (0 for cylinders), three coordinates, and the normal as a covector."""
+
+    surface: NDArray
+    face: NDArray
+    at: NDArray
+    normal: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceAnchors:
+    """N points on the surfaces of a body.
+
+    Parameters
+    ----------
+    body : Body that they are given on.
+    segment : (N,) int
+    points : (N, 3) [m] on a surface of that segment, or near it, in the root frame at rest.
+    normals : (N, 3) outward there.
+
+    Raises
+    ------
+    BodyError
+        A segment without a surface; told when the anchors are first asked for on another body.
+    """
+
+    body: Body
+    segment: NDArray
+    points: NDArray
+    normals: NDArray
+
+    def __len__(self) -> int:
+        return len(self.segment)
+
+    def on(self, body: Body) -> tuple[NDArray, NDArray]:
+        """Points and normals (N, 3) of the same anchors on a body of the same make, in its root frame at rest.
+
+        Raises
+        ------
+        BodyError
+            A body with other surfaces: another number, another kind, another segment, a mesh of other faces.
+        """
+        if body is self.body:
+            return self.points, self.normals
+        if self._latest and self._latest[0][0] is body:
+            return self._latest[0][1]
+        _check_make(self.body, body)
+        places, points, normals = self._places, np.empty((len(self), 3)), np.empty((len(self), 3))
+        for k in np.unique(places.surface):
+            own, surface = places.surface == k, body.surfaces[k]
+            x, J = _mapped(surface, places.face[own], places.at[own])
+            points[own] = x + body.tree.rest[surface.segment]
+            normals[own] = np.linalg.solve(np.swapaxes(J, 1, 2), places.normal[own][..., None])[..., 0]
+        size = np.linalg.norm(self.normals, axis=1) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
+        told = points, normals * size[:, None]
+        self._latest[:] = [(body, told)]
+        return told
+
+    @cached_property
+    def _latest(self) -> list[tuple[Body, tuple[NDArray, NDArray]]]:
+        """The other body that was asked for last, and what it was told."""
+        return []
+
+    @cached_property
+    def _places(self) -> _Places:
+        """Each anchor on the surface of its segment that is nearest."""
+        body, count = self.body, len(self)
+        out = _Places(np.full(count, -1), np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
+        best = np.full(count, np.inf)
+        for k, surface in enumerate(body.surfaces):
+            own = np.flatnonzero(self.segment == surface.segment)
+            x = self.points[own] - body.tree.rest[surface.segment]
+            away, face, at = _placed(surface, x)
+            nearer = away < best[own]
+            own, face, at = own[nearer], face[nearer], at[nearer]
+            best[own], out.surface[own], out.face[own], out.at[own] = away[nearer], k, face, at
+        if count and out.surface.min() < 0:
+            name = body.tree.segments[int(self.segment[np.argmin(out.surface)])]
+            raise BodyError(f"segment '{name}' has no surface to be anchored on", remedy="Give it a surface.")
+        for k in np.unique(out.surface):
+            own = out.surface == k
+            _, J = _mapped(body.surfaces[k], out.face[own], out.at[own])
+            out.normal[own] = np.einsum("nji,nj->ni", J, self.normals[own])
+        return out
+
+
+def _mapped(surface: TaperedCylinder | MeshSurface, face: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
+    """Points (N, 3) [m] in the segment's frame of coordinates (N, 3), and the derivatives by these, (N, 3, 3)."""
+    if isinstance(surface, MeshSurface):
+        corner, J = _face_axes(surface, face)
+        return corner + np.einsum("nij,nj->ni", J, at), J
+    first, last = np.array(surface.radii)
+    half = first + at[:, 2:] * (last - first)
+    axes, J = surface.axes, np.zeros((len(at), 3, 3))
+    local = np.concatenate([half * at[:, :2], surface.length * at[:, 2:]], axis=1)
+    J[:, 0, 0], J[:, 1, 1], J[:, 2, 2] = half[:, 0], half[:, 1], surface.length
+    J[:, :2, 2] = (last - first) * at[:, :2]
+    return local @ axes + surface.start, axes.T @ J
+
+
+def _placed(surface: TaperedCylinder | MeshSurface, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Distance (N,) [m] to a surface, about; face (N,) and coordinates (N, 3) of points (N, 3) in its segment."""
+    if isinstance(surface, MeshSurface):
+        corners = surface.vertices[surface.faces]
+        twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        some = np.flatnonzero(twice > 1e-6 * twice.max())  # a face without area has no coordinates
+        place, square = np.empty(len(x), np.int64), np.empty(len(x))
+        nearest_faces(np.ascontiguousarray(corners[some]), np.ascontiguousarray(x), place, square)
+        face = some[place]
+        corner, J = _face_axes(surface, face)
+        return np.sqrt(square), face, np.linalg.solve(J, (x - corner)[..., None])[..., 0]
+    first, last = np.array(surface.radii)
+    local = (x - surface.start) @ surface.axes.T
+    t = local[:, 2:] / surface.length
+    half = np.maximum(first + t * (last - first), 1e-6)
+    at = np.concatenate([local[:, :2] / half, t], axis=1)
+    beside = (np.linalg.norm(at[:, :2], axis=1) - 1.0) * np.sqrt(half.prod(axis=1))
+    beyond = (np.abs(t[:, 0] - 0.5) - 0.5) * surface.length
+    return np.abs(np.maximum(beside, beyond)), np.zeros(len(x), np.int64), at
+
+
+def _face_axes(surface: MeshSurface, face: NDArray) -> tuple[NDArray, NDArray]:
+    """First corners (N, 3) of faces, and two sides and a normal as long as a side as columns (N, 3, 3)."""
+    a, b, c = np.moveaxis(surface.vertices[surface.faces[face]], 1, 0)
+    normal = np.cross(b - a, c - a)
+    size = np.sqrt(np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
+    return a, np.stack([b - a, c - a, normal / size], axis=2)
+
+
+def _check_make(one: Body, other: Body) -> None:
+    """Whether the surfaces of two bodies correspond."""
+    a, b = one.surfaces, other.surfaces
+    alike = len(a) == len(b) and all(
+        type(s) is type(t) and s.segment == t.segment
+        and (not isinstance(s, MeshSurface) or np.array_equal(s.faces, t.faces))  # type: ignore[union-attr]
+        for s, t in zip(a, b)
+    )  # fmt: skip
+    if not alike:
+        problem = f"surfaces of body '{other.name}' do not correspond to those of '{one.name}'"
+        raise BodyError(problem, remedy="Take a body of the same make: other lengths and widths, the same surfaces.")

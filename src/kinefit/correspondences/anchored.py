@@ -1,0 +1,99 @@
+"""Points of a body's surface with a correspondence that was found before: rows that hold at any state near it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences import _kernels_surface as kernels
+from kinefit.correspondences import targets
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.rows import Rows
+
+
+def anchored_rows(
+    body: Body,
+    state: BodyState,
+    segment: NDArray,
+    points: NDArray,
+    normals: NDArray,
+    x_world: NDArray,
+    *,
+    weight: ArrayLike = 1e4,
+    at_surface: bool = True,
+    frames: NDArray | None = None,
+) -> Rows:
+    """One row a point of the surface: what was measured, q, lies r = n·(q − x) along its normal n, which turns with it.
+
+    Parameters
+    ----------
+    segment : (N,) int
+    points, normals : (N, 3) [m] of the surface, in the root frame at rest; see `SurfaceAnchors`.
+    x_world : (N, 3) [m] measured.
+    weight : scalar or (N,) [1/m²]
+    at_surface : bool
+        Whether a row's point is q's foot on the tangent plane, as of `surface_rows`, or q itself, as of
+        `depth_image_rows`. The derivative is the same.
+    frames : (S, 12), optional, of a body whose joints move with its angles.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other sizes.
+    """
+    count = len(segment)
+    x, given = _checked(points, count), _checked(x_world, count)
+    w = np.ascontiguousarray(np.broadcast_to(np.asarray(weight, float), count))
+    data = np.empty((8, count))
+    kernels.anchored_rows(
+        targets.of_segments(body, state, frames), segment, x, _checked(normals, count), given, w, at_surface, data
+    )
+    return Rows(data, segment, np.arange(count))
+
+
+def target_rows(
+    body: Body,
+    state: BodyState,
+    segment: NDArray,
+    points: NDArray,
+    camera: Camera,
+    target: NDArray,
+    *,
+    slack: float = 0.0,
+    sigma: float = 2.0,
+    frames: NDArray | None = None,
+) -> Rows:
+    """One row a point of the body: its pixel should come within `slack` of a target, straight towards it.
+
+    With the distance d and g = −∂d/∂x: n = g/|g|, r = (d − slack)/|g|, w = |g|²/σ², the exact linearisation. A point
+    that is there already, or that the camera does not see, has the weight 0.
+
+    Parameters
+    ----------
+    segment : (N,) int; points : (N, 3) [m] in the root frame at rest.
+    target : (N, 2) [px]
+    slack, sigma : float [px]
+    frames : (S, 12), optional, of a body whose joints move with its angles.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other sizes, a standard deviation that is not positive.
+    """
+    if not sigma > 0:
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+    count = len(segment)
+    data, x, pixel = np.empty((8, count)), _checked(points, count), _checked(target, count, 2)
+    frames = targets.of_segments(body, state, frames)
+    kernels.target_rows(frames, segment, x, camera.packed, pixel, slack, 1.0 / sigma**2, data)
+    return Rows(data, segment, np.arange(count))
+
+
+def _checked(array: NDArray, count: int, columns: int = 3) -> NDArray:
+    out = np.ascontiguousarray(array, float)
+    if out.shape != (count, columns):
+        problem = f"{count} points of a surface with an array of shape {out.shape}"
+        raise ObservationError(problem, remedy=f"Give ({count}, {columns}).")
+    return out

@@ -1,0 +1,99 @@
+"""Recordings of what was made out in one camera's images: some points of the body, or lines of known objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.observations.depth import _Recording, checked_times
+from kinefit.observations.frames import KeypointFrame, LineFrame
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointVideo(_Recording):
+    """Keypoints of one person in one camera, found when they are asked for.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the camera in the rig.
+    rate : float [Hz]
+    times : (F,) [s] in the take; strictly increasing.
+    names : (K,) of the keypoints
+    points : callable
+        Frame number -> (K, 2) [px] in the calibration's image frame, NaN where unseen, and (K,) confidence in 0..1.
+    keypoint_set : str
+        The body's keypoint set that the names belong to; "" for names of the body's landmarks.
+    source : str
+        File, for messages.
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase.
+    """
+
+    names: tuple[str, ...]
+    points: Callable[[int], tuple[NDArray, NDArray]]
+    keypoint_set: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
+
+    def frame(self, i: int) -> KeypointFrame:
+        """Frame number `i`, negative ones from the end; found now."""
+        i = range(len(self))[i]
+        uv, confidence = self.points(i)
+        return KeypointFrame(self.sensor, float(self.times[i]), self.names, uv, confidence, self.keypoint_set)
+
+
+@dataclass(frozen=True, eq=False)
+class LineVideo(_Recording):
+    """Image lines and edges of known objects in one camera.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the camera in the rig.
+    rate : float [Hz]
+    times : (F,) [s] in the take; strictly increasing.
+    names : (L,) of the lines
+    landmarks : (L,) of one or two names each
+        The body's landmarks that lie on a line: the two ends of an edge, or a single point.
+    ends : (F, L, 2, 2) [px]
+        Two points of every line in the calibration's image frame; NaN for one that was not seen.
+    source : str
+        File, for messages.
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase; shapes that do not agree.
+    """
+
+    names: tuple[str, ...]
+    landmarks: tuple[tuple[str, ...], ...]
+    ends: NDArray
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
+        ends = np.array(self.ends, float)
+        wanted = (len(self.times), len(self.names), 2, 2)
+        if ends.shape != wanted or len(self.landmarks) != len(self.names):
+            raise ObservationError(
+                f"lines of {self.sensor} have shape {ends.shape}, with landmarks of {len(self.landmarks)}",
+                file=self.source or None, remedy=f"Give {wanted}, and landmarks for each line.",
+            )  # fmt: skip
+        ends.flags.writeable = False
+        object.__setattr__(self, "ends", ends)
+
+    def frame(self, i: int) -> LineFrame:
+        """Frame number `i`, negative ones from the end."""
+        i = range(len(self))[i]
+        return LineFrame(self.sensor, float(self.times[i]), self.names, self.landmarks, self.ends[i])

@@ -1,0 +1,214 @@
+"""Checks of a take file beyond its form: values that can be, names that agree, keys of use, files that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kinefit.errors import FileError, TakeError, choices
+from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.markers import UNITS
+from kinefit.readers.take.entries import SKIN_SETS
+
+if TYPE_CHECKING:
+    from kinefit.readers.take.file import Take
+
+_ONLY: dict[str, dict[str, tuple[str, ...]]] = {
+    "keypoints": {
+        "file": ("openpose", "mediapipe", "caliscope", "detect"), "frame": ("openpose", "mediapipe", "caliscope"),
+        "rate": ("openpose", "mediapipe", "caliscope"), "face": ("skin",),
+    },
+    "silhouette": {
+        "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
+        **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
+    },
+}  # fmt: skip
+"""Formats for which a key means something: with any other it is refused."""
+
+
+def check_take(take: Take) -> None:
+    """Refuse a take whose values cannot be, whose names do not agree, whose files are missing, or keys without use.
+
+    Raises
+    ------
+    TakeError
+        With the place, and what would work.
+    FileError
+        A file that it names is missing.
+    """
+    _values(take)
+    _uses(take)
+    _names(take)
+    _files(take)
+
+
+def _values(take: Take) -> None:
+    """Refuse numbers that cannot be."""
+
+    def refuse(problem: str, place: str, remedy: str) -> None:
+        raise TakeError(problem, file=take.path, place=place, remedy=remedy)
+
+    if take.rate is not None and not 0 < take.rate < 1e6:
+        refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
+    if take.height is not None and not 0.3 < take.height < 3:
+        refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+    if take.frames is not None and not take.frames[0] < take.frames[1]:
+        refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
+    for camera in take.cameras:
+        if not abs(camera.time_offset) < 1e6 or (camera.size and min(camera.size) < 1):
+            refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
+    for source in (*take.keypoints, *take.skin):
+        place = f"keypoints of camera {source.camera}"
+        sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS}.get(source.format, ("MEDIAPIPE_33",))
+        if source.set is not None and source.set not in sets:
+            kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
+            refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
+        if source.file is None and source.format not in ("detect", "skin"):
+            refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
+        if source.face is not None and not min(source.face[2:]) > 0:
+            refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
+        if not 0 < source.sigma < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
+            refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
+        if source.frames is not None and not source.frames[0] < source.frames[1]:
+            refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
+    for shape in take.silhouettes:
+        place = f"silhouette of camera {shape.camera}"
+        if not 0 < shape.sigma < 1e4 or (shape.rate is not None and not 0 < shape.rate < 1e6):
+            refuse(f"sigma {shape.sigma} px, rate {shape.rate} Hz", place, "Give positive numbers.")
+        if shape.file is None and shape.format == "masks":
+            refuse("no file of masks", place, 'Write file = "..." (a folder), or another format.')
+        if shape.format == "threshold":
+            if shape.low is None or shape.high is None:
+                refuse("no colour of the body", place, "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each.")
+            elif not all(0 <= a <= b <= 255 for a, b in zip(shape.low, shape.high)):
+                refuse(f"low = {list(shape.low)}, high = {list(shape.high)}", place, "0 to 255, the lower ones first.")
+        if shape.smooth is not None and not 0 < shape.smooth < 100:
+            refuse(f"smooth = {shape.smooth:g} px", place, "Give a positive number.")
+    for lines in take.lines:
+        place = f"lines of camera {lines.camera}"
+        if not 0 < lines.sigma < 1e4 or (lines.rate is not None and not 0 < lines.rate < 1e6):
+            refuse(f"sigma {lines.sigma} px, rate {lines.rate} Hz", place, "Give positive numbers.")
+        for name, own in lines.landmarks.items():
+            if not 1 <= len(set(own)) == len(own) <= 2:
+                refuse(f"line '{name}' has {len(own)} landmarks", place, "Give the two ends of an edge, or one point.")
+        if not lines.landmarks:
+            refuse("no landmarks", place, 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.')
+    for entry in take.markers:
+        place = f"markers {entry.file.name}"
+        if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
+            refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
+        if entry.unit is not None and entry.unit.lower() not in UNITS:
+            refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+    for problem, place, remedy in _odd_depth(take):
+        refuse(problem, place, remedy)
+
+
+def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
+    """Numbers of depth sensors and stereo pairs that cannot be: problem, place, remedy."""
+    for entry in take.depth:
+        place = f"depth {entry.name}"
+        if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
+            yield f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds."
+        for key, value in (("unit", entry.unit), ("rate", entry.rate), ("time_unit", entry.time_unit)):
+            if value is not None and not 0 < value < 1e6:
+                yield f"{key} = {value:g}", place, "Give a positive number: unit in metres a count, rate in Hz."
+        if entry.range is not None and not 0 <= entry.range[0] < entry.range[1]:
+            yield f"range = {list(entry.range)}", place, "Give [near, far] in metres."
+        if entry.size is not None and min(entry.size) < 1:
+            yield f"size = {list(entry.size)}", place, "Give [width, height] in pixels."
+        if entry.camera is not None and take.calibration is None:
+            yield f"camera = {entry.camera}, but no [calibration]", place, "Add one, or give intrinsics."
+        if entry.distortion and entry.intrinsics is None:
+            yield "distortion without intrinsics", place, "Write intrinsics = [fx, fy, cx, cy] too."
+        if entry.intrinsics is not None and not min(entry.intrinsics[:2]) > 0:
+            yield f"intrinsics = {list(entry.intrinsics)}", place, "Give [fx, fy, cx, cy] in pixels."
+    for pair in take.stereo:
+        if not (0 < pair.range[0] < pair.range[1] and 0 < pair.sigma < 100):
+            yield (
+                f"range {list(pair.range)} m, sigma {pair.sigma} px", f"stereo {pair.name}",
+                "Give [near, far] in metres, nearer than far, and pixels.",
+            )
+
+
+def _uses(take: Take) -> None:
+    """Refuse a key that means nothing with the entry's format."""
+    given = {"keypoints": (*take.keypoints, *take.skin), "silhouette": take.silhouettes}
+    for table, entries in given.items():
+        for entry in entries:
+            for key, formats in _ONLY[table].items():
+                if getattr(entry, key) is not None and entry.format not in formats:  # type: ignore[attr-defined]
+                    raise TakeError(
+                        f"'{key}' has no use with format = \"{entry.format}\"", file=take.path,  # type: ignore[attr-defined]
+                        place=f"{table} of camera {entry.camera}",  # type: ignore[attr-defined]
+                        remedy=f"Leave it out; it is for {', '.join(formats)}.",
+                    )  # fmt: skip
+
+
+def _names(take: Take) -> None:
+    """Names within the take agree, and there is something to see."""
+    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or take.silhouettes):
+        remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
+        raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
+    names = [entry.name for entry in take.cameras]
+    sensors = [*names, *(entry.name for entry in take.depth), *(entry.name for entry in take.stereo)]
+    for name in sensors:
+        if sensors.count(name) > 1:
+            kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
+            raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
+    named = [("keypoints", k.camera) for k in (*take.keypoints, *take.skin)]
+    named += [("silhouette", s.camera) for s in take.silhouettes] + [("lines", e.camera) for e in take.lines]
+    for kind, camera in named:
+        if camera not in names:
+            raise TakeError(
+                choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
+                remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
+            )
+    if take.cameras and take.calibration is None:
+        raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')
+    for pair in take.stereo:
+        for side in (pair.left, pair.right):
+            if not any(entry.name == side and entry.video is not None for entry in take.cameras):
+                raise TakeError(
+                    choices("camera with a video", side, [e.name for e in take.cameras if e.video is not None]),
+                    file=take.path, place=f"stereo {pair.name}", remedy="Name two [[camera]] that have a video.",
+                )  # fmt: skip
+        if pair.left == pair.right:
+            raise TakeError("left and right are one camera", file=take.path, place=f"stereo {pair.name}")
+    videos = [entry.name for entry in take.cameras if entry.video is not None]
+    seen = [("silhouette", s.camera) for s in take.silhouettes if s.format in ("background", "threshold")]
+    for kind, camera in [*seen, *(("keypoints", k.camera) for k in take.skin)]:
+        if camera not in videos:
+            raise TakeError(
+                choices("camera with a video", camera, videos), file=take.path,
+                place=f"{kind} of camera {camera}", remedy="Give the [[camera]] its video.",
+            )  # fmt: skip
+    for shape in take.silhouettes:
+        if [s.camera for s in take.silhouettes].count(shape.camera) > 1:
+            raise TakeError("two silhouettes", file=take.path, place=f"camera {shape.camera}", remedy="Leave one out.")
+    alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
+    if alone and (take.calibration is not None or len(take.depth) > 1):
+        raise TakeError(
+            "intrinsics alone do not tell where a sensor stands beside others", file=take.path,
+            place=f"depth {alone[0]}", remedy="Put its intrinsics and its pose into the calibration, and not here.",
+        )  # fmt: skip
+
+
+def _files(take: Take) -> None:
+    """Every file that the take names is there."""
+    named: list[tuple[str, Path | None]] = [("[calibration] file", take.calibration.file if take.calibration else None)]
+    named += [(f"camera {entry.name}, video", entry.video) for entry in take.cameras]
+    named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
+    named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
+    named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
+    named += [("[take] subject", take.subject), ("[take] start", take.start)]
+    named += [("markers", entry.file) for entry in take.markers]
+    named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
+    named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
+    named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
+    for place, file in named:
+        if file is not None and not file.exists() and not ("*" in file.name and any(file.parent.glob(file.name))):
+            raise FileError(
+                f"no such file or folder: {file}", file=take.path, place=place,
+                remedy="Correct the path; a relative one starts at the take file.",
+            )

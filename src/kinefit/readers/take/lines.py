@@ -1,0 +1,111 @@
+"""Image lines of known objects: `[[lines]]`, a table of two image points a line and frame (CSV or JSON)."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, KinefitError, ObservationError, TakeError, choices
+from kinefit.geometry.camera import ImageFrame
+from kinefit.observations import LineVideo
+from kinefit.readers.take.entries import LinesEntry
+from kinefit.readers.take.file import Take
+
+_COLUMNS = ("frame", "line", "u1", "v1", "u2", "v2")
+_REMEDY = f"Give a table with the columns {', '.join(_COLUMNS)} (.csv), or a list of objects with these keys (.json)."
+
+
+def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
+    """Frames (F,), those that the file has, and the named lines' points (F, L, 2, 2) [px], NaN where there are none.
+
+    Raises
+    ------
+    FileError
+        No such table, a number that is none, a line twice in one frame.
+    ObservationError
+        A line whose name is not known, or no line at all.
+    """
+    names = tuple(names)
+    rows: dict[tuple[int, str], list[float]] = {}
+    for place, row in _rows(path):
+        try:
+            frame, name = int(row["frame"]), str(row["line"]).strip()
+            ends = [float(row[key]) for key in _COLUMNS[2:]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileError(f"no line of a table of lines ({error})", file=path, place=place, remedy=_REMEDY) from error
+        if name not in names:
+            raise ObservationError(
+                choices("line", name, names), file=path, place=place, remedy="Add it to `landmarks`, or leave it out."
+            )
+        if not np.isfinite(ends).all() or frame < 0 or (frame, name) in rows:
+            problem = f"frame {frame}, line '{name}' is there twice, or its numbers are not finite"
+            raise FileError(problem, file=path, place=place, remedy="Give each line once a frame; frames begin with 0.")
+        rows[frame, name] = ends
+    if not rows:
+        raise ObservationError("no lines", file=path, remedy=_REMEDY)
+    frames = np.unique([frame for frame, _ in rows])
+    out = np.full((len(frames), len(names), 2, 2), np.nan)
+    for (frame, name), ends in rows.items():
+        out[np.searchsorted(frames, frame), names.index(name)] = np.reshape(ends, (2, 2))
+    return frames, out
+
+
+def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
+    """Rows of a table, each with its place for messages."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        if path.suffix.lower() == ".json":
+            content = json.loads(text)
+            if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
+                raise FileError("no list of objects", file=path, remedy=_REMEDY)
+            return [(f"entry {i}", row) for i, row in enumerate(content)]
+        return [(f"line {i}", row) for i, row in enumerate(csv.DictReader(text.splitlines()), 2)]
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
+        raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
+
+
+def load_lines(
+    take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
+) -> tuple[LineVideo, ...]:
+    """All `[[lines]]` of a take; `rates` [Hz] of its other streams.
+
+    Raises
+    ------
+    TakeError
+        Nothing tells the rate, or the picture in which the lines are.
+    KinefitError
+        As `read_lines`, with the camera's name.
+    """
+    out = []
+    for entry in take.lines:
+        try:
+            out.append(_lines(entry, take, images[entry.camera], rates))
+        except KinefitError as error:
+            place = ", ".join(part for part in (f"lines of camera {entry.camera}", error.place) if part)
+            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
+    return tuple(out)
+
+
+def _lines(entry: LinesEntry, take: Take, image: ImageFrame, rates: Mapping[str, float]) -> LineVideo:
+    same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
+    if entry.frame is None and not same:
+        problem = "the video's picture is not the calibration's, and it is not told in which the lines are"
+        raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
+    rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
+    if rate is None:
+        raise TakeError("nothing tells the rate", remedy="Write rate = ... into [take].")
+    names = tuple(entry.landmarks)
+    frames, ends = read_lines(entry.file, names)
+    if entry.frame == "video" and not same:
+        ends = image.to_calibration(ends)
+    offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
+    return LineVideo(
+        entry.camera, rate, offset + frames / rate, names, tuple(map(tuple, entry.landmarks.values())), ends,
+        source=str(entry.file),
+    )  # fmt: skip

@@ -1,0 +1,96 @@
+"""Face and hands by the colour of the skin: `[[keypoints]]` with format = "skin", made from a camera's video."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import KinefitError, TakeError
+from kinefit.geometry.camera import ImageFrame
+from kinefit.images.skin import LANDMARKS, WRISTS, SkinTracker, face_box
+from kinefit.observations import KeypointVideo
+from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.take.entries import KeypointsEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.video import Video
+
+_NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
+
+
+def load_skin(take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str, Path]) -> tuple[KeypointVideo, ...]:
+    """All `[[keypoints]]` of a take with format = "skin"; pictures are read when their frames are asked for.
+
+    Raises
+    ------
+    TakeError
+        Nothing tells where the face is.
+    KinefitError
+        What reading the video, and the tracker at a face that is not in it, raise; with the camera's name.
+    """
+    out = []
+    for entry in take.skin:
+        try:
+            out.append(_skin(entry, take, images[entry.camera], videos[entry.camera]))
+        except KinefitError as error:
+            place = ", ".join(part for part in (f"keypoints of camera {entry.camera}", error.place) if part)
+            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
+    return tuple(out)
+
+
+def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path) -> KeypointVideo:
+    video = Video(file)
+    offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
+    rate = take.rate or video.rate
+    used = entry.frames or take.frames or (round(offset * rate), round((offset + len(video) / video.rate) * rate))
+    begin, end = (round((step / rate - offset) * video.rate) for step in used)
+    begin, end = max(begin, 0), min(end, len(video))
+    if begin >= end:
+        raise TakeError("none of its frames is in the video", remedy=f"The video has {len(video)} frames.")
+    face = entry.face
+    if face is None:
+        begin, face = _detected_face(take, entry, begin, end)
+    seen = _Seen(video, begin, face, image)
+    times = offset + np.arange(begin, end) / video.rate
+    return KeypointVideo(
+        entry.camera, video.rate, times, _NAMES[entry.set or "HANDS"], seen.points, source=str(file)
+    )
+
+
+def _detected_face(
+    take: Take, entry: KeypointsEntry, begin: int, end: int
+) -> tuple[int, tuple[float, float, float, float]]:
+    """The first frame in which the built-in detector saw somebody, and the face there, of whom it saw best."""
+    file = detections_file(take.path, entry.camera)
+    if not file.exists():
+        raise TakeError(
+            "nothing tells where the face is",
+            remedy="Write face = [left, top, width, height] of the first picture used, or run `kinefit detect`.",
+        )
+    found = read_detections(file)
+    frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
+    if not frames:
+        raise TakeError("the detector saw nobody", remedy="Write face = [left, top, width, height] of the first one.")
+    people = np.where(found.seen[frames[0]], found.confidence[frames[0]].mean(axis=1), -1.0)
+    return frames[0], face_box(found.points[frames[0], int(np.argmax(people))])
+
+
+class _Seen:
+    """Face and hands in the frames of a video: followed from the first one on, each picture once."""
+
+    def __init__(
+        self, video: Video, begin: int, face: tuple[float, float, float, float], image: ImageFrame
+    ) -> None:
+        self._video, self._begin, self._image = video, begin, image
+        self._tracker = SkinTracker(video.read(begin), face, rate=video.rate)
+        self._found: list[tuple[NDArray, NDArray]] = []
+
+    def points(self, i: int) -> tuple[NDArray, NDArray]:
+        """Places (3, 2) [px] in the calibration's image and confidence (3,) in frame `i` after the first."""
+        while len(self._found) <= i:
+            self._tracker.update(self._video.read(self._begin + len(self._found)))
+            frame = self._tracker.frame("", 0.0)
+            self._found.append((self._image.to_calibration(frame.uv), frame.confidence))
+        return self._found[i]

@@ -1,0 +1,265 @@
+"""2D keypoints of all cameras at one time: points of the body on rays, left and right put right (P2 2.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.correspondences import _kernels
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.losses import Loss
+from kinefit.observations import KeypointFrame, Keypoints
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
+from kinefit.sensors.channels import Channels, make_channels
+from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.triangulation import triangulated_frame
+
+NAME = "keypoints"
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Which points of which cameras a body's keypoints are, frame after frame; see `Channels`.
+
+    Parameters
+    ----------
+    channels : Channels, of which the measurements are not used
+    body : Body
+    """
+
+    channels: Channels
+    body: Body
+
+    @cached_property
+    def points(self) -> PointSet:
+        """A point of the body for every channel (N,)."""
+        return self._of(self.channels)
+
+    @cached_property
+    def groups(self) -> NDArray:
+        """(N,) channels that change sides together."""
+        return limb_groups(self.body, self.channels)
+
+    @cached_property
+    def informs(self) -> NDArray:
+        """(S, N) 0 or 1: channels that tell where a segment is."""
+        return informing(self.body, self.channels)
+
+    def points_of(self, body: Body) -> PointSet:
+        """The same of another body of this make."""
+        return self.points if body is self.body else self._of(self.channels.with_points(body))
+
+    @staticmethod
+    def _of(channels: Channels) -> PointSet:
+        names = tuple(channels.points.names[c] for c in channels.column)
+        owner, place = channels.points.segments, channels.points.points
+        return PointSet(names, owner[channels.column], place[channels.column])
+
+
+class KeypointSensor(Sensor):
+    """The detectors of all cameras of a rig, as one sensor: only together they tell left from right.
+
+    Parameters
+    ----------
+    rig : Rig
+    sigma : {camera: standard deviation [px] of a keypoint with confidence 1}
+    usual : float [px] that of a camera that none is given for
+    loss : Loss of a keypoint, in its standard deviations
+    near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
+    """
+
+    name = NAME
+
+    def __init__(self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float) -> None:
+        self.rig, self.sigma, self.usual, self.loss, self.near = rig, sigma, usual, loss, near
+        self._layouts: dict[tuple[object, ...], tuple[Layout, list[list[int]]]] = {}
+
+    def prepare(self, frame: KeypointFrame | Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
+        """Of the frames of all cameras at one time.
+
+        Raises
+        ------
+        BodyError, CalibrationError
+            A keypoint set that the body does not have, a camera that the rig does not have.
+        """
+        frames = [frame] if isinstance(frame, KeypointFrame) else list(frame)
+        layout, columns = self._layout(scene.body, frames)
+        uv = np.concatenate([f.uv[c] for f, c in zip(frames, columns)])
+        confidence = np.concatenate([f.confidence[c] for f, c in zip(frames, columns)])
+        time = float(np.mean([f.time for f in frames]))
+        return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
+
+    def of_channels(self, channels: Channels, body: Body) -> Layout:
+        """The layout of a recording's channels, for `KeypointMeasurement`."""
+        return Layout(channels, body)
+
+    def _layout(self, body: Body, frames: Sequence[KeypointFrame]) -> tuple[Layout, list[list[int]]]:
+        key = (id(body), *((f.sensor, f.keypoint_set, f.names) for f in frames))
+        if key not in self._layouts:
+            records, columns = [], []
+            for f in frames:
+                self.rig.index(f.sensor)
+                known = (body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks).names
+                columns.append([f.names.index(n) for n in f.names if n in known])
+                shape = (1, 1, len(f.names))
+                records.append(
+                    Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, np.zeros((*shape, 2)), np.zeros(shape))
+                )
+            sigma = [self.sigma.get(f.sensor, self.usual) for f in frames]
+            used = [r for r, c in zip(records, columns) if c]
+            if not used:
+                problem = f"body '{body.name}' has none of the points that {frames[0].sensor} names"
+                raise ObservationError(problem, remedy="Name its keypoint set, or its landmarks.")
+            people = [np.zeros(1, np.int64)] * len(records)
+            channels = make_channels(body, self.rig, records, people, sigma)
+            if len(self._layouts) > 16:
+                self._layouts.clear()
+            self._layouts[key] = Layout(channels, body), columns
+        return self._layouts[key]
+
+
+class KeypointMeasurement(Measurement):
+    """Keypoints of one time in a layout.
+
+    Parameters
+    ----------
+    sensor : KeypointSensor
+    layout : Layout of N channels
+    uv : (N, 2) [px], NaN where unseen
+    confidence : (N,)
+    time : float [s]
+    """
+
+    def __init__(self, sensor: KeypointSensor, layout: Layout, uv: NDArray, confidence: NDArray, time: float) -> None:
+        self.sensor, self.time, self.of, self.layout = NAME, time, sensor, layout
+        seen = np.isfinite(uv).all(axis=1) & (confidence > 0)
+        self.confidence = np.where(seen, confidence, 0.0)
+        self.weight = self.confidence / np.square(layout.channels.sigma)
+        self.uv = np.where(seen[:, None], uv, np.nan)
+
+    def match(self, scene: Scene, reach: float) -> KeypointMatched:
+        """Left and right of each source as they fit the body better; which points another sensor saw to be hidden."""
+        channels = self.layout.channels
+        fitted = projected(scene, self.layout)
+        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, fitted)
+        order = np.where(swapped, channels.partner, np.arange(len(swapped)))
+        uv, weight = np.ascontiguousarray(self.uv[order]), np.ascontiguousarray(self.weight[order])
+        hidden: tuple[Hidden, ...] = ()
+        if scene.measurements:
+            sure = self.confidence[order] >= SEEN
+            hidden = tuple(hidden_points(scene, self.layout.points_of(scene.body), channels.camera, sure))
+        loss = self.of.loss
+        loss = replace(loss, scale=loss.scale * max(reach / self.of.near, 1.0))
+        return KeypointMatched(self, uv, weight, swapped, loss, hidden)
+
+    def hints(self, scene: Scene) -> Hints:
+        """Points on which two cameras agree."""
+        channels = self.layout.channels.with_points(scene.body)
+        x, _ = triangulated_frame(channels, self.uv, self.confidence)
+        return Hints(channels.points, x)
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointMatched(Matched):
+    """Keypoints with left and right put right.
+
+    Parameters
+    ----------
+    measurement : KeypointMeasurement
+    uv, weight : (N, 2) [px] and (N,) [1/px²] as used
+    swapped : (N,) bool, channels exchanged with their partner
+    loss : Loss
+    hidden : what other sensors measured in front of points
+    """
+
+    measurement: KeypointMeasurement
+    uv: NDArray
+    weight: NDArray
+    swapped: NDArray
+    loss: Loss
+    hidden: tuple[Hidden, ...] = ()
+
+    sensor = NAME
+
+    @property
+    def key(self) -> bytes:
+        """The same for matches that make the same rows."""
+        return self.swapped.tobytes() + b"".join(h.key for h in self.hidden)
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """Two rows a keypoint; one more where it lies too deep behind what was measured in front of it."""
+        layout = self.measurement.layout
+        points, channels = layout.points_of(scene.body), layout.channels
+        rows = scene.rows_of(
+            _kernels.pixel_rows, 2, points, scene.rig.packed, channels.camera, self.uv, self.weight
+        )
+        return [replace(rows, loss=self.loss), *(h.rows(scene, points) for h in self.hidden)]
+
+    def squares(self, scene: Scene) -> NDArray:
+        """(N,) squared distances in the image, in variances; 0 where unseen, inf where it could not be seen."""
+        gap = self.uv - projected(scene, self.measurement.layout)
+        out = np.where(self.weight > 0, self.weight * np.square(gap).sum(axis=1), 0.0)
+        for h in self.hidden:
+            out[h.far] = np.inf
+        return np.nan_to_num(out, nan=np.inf)
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Of every point of every detector."""
+        layout, channels = self.measurement.layout, self.measurement.layout.channels
+        points = layout.points_of(scene.body)
+        uv = np.where((self.weight > 0)[:, None], self.uv, np.nan)
+        values = uv - projected(scene, layout)
+        factor = np.where(self.weight > 0, self.loss.factor(self.squares(scene)), 0.0)
+        out = []
+        for q, label in enumerate(channels.sources):
+            mine = np.flatnonzero(channels.source == q)
+            out.append(Leftover(
+                label, tuple(points.names[k] for k in mine), points.segments[mine], values[mine], factor[mine], "px",
+                uv[mine], bool(self.swapped[mine].any()),
+            ))  # fmt: skip
+        return out
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""
+        agrees = self.squares(scene) < AGREES**2
+        seen, informs = self.weight > 0, self.measurement.layout.informs
+        return Evidence(SHOWN * (informs @ (seen & agrees)), SHOWN * (informs @ (seen & ~agrees)))
+
+
+def projected(scene: Scene, layout: Layout) -> NDArray:
+    """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
+    x = scene.positions(layout.points_of(scene.body))
+    out = np.empty((len(x), 2))
+    for c, camera in enumerate(scene.rig):
+        mine = layout.channels.camera == c
+        if mine.any():
+            out[mine] = camera.project(x[mine])
+    return out
+
+
+def informing(body: Body, channels: Channels) -> NDArray:
+    """(S, N) 0 or 1: channels that tell where a segment is: those on it and those at its children's joints.
+
+    A segment without any is known through its children.
+    """
+    tree = body.tree
+    owner, place = channels.points.segments[channels.column], channels.points.points[channels.column]
+    near = np.linalg.norm(place, axis=1) < 0.05
+    out = np.zeros((len(tree.segments), len(owner)))
+    for s in range(len(tree.segments)):
+        out[s] = (owner == s) | (near & (tree.parents[owner] == s))
+    for s in range(len(tree.segments) - 1, 0, -1):
+        if not out[s].any():
+            children = [c for c in range(len(tree.segments)) if tree.parents[c] == s]
+            out[s] = np.max([out[c] for c in children], axis=0) if children else 0.0
+    return out

@@ -1,0 +1,133 @@
+"""Labelled markers of one time: point to point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.correspondences import _kernels
+from kinefit.losses import Loss
+from kinefit.observations import MarkerFrame
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
+from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.scene import Scene
+
+_AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
+
+
+class MarkerSensor(Sensor):
+    """A marker system, its markers named.
+
+    Parameters
+    ----------
+    name : str
+    sigma : float [m] standard deviation of a marker, with what it moves on the skin
+    loss : Loss of a marker, in its standard deviations
+    near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
+    """
+
+    def __init__(self, name: str, sigma: float, loss: Loss, near: float) -> None:
+        self.name, self.sigma, self.loss, self.near = name, sigma, loss, near
+
+    def prepare(self, frame: MarkerFrame, scene: Scene) -> MarkerMeasurement:
+        """Those markers that the body has and that were seen.
+
+        Raises
+        ------
+        BodyError
+            A marker set that the body does not have.
+        """
+        known = set(markers_of(scene.body, frame.marker_set).names)
+        seen = np.isfinite(frame.positions).all(axis=1)
+        here = [k for k, name in enumerate(frame.names) if name in known and seen[k]]
+        names = tuple(frame.names[k] for k in here)
+        x = np.ascontiguousarray(frame.positions[here])
+        return MarkerMeasurement(self, names, x, frame.marker_set, frame.time)
+
+
+def markers_of(body: Body, marker_set: str) -> PointSet:
+    """Where a marker set's markers sit on a body; the body's landmarks for no set."""
+    return body.markers(marker_set) if marker_set else body.landmarks
+
+
+class MarkerMeasurement(Measurement):
+    """Markers of one time.
+
+    Parameters
+    ----------
+    of : MarkerSensor
+    names : (M,); x_world : (M, 3) [m]; marker_set : str; time : float [s]
+    """
+
+    def __init__(
+        self, of: MarkerSensor, names: tuple[str, ...], x_world: NDArray, marker_set: str, time: float
+    ) -> None:
+        self.sensor, self.time, self.of = of.name, time, of
+        self.names, self.x_world, self.marker_set = names, x_world, marker_set
+        self.weight = np.full(len(names), 1.0 / of.sigma**2)
+        self._points: tuple[Body, PointSet] | None = None
+
+    def points_of(self, body: Body) -> PointSet:
+        """(M,) the markers on a body."""
+        if self._points is None or self._points[0] is not body:
+            self._points = body, markers_of(body, self.marker_set).select(self.names)
+        return self._points[1]
+
+    def match(self, scene: Scene, reach: float) -> MarkerMatched:
+        """As they are named."""
+        loss = self.of.loss
+        return MarkerMatched(self, replace(loss, scale=loss.scale * max(reach / self.of.near, 1.0)))
+
+    def hints(self, scene: Scene) -> Hints:
+        """Where they are."""
+        return Hints(self.points_of(scene.body), self.x_world)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerMatched(Matched):
+    """Markers with their places on the body; measurement and the Loss of a marker."""
+
+    measurement: MarkerMeasurement
+    loss: Loss
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the marker system."""
+        return self.measurement.sensor
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """Three rows a marker."""
+        m = self.measurement
+        rows = scene.rows_of(_kernels.point_rows, 3, m.points_of(scene.body), m.x_world, m.weight)
+        return [replace(rows, loss=self.loss)]
+
+    def squares(self, scene: Scene) -> NDArray:
+        """(M,) squared distances, in variances."""
+        m = self.measurement
+        return np.asarray(m.weight * np.square(m.x_world - scene.positions(m.points_of(scene.body))).sum(axis=1))
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Of every marker."""
+        m = self.measurement
+        points = m.points_of(scene.body)
+        values, factor = m.x_world - scene.positions(points), self.loss.factor(self.squares(scene))
+        return [Leftover(m.sensor, m.names, points.segments, values, factor, "m", m.x_world)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """A marker speaks for its segment within three standard deviations, and against it beyond."""
+        return of_points(scene.body, self.measurement.points_of(scene.body), self.squares(scene))
+
+
+def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
+    """Evidence of points with squared residuals (K,) in variances."""
+    tree, out = body.tree, np.zeros((2, len(body.tree.segments)))
+    for s, place, far in zip(points.segments, points.points, square >= AGREES**2):
+        out[int(far), s] += SHOWN
+        if tree.parents[s] >= 0 and np.linalg.norm(place) < _AT_JOINT:
+            out[int(far), tree.parents[s]] += SHOWN
+    return Evidence(*out)

@@ -1,0 +1,147 @@
+"""Correspondences between a body's surface and what was measured, frozen: they hold at any state, on any like body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces import SurfaceAnchors
+from kinefit.correspondences import anchored_rows, free_space_rows, target_rows
+from kinefit.correspondences.depth_image import SurfaceSamples
+from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.geometry.camera import Camera
+from kinefit.losses import SQUARED, geman_mcclure
+from kinefit.rows import DofRows, Rows
+from kinefit.sensors.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentResiduals:
+    """Residuals of a surface or an outline by segments.
+
+    Parameters
+    ----------
+    median : (S,) signed [m] or [px], above 0 where the measurement lies outside the body; NaN where there is none.
+    rms : (S,) root mean square, in the same unit; NaN where there is none.
+    count : (S,) int
+    """
+
+    median: NDArray
+    rms: NDArray
+    count: NDArray
+
+
+def by_segment(residual: NDArray, segment: NDArray, segments: int) -> SegmentResiduals:
+    """Residuals (N,) of segments (N,) int for each of a number of segments."""
+    count = np.bincount(segment, minlength=segments)
+    median, rms = np.full((2, segments), np.nan)
+    order = np.argsort(segment, kind="stable")
+    for s, own in enumerate(np.split(residual[order], np.cumsum(count)[:-1])):
+        if len(own):
+            median[s], rms[s] = np.median(own), np.sqrt(np.mean(own**2))
+    return SegmentResiduals(median, rms, count)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePairs:
+    """N measured points, each with the point of the surface that it belongs to: point to plane (P2 2.3).
+
+    Parameters
+    ----------
+    anchors : SurfaceAnchors
+    x_world : (N, 3) [m] measured.
+    weight : (N,) [1/m²]
+    scale : float [m] of the loss (Geman-McClure): at this distance a pair has a quarter of its weight.
+    at_surface : bool, see `anchored_rows`.
+    """
+
+    anchors: SurfaceAnchors
+    x_world: NDArray
+    weight: NDArray
+    scale: float
+    at_surface: bool
+
+    @classmethod
+    def nearest(cls, rows: Rows, x_world: NDArray, scene: Scene, scale: float, factor: float = 1.0) -> SurfacePairs:
+        """Pairs of measured points (M, 3) [m] and their nearest points: `surface_rows` of them in the scene's state.
+
+        `factor` multiplies the weights.
+        """
+        x, n, r = x_world[rows.group], rows.direction, rows.residual
+        foot = x - (r / np.square(n).sum(axis=1))[:, None] * n
+        f = scene.frames[rows.segment]
+        R = f[:, :9].reshape(-1, 3, 3)
+        rest, normal = np.einsum("nji,nj->ni", R, foot - f[:, 9:]), np.einsum("nji,nj->ni", R, n)
+        anchors = SurfaceAnchors(scene.body, rows.segment, rest, normal)
+        return cls(anchors, np.ascontiguousarray(x), factor * rows.weight, scale, True)
+
+    @classmethod
+    def seen(cls, rows: Rows, samples: SurfaceSamples, scene: Scene, scale: float) -> SurfacePairs:
+        """Pairs of visible samples and what was measured at their pixels: `depth_image_rows` in the scene's state."""
+        rest, normal = samples.point[:, rows.group].T, samples.normal[:, rows.group].T
+        anchors = SurfaceAnchors(scene.body, rows.segment, np.ascontiguousarray(rest), np.ascontiguousarray(normal))
+        return cls(anchors, np.ascontiguousarray(rows.point), rows.weight.copy(), scale, False)
+
+    def on_segments(self, scene: Scene) -> Rows:
+        """The rows, as if no joint moved with an angle."""
+        points, normals = self.anchors.on(scene.body)
+        made = anchored_rows(
+            scene.body, scene.state, self.anchors.segment, points, normals, self.x_world, weight=self.weight,
+            at_surface=self.at_surface, frames=scene.frames,
+        )  # fmt: skip
+        return replace(made, loss=geman_mcclure(self.scale * np.sqrt(self.weight)))
+
+    def rows(self, scene: Scene) -> Rows | DofRows:
+        """One row a pair at a scene's state."""
+        return _on_joints(scene, self.on_segments(scene))
+
+
+@dataclass(frozen=True, eq=False)
+class FreePairs:
+    """Samples of the surface in free space, each with the place in the image that it is drawn to.
+
+    Parameters
+    ----------
+    anchors : SurfaceAnchors, N
+    camera : Camera
+    target : (N, 2) [px]
+    slack, sigma : float [px]
+    """
+
+    anchors: SurfaceAnchors
+    camera: Camera
+    target: NDArray
+    slack: float
+    sigma: float
+
+    @classmethod
+    def found(
+        cls, scene: Scene, samples: SurfaceSamples, space: FreeSpace, camera: Camera, *, tolerance: float, sigma: float
+    ) -> FreePairs:
+        """As `free_space_rows` finds them at a scene's state."""
+        chosen = np.empty(len(samples), np.int64)
+        made = free_space_rows(
+            scene.body, scene.state, samples, space, camera, tolerance=tolerance, sigma=sigma, chosen=chosen,
+            frames=scene.frames,
+        )  # fmt: skip
+        own = made.group
+        rest, normal = (np.ascontiguousarray(a[:, own].T) for a in (samples.point, samples.normal))
+        anchors = SurfaceAnchors(scene.body, made.segment, rest, normal)
+        return cls(anchors, camera, space.middle(chosen[own]), 0.5 * space.cell, sigma)
+
+    def rows(self, scene: Scene) -> Rows | DofRows:
+        """One row a sample at a scene's state."""
+        points, _ = self.anchors.on(scene.body)
+        made = target_rows(
+            scene.body, scene.state, self.anchors.segment, points, self.camera, self.target, slack=self.slack,
+            sigma=self.sigma, frames=scene.frames,
+        )  # fmt: skip
+        return _on_joints(scene, replace(made, loss=SQUARED))
+
+
+def _on_joints(scene: Scene, rows: Rows) -> Rows | DofRows:
+    """Rows with the derivative of joints that move with angles, where there are any."""
+    return rows if scene.morphing is None else on_moved_joints(scene.morphing.pose(scene.state), rows)

@@ -1,0 +1,140 @@
+"""Any sensors over a whole take: matched anew in every round, and between rounds as quadratic costs of the poses.
+
+About the states where a frame's rows were made, the cost of its measurements is c − 2 gᵀδ + δᵀHδ. That is all that the
+solver asks of them while it moves by little, so a round costs one match and one linearisation a frame, whatever the
+sensors are; the motion prior and the pixels of keypoints are taken exactly at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.rows import AnyRows, DofRows, Rows
+from kinefit.sensors.base import Matched, Measurement, matched_by
+from kinefit.sensors.scene import Scene
+from kinefit.solvers import _kernels_smoothing
+from kinefit.solvers.equations import normal_equations
+from kinefit.solvers.smoothing import Equations, MakeEquations
+
+SceneOf = Callable[[BodyState, float], Scene]
+ApartRows = Callable[[Scene], Sequence[AnyRows]]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Quadratic costs of T frames about their states.
+
+    Parameters
+    ----------
+    H, g, cost : (T, n, n), (T, n), (T,)
+    roots, angles : (T, 4, 4), (T, D) about which
+    matched : T lists, by which correspondences
+    rows : (T,) how many rows agree
+    """
+
+    H: NDArray
+    g: NDArray
+    cost: NDArray
+    roots: NDArray
+    angles: NDArray
+    matched: tuple[tuple[Matched, ...], ...]
+    rows: NDArray
+
+    def part(self, frames: slice) -> Linearised:
+        """A stretch of it."""
+        names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
+        return replace(self, **{name: getattr(self, name)[frames] for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class OtherSensors:
+    """What all sensors but the keypoints saw in T frames.
+
+    Parameters
+    ----------
+    times : (T,) [s]
+    measurements : T lists
+    scene_of : (state, time) -> scene
+    apart : scene -> rows that keep parts of the body from running into each other
+    reach : float [m] correspondence distance
+    scale : {sensor: factor on its standard deviation}, as the take shows it; 1 where none is given
+    """
+
+    times: NDArray
+    measurements: tuple[tuple[Measurement, ...], ...]
+    scene_of: SceneOf
+    apart: ApartRows
+    reach: float
+    scale: dict[str, float]
+
+    def part(self, frames: slice) -> OtherSensors:
+        """A stretch of it."""
+        return replace(self, times=self.times[frames], measurements=self.measurements[frames])
+
+    def scene(self, f: int, state: BodyState) -> Scene:
+        """Of one frame."""
+        return self.scene_of(state, float(self.times[f])).at(state, measurements=self.measurements[f])
+
+    def linearised(self, body: Body, roots: NDArray, angles: NDArray) -> Linearised:
+        """All frames matched and linearised about states (T, 4, 4), (T, D)."""
+        T, n = len(roots), body.tree.n_dofs
+        H, g, cost, rows, matches = np.zeros((T, n, n)), np.zeros((T, n)), np.zeros(T), np.zeros(T), []
+        for f in range(T):
+            state = BodyState(roots[f], angles[f])
+            scene = self.scene(f, state)
+            matched = tuple(matched_by(m, scene, self.reach) for m in self.measurements[f])
+            matches.append(matched)
+            parts = [weaker(r, self.scale.get(m.sensor, 1.0)) for m in matched for r in m.rows(scene)]
+            rows[f] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
+            if matched:
+                parts += self.apart(scene)
+            if parts:
+                equations = normal_equations(body, state, parts)
+                H[f], g[f], cost[f] = equations.matrix, equations.gradient, equations.cost
+        return Linearised(H, g, cost, np.array(roots), np.array(angles), tuple(matches), rows)
+
+
+def weaker(rows: AnyRows, factor: float) -> AnyRows:
+    """The same rows with standard deviations that are so many times larger."""
+    if factor == 1.0:
+        return rows
+    if isinstance(rows, Rows):
+        data = np.array(rows.data)
+        data[7] /= factor**2
+        return replace(rows, data=data)
+    return replace(rows, weight=rows.weight / factor**2)
+
+
+def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:
+    """Equations of keypoints, packed as the tree has them, made dense, with quadratic costs added."""
+    chain, depth = body.tree.chain, body.tree.depth
+
+    def both(roots: NDArray, angles: NDArray) -> Equations:
+        packed, g, cost = make(roots, angles)
+        delta = np.empty(more.g.shape)
+        _kernels_smoothing.differences(more.roots, roots, more.angles, angles, delta)
+        moved = np.einsum("tij,tj->ti", more.H, delta)
+        C = np.array(more.H)
+        _kernels_smoothing.add_packed(packed, chain, depth, C)
+        g += more.g - moved
+        cost += more.cost - 2.0 * np.einsum("ti,ti->t", more.g, delta) + np.einsum("ti,ti->t", moved, delta)
+        return C, g, cost
+
+    return both
+
+
+def squares_of(rows: AnyRows) -> tuple[NDArray, NDArray]:
+    """Squared residual of each row, in variances, and its robust factor; nothing of rows that are no measurement."""
+    if not isinstance(rows, Rows | DofRows):
+        return np.zeros(0), np.zeros(0)
+    square = rows.weight * rows.residual**2
+    if rows.loss is None:
+        return square, np.ones(len(square))
+    data = np.zeros((8, len(square)))
+    data[6], data[7] = rows.residual, rows.weight
+    return square, rows.loss.of_rows(data, rows.group)[0]

@@ -1,0 +1,136 @@
+"""How any sensor errs: jitter, drift of every channel, and a shift of the whole sensor, from what a fit left over.
+
+A channel is what errs alike for a while: one axis of a marker, the surface of one segment along its normals. What its
+mean residual has that is not new in every frame lasts; what all residuals of a sensor have in common is a shift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.rows import DofRows, Rows
+from kinefit.sensors.base import Matched
+from kinefit.smoothing.linearised import OtherSensors, squares_of
+from kinefit.solvers.equations import design
+
+_MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_FEW = 5  # frames of a channel, with fewer of which it tells nothing of what lasts
+
+
+@dataclass(eq=False)
+class _Channel:
+    """Mean residual [m] of a channel frame by frame, and the variance [m²] that it should have."""
+
+    values: list[float] = field(default_factory=list)
+    expected: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class OtherNoise:
+    """What lasts of the errors of all sensors but the keypoints.
+
+    Parameters
+    ----------
+    information : (T, n, n) of every frame's rows
+    lasting : (T, n, n) Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e
+    drift : {sensor: standard deviation [m]}
+    shift : {sensor: (3,) [m]} in the world
+    """
+
+    information: NDArray
+    lasting: NDArray
+    drift: dict[str, float]
+    shift: dict[str, NDArray]
+
+    def as_told(self) -> dict[str, Any]:
+        """The same in a few numbers, by sensor."""
+        return {
+            name: {"drift [m]": round(d, 4), "shift [m]": np.round(self.shift.get(name, np.zeros(3)), 4).tolist()}
+            for name, d in self.drift.items()
+        }
+
+
+def other_noise(
+    body: Body, others: OtherSensors, matched: tuple[tuple[Matched, ...], ...], roots: NDArray, angles: NDArray
+) -> OtherNoise:
+    """Noise of all sensors but the keypoints, from their residuals at fitted states.
+
+    Parameters
+    ----------
+    matched : T lists of matches
+    roots, angles : (T, 4, 4), (T, D) fitted
+    """
+    T, n = len(roots), body.tree.n_dofs
+    pushes: list[list[tuple[str, NDArray]]] = []
+    information = np.zeros((T, n, n))
+    channels: dict[str, dict[tuple[int, int], _Channel]] = {}
+    normal: dict[str, tuple[NDArray, NDArray]] = {}
+    shifts: list[list[tuple[str, NDArray]]] = []
+    counts: dict[str, list[int]] = {}
+    for f in range(T):
+        state, push, moved = BodyState(roots[f], angles[f]), list[tuple[str, NDArray]](), list[tuple[str, NDArray]]()
+        scene = others.scene(f, state)
+        for m in matched[f]:
+            scale = others.scale.get(m.sensor, 1.0)
+            for part, rows in enumerate(m.rows(scene)):
+                if not isinstance(rows, Rows | DofRows) or not len(rows):
+                    continue
+                J, w = design(body, state, rows), rows.weight * squares_of(rows)[1] / scale**2
+                weighted = J * w[:, None]
+                information[f] += J.T @ weighted
+                by_segment = not m.of_points and isinstance(rows, Rows)
+                names = rows.segment if by_segment else np.arange(len(rows))
+                counts.setdefault(m.sensor, []).append(len(np.unique(names)))
+                mine = channels.setdefault(m.sensor, {})
+                for c in np.unique(names):
+                    of = names == c
+                    total = float(w[of].sum())
+                    if total > 0.0:
+                        channel = mine.setdefault((part, int(c)), _Channel())
+                        channel.values.append(float(w[of] @ rows.residual[of]) / total)
+                        channel.expected.append(1.0 / total)
+                        push.append((m.sensor, weighted[of].sum(axis=0)))
+                if isinstance(rows, Rows):
+                    d = rows.direction
+                    A, b = normal.get(m.sensor, (np.zeros((3, 3)), np.zeros(3)))
+                    normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
+                    moved += [(m.sensor, weighted.T @ d)]
+        pushes.append(push)
+        shifts.append(moved)
+    shift = {
+        name: np.abs(np.linalg.solve(A + 1e-9 * (np.trace(A) + 1.0) * np.eye(3), b)) for name, (A, b) in normal.items()
+    }
+    drift = {
+        name: _drift(list(mine.values()), min(n / max(float(np.mean(counts[name])), 1.0), _MOST_HIDDEN))
+        for name, mine in channels.items()
+    }
+    lasting = np.zeros((T, n, n))
+    for f in range(T):
+        for name, s in pushes[f]:
+            lasting[f] += drift[name] ** 2 * np.outer(s, s)
+        for name, S in shifts[f]:
+            moved_by = S * shift[name]
+            lasting[f] += moved_by @ moved_by.T
+    return OtherNoise(information, lasting, drift, shift)
+
+
+def _drift(channels: list[_Channel], hidden: float) -> float:
+    """[m] standard deviation of what lasts, pooled over a sensor's channels.
+
+    Parameters
+    ----------
+    hidden : share of a channel's own error that the fit follows, and so hides from its residual
+    """
+    lasting, frames = 0.0, 0
+    for channel in channels:
+        values = np.array(channel.values)
+        if len(values) >= _FEW:
+            new = min(0.5 * float(np.mean(np.diff(values) ** 2)), float(np.mean(values**2)))
+            lasting += len(values) * (float(np.mean(values**2)) - new)
+            frames += len(values)
+    return float(np.sqrt(lasting / max(frames, 1) / (1.0 - hidden)))

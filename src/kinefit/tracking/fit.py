@@ -1,0 +1,110 @@
+"""One time's fit: measurements are matched, matches become rows, and a state comes out with its uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.rows import AnyRows, ParameterRows
+from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
+from kinefit.sensors.results import FrameResult, judged
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.equations import inverse
+from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.tracking.prediction import belief
+
+_LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
+_ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
+
+Held = tuple[BodyState, NDArray]
+"""What is known beforehand: a state, and the information (n, n) of it, without the posture prior."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fitted frame: the result, and the covariance (n, n) of what was measured and predicted, without the prior."""
+
+    result: FrameResult
+    filtered: NDArray
+
+
+class FrameFit:
+    """A body, ready for one fit after the other.
+
+    Parameters
+    ----------
+    body : Body
+    settings : TrackSettings
+    """
+
+    def __init__(self, body: Body, settings: TrackSettings) -> None:
+        self.body, self.settings = body, settings
+        self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
+        self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
+        self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
+
+    def run(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Fitted:
+        """Fit from a scene's state on, and judge."""
+        if all(m.settled for m in measurements):
+            return self._settled(scene, held, measurements)
+        s, reach, iterations = self.settings, self.settings.far, 0
+        while iterations < s.iterations:
+            iterations += 1
+            matched = _match(scene, measurements, reach)
+            step = gauss_newton(self.body, scene.state, self.rows(scene, held, matched, apart=True))
+            scene = scene.at(step.state)
+            gain = float(step.delta @ step.equations.gradient)  # twice the fall of the cost: squared deviations
+            if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
+                break
+            reach = max(reach * s.shrink, s.near)
+        return self._judged(scene, step.equations.matrix, matched, iterations)
+
+    def _settled(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Fitted:
+        """Where a match changes in what is discrete alone: to the minimum under each, until it stays as it is."""
+        matched, iterations = _match(scene, measurements, self.settings.near), 0
+        for last in [False] * (_ROUNDS - 1) + [True]:
+            fit = levenberg_marquardt(
+                self.body, scene.state, lambda state: self.rows(scene.at(state), held, matched),  # noqa: B023
+                max_iterations=40, tolerance=1e-4, damping=None if held is None else _LIGHT,
+            )  # fmt: skip
+            scene, iterations = scene.at(fit.state), iterations + fit.iterations
+            again = matched if last else _match(scene, measurements, self.settings.near)
+            if all(a.key == b.key for a, b in zip(matched, again)):
+                break
+            matched = again
+        return self._judged(scene, fit.equations.matrix, matched, iterations)
+
+    def rows(
+        self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
+    ) -> list[AnyRows]:
+        """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart."""
+        parts = [rows for m in matched for rows in check_rows(m.rows(scene), m.sensor, self.body)]
+        if held is not None:
+            parts.append(belief(scene.state, *held))
+        usual = self.body.tree.usual
+        parts.append(ParameterRows(self._prior, (usual - scene.state.angles)[self._prior - 6], self._prior_weight))
+        return [*parts, *self.apart(scene)] if apart else parts
+
+    def apart(self, scene: Scene) -> list[AnyRows]:
+        """Rows that keep parts of the body from running into each other."""
+        if self._pairs is None:
+            return []
+        s = self.settings
+        margin, sigma = -s.flesh, s.collision
+        return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
+
+    def _judged(self, scene: Scene, H: NDArray, matched: Sequence[Matched], iterations: int) -> Fitted:
+        alone = np.array(H)
+        alone[self._prior, self._prior] -= self._prior_weight * (1.0 - 1e-6)
+        return Fitted(judged(scene, inverse(H), matched, iterations), inverse(alone))
+
+
+def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:
+    return [matched_by(m, scene, reach) for m in measurements]
+

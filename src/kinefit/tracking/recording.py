@@ -1,0 +1,196 @@
+"""A recording: what all sensors saw at each of its times, from a take, from arrays in memory, or kept of a live session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.motion import UP_AXES
+from kinefit.multiview.association import choose_people
+from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, Markers
+from kinefit.sensors.base import Sensor
+
+Steps = Callable[[int], Sequence[Any]]
+"""Number of a step of time -> what the sensors saw then; nothing where none did."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What all sensors of a take saw.
+
+    Parameters
+    ----------
+    times : (F,) [s] of the steps
+    rate : float [Hz]
+    rig : Rig of all cameras
+    steps : what all sensors but the keypoints' detectors saw at each step
+    keypoints : of F frames each, of one or several people
+    people : (F,) int each, which of them is followed in each frame, -1 for none
+    sigma : {sensor: standard deviation}, [px] of cameras' keypoints and of "silhouette CAMERA", else [m]
+    sensors : of one's own, see `kinefit.sensors.base`
+    markers : labelled recordings among what the steps show, whole, for the subject fit
+    depth : some of the first images of the depth sensor that comes first, by step, for the subject fit
+    on_body : depth cameras whose images show nothing but the body
+    backgrounds : {depth camera: (H, W) [m]} of the empty scene
+    start : step and state to begin with
+    up : vertical axis of the world
+    name : str
+    """
+
+    times: NDArray
+    rate: float
+    rig: Rig
+    steps: Steps = lambda i: ()
+    keypoints: tuple[Keypoints, ...] = ()
+    people: tuple[NDArray, ...] = ()
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    keypoint_sigma: tuple[float, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
+    markers: tuple[Markers, ...] = ()
+    depth: Mapping[int, DepthFrame] = field(default_factory=dict)
+    on_body: tuple[str, ...] = ()
+    backgrounds: Mapping[str, NDArray] = field(default_factory=dict)
+    start: tuple[int, BodyState] | None = None
+    up: str = "z"
+    name: str = "motion"
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def up_axis(self) -> NDArray:
+        """(3,) upwards in the world."""
+        return np.array(UP_AXES[self.up])
+
+    @classmethod
+    def of_keypoints(
+        cls, rig: Rig, keypoints: Sequence[Keypoints], *, accuracy: float | Sequence[float] = 8.0, **more: Any
+    ) -> Recording:
+        """Keypoints of calibrated cameras; the person is chosen among all detected.
+
+        Parameters
+        ----------
+        rig : Rig
+        keypoints : records of the same number of frames and the same rate.
+        accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
+        more : other arguments of a recording
+
+        Raises
+        ------
+        ObservationError
+            No keypoints, or of different lengths or rates.
+        TrackingError
+            Nobody is seen in any frame.
+        """
+        if not keypoints:
+            raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+        lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
+        if len(lengths) > 1 or len(rates) > 1:
+            told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
+            raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
+        sigma = _sigmas(accuracy, len(keypoints))
+        people = tuple(choose_people(rig, keypoints))
+        return cls(
+            keypoints[0].times, keypoints[0].rate, rig, keypoints=tuple(keypoints), people=people,
+            keypoint_sigma=sigma, **more,
+        )  # fmt: skip
+
+    @classmethod
+    def of_frames(
+        cls, steps: Sequence[Sequence[Any]], rig: Rig, *, rate: float, sigma: Mapping[str, float] | None = None,
+        **more: Any,
+    ) -> Recording:  # fmt: skip
+        """What the sensors saw at each time, in memory: depth images, clouds, keypoints, markers, your own, in any mix.
+
+        Parameters
+        ----------
+        steps : lists of frames
+        rig : Rig
+        rate : float [Hz] of the steps
+        sigma : {sensor: standard deviation}
+        more : other arguments of a recording
+
+        Raises
+        ------
+        ObservationError
+            No steps, or steps without any frame.
+        """
+        told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
+        known = np.flatnonzero(np.isfinite(told))
+        if not len(known):
+            raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
+        times = np.interp(np.arange(len(told)), known, np.array(told)[known])
+        if len(known) < len(told):  # evenly beyond the ends
+            times = np.where(np.isfinite(told), times, times[known[0]] + (np.arange(len(told)) - known[0]) / rate)
+        sigma = dict(sigma or {})
+        records = _records(steps, times, rate)
+        others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
+        accuracy = tuple(sigma.get(r.camera, 4.0) for r in records)
+        return cls(
+            times, rate, rig, steps=lambda i: others[i], keypoints=records,
+            people=tuple(np.where((r.confidence > 0).any(axis=(1, 2)), 0, -1) for r in records),
+            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **more,
+        )  # fmt: skip
+
+    def part(self, frames: slice) -> Recording:
+        """Some of its steps."""
+        first = range(len(self))[frames].start
+        return replace(
+            self, times=self.times[frames], steps=lambda i: self.steps(i + first),
+            keypoints=tuple(_cut(k, frames) for k in self.keypoints), people=tuple(p[frames] for p in self.people),
+        )  # fmt: skip
+
+
+def _cut(record: Keypoints, frames: slice) -> Keypoints:
+    first = range(len(record))[frames].start
+    offset = record.time_offset + first / record.rate
+    return replace(record, points=record.points[frames], confidence=record.confidence[frames], time_offset=offset)
+
+
+def _sigmas(accuracy: float | Sequence[float], count: int) -> tuple[float, ...]:
+    """One standard deviation [px] for each of the records."""
+    values = np.asarray(accuracy, float).ravel()
+    if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
+        raise ObservationError(f"accuracies {values}", remedy=f"Give one positive number of pixels, or {count}.")
+    return tuple(float(v) for v in np.broadcast_to(values, count))
+
+
+def _records(steps: Sequence[Sequence[Any]], times: NDArray, rate: float) -> tuple[Keypoints, ...]:
+    """Keypoints of single frames as records of all of them, one for each camera and keypoint set."""
+    seen: dict[tuple[str, str, tuple[str, ...]], dict[int, KeypointFrame]] = {}
+    for i, frames in enumerate(steps):
+        for f in frames:
+            if isinstance(f, KeypointFrame):
+                seen.setdefault((f.sensor, f.keypoint_set, f.names), {})[i] = f
+    out = []
+    for (camera, name, names), frames_of in seen.items():
+        points = np.full((len(steps), 1, len(names), 2), np.nan)
+        confidence = np.zeros(points.shape[:3])
+        for i, f in frames_of.items():
+            points[i, 0], confidence[i, 0] = f.uv, f.confidence
+        out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=float(times[0])))
+    return tuple(out)
+
+
+_SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
+
+
+def _first_depth(steps: Sequence[Sequence[Any]], rate: float) -> dict[int, DepthFrame]:
+    """Some of the first images of the depth camera that comes first, by step."""
+    shown = {i: f for i, seen in enumerate(steps) for f in seen if isinstance(f, DepthFrame)}
+    sensor = next((f.sensor for f in shown.values()), None)
+    mine = [i for i, f in shown.items() if f.sensor == sensor]
+    mine = [i for i in mine if i <= mine[0] + _FIRST * rate]
+    return {mine[k]: shown[mine[k]] for k in spread(len(mine), _SIZES)}
+
+
+def spread(count: int, most: int) -> NDArray:
+    """(N,) int: at most so many of `count` places, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)) if count else np.zeros(0, int)

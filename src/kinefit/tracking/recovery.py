@@ -1,0 +1,152 @@
+"""What is lost is sought, and taken where more speaks for it: a limb in a view, a whole body in all that was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.geometry.camera import Rig
+from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
+from kinefit.initialization.depth_search import Search
+from kinefit.sensors.base import Measurement
+from kinefit.sensors.results import ANYWHERE, FrameResult
+from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.equations import inverse
+from kinefit.tracking.prediction import forgetting
+
+if TYPE_CHECKING:
+    from kinefit.tracking.tracker import Tracker
+
+_SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than that must be the more certain
+_GAIN = 0.1  # of the support, by which a start must be better than what was tracked
+
+
+class Recovery:
+    """Searches of one tracker: when the last one was, and since when something is lost.
+
+    Parameters
+    ----------
+    body, rig, up, settings, rate : as of the `Tracker`
+    """
+
+    def __init__(self, body: Body, rig: Rig, up: NDArray, settings: TrackSettings, rate: float) -> None:
+        self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
+        self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
+        self.forget()
+
+    def forget(self) -> None:
+        """Of the time before a pause."""
+        self._sought = self._lost_since = -np.inf
+
+    def clocks(self) -> tuple[float, float]:
+        """When the last search was, and since when something is lost [s]."""
+        return self._sought, self._lost_since
+
+    def set_clocks(self, clocks: tuple[float, float]) -> None:
+        """As `clocks` gave them."""
+        self._sought, self._lost_since = clocks
+
+    def run(
+        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        result: FrameResult | None,
+    ) -> FrameResult | None:  # fmt: skip
+        """The result of one time, or a better one that was found."""
+        s = self.settings
+        if result is None or result.support < s.support:
+            result = self._from_points(tracker, time, frames, measurements, result)
+        if result is not None:
+            seek = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
+            self._good[~seek] = time
+            if not seek.any():
+                self._lost_since = time
+                return result
+        waited = result is None or time - self._lost_since >= s.search_after
+        if not s.search or not waited or time - self._sought < s.search_every - 0.25 / self.rate:
+            return result
+        self._sought = time
+        if result is None or result.lost[0] or result.quality < s.poor:
+            return self._from_views(tracker, time, frames, result)
+        return self._limbs(tracker, time, frames, measurements, result, seek)
+
+    def _from_points(
+        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        result: FrameResult | None,
+    ) -> FrameResult | None:  # fmt: skip
+        """A start from points that are known in space, which costs little."""
+        scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
+        for state in starts_from_points(self.body, frames, measurements, scene, tracker.sensors.keypoints):
+            found = tracker.fitted(time, frames, state).result
+            if result is None or found.support > result.support + _GAIN:
+                result, self._lost_since = found, time
+                tracker.restart(found)
+        return result
+
+    def _from_views(
+        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None
+    ) -> FrameResult | None:
+        """A start from what shows a whole person."""
+        scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
+        for state in starts_from_views(self.body, self.rig, frames, self.up, scene, tracker.sensors.keypoints):
+            found = tracker.fitted(time, frames, state).result
+            poor = found.lost[0] or found.quality < self.settings.poor
+            if not poor and (result is None or _better(found, result)):
+                result, self._lost_since = found, time
+                tracker.restart(found)
+        return result
+
+    def _limbs(
+        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        result: FrameResult, seek: NDArray,
+    ) -> FrameResult:  # fmt: skip
+        scene = tracker.scene_of(result.state, time)
+        view = next((v for m in measurements if (v := m.hints(scene).view) is not None), None)
+        if view is None:
+            return result
+        search = Search(self.body, view, self.up, np.random.default_rng(0))
+        free = dofs_of_limbs(self.body, seek)
+        std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
+        held = result.state, forgetting(inverse(np.diag(std**2)), free)
+        now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
+        for state, least in find_limbs(search, result.state, seek):
+            found = tracker.fitted(time, frames, state, held).result
+            value = search.score.of(found.state) - LEAP * _against(tracker, found)
+            if not self._shown(tracker, found, seek):
+                continue
+            if value > max(best, now + least * self._leap(time, result, found, seek)):
+                best, result, self._lost_since = value, found, time
+                tracker.restart(found, np.where(free, 0.0, tracker.velocity))
+        return result
+
+    def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
+        """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
+        scene = tracker.scene_of(found.state, found.time)
+        views = [m for m in found.matched if m.shows_surface]
+        hidden = np.ones(len(seek), bool)
+        for m in views:
+            hidden &= m.evidence(scene).hidden
+        return not (hidden & seek).any()
+
+    def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
+        """How much faster than usual a limb would have moved since it was last seen where it was, 1 at least."""
+        elapsed = time - float(self._good[seek].min())
+        points = self.body.landmarks
+        gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)
+        return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)
+
+
+def _against(tracker: Tracker, result: FrameResult) -> float:
+    """How many points a result does not agree with; half for one that is ten deviations off."""
+    scene = tracker.scene_of(result.state, result.time)
+    square = np.concatenate([np.zeros(0), *(m.squares(scene) for m in result.matched if m.of_points)])
+    return float(np.sum(1.0 - 100.0 / (square + 100.0)))
+
+
+def _better(new: FrameResult, old: FrameResult) -> bool:
+    """Fewer segments are lost, or as many and more speaks for those that are seen."""
+    lost = int(new.lost.sum()), int(old.lost.sum())
+    return lost[0] < lost[1] or (lost[0] == lost[1] and new.quality > old.quality + 0.05)
+

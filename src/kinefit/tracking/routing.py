@@ -1,0 +1,179 @@
+"""From what sensors hand over to measurements: which sensor each frame is of, and what it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError, choices
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
+from kinefit.sensors.background import Background
+from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.keypoints import NAME as KEYPOINTS
+from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.point_cloud import PointCloudSensor
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.silhouette import SilhouetteSensor
+
+
+class Sensors:
+    """All sensors of a take by name: the built-in kinds as their first frame asks for them, and those of one's own.
+
+    Parameters
+    ----------
+    rig : Rig
+    rate : float [Hz] of the frames
+    sigma : {sensor: standard deviation}
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
+    settings : TrackSettings
+    own : sensors of one's own
+    on_body : depth cameras whose images show nothing but the body: no background is learnt
+
+    Raises
+    ------
+    ObservationError
+        Two sensors of one name; a standard deviation that is not positive.
+    """
+
+    def __init__(
+        self, rig: Rig, rate: float, sigma: Mapping[str, float], settings: TrackSettings, own: Sequence[Sensor] = (),
+        on_body: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        self.rig, self.rate, self.sigma, self.settings = rig, rate, dict(sigma), settings
+        bad = [f"{name}: {value}" for name, value in self.sigma.items() if not 0.0 < value < np.inf]
+        if bad:
+            raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
+        self._sensors: dict[str, Sensor] = {}
+        for sensor in own:
+            if sensor.name in self._sensors:
+                raise ObservationError(f"two sensors are named '{sensor.name}'", remedy="Give each its own name.")
+            self._sensors[sensor.name] = sensor
+        self._own = frozenset(self._sensors)
+        self._backgrounds: dict[str, Background | None] = dict.fromkeys(on_body)
+        self._makers: dict[type, Callable[[str], Sensor]] = {
+            KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
+            PointCloud: self._cloud, SilhouetteFrame: self._silhouette,
+        }  # fmt: skip
+
+    def __iter__(self) -> Any:
+        return iter(self._sensors.values())
+
+    def of(self, name: str) -> Sensor | None:
+        """The sensor of a measurement; None for a measurement that came without one."""
+        return self._sensors.get(name)
+
+    def measurements(self, frames: Sequence[Any], scene: Scene) -> list[Measurement]:
+        """What the sensors saw at one time, ready to be matched; keypoints of all cameras are one measurement."""
+        pixels = [f for f in frames if isinstance(f, KeypointFrame) and f.sensor not in self._own]
+        out = []
+        for frame in frames:
+            if isinstance(frame, Measurement):
+                out.append(frame)
+            elif frame.sensor in self._own:
+                out.append(self._sensors[frame.sensor].prepare(frame, scene))
+            elif not isinstance(frame, KeypointFrame):
+                out.append(self._of_frame(frame).prepare(frame, scene))
+            elif frame is pixels[0]:
+                out.append(self.keypoints.prepare(pixels, scene))
+        for m in out:
+            _check_measurement(m)
+        return out
+
+    @property
+    def keypoints(self) -> KeypointSensor:
+        """The detectors of all cameras."""
+        if KEYPOINTS not in self._sensors:
+            self._sensors[KEYPOINTS] = self._keypoints(KEYPOINTS)
+        sensor = self._sensors[KEYPOINTS]
+        assert isinstance(sensor, KeypointSensor)
+        return sensor
+
+    def background(self, camera: Camera) -> Background | None:
+        """What stands still before a depth camera; None where nothing is to be learnt."""
+        if camera.name not in self._backgrounds:
+            sigma = self.sigma.get(camera.name, self.settings.depth)
+            wait = self.settings.background * self.rate
+            still = np.isfinite(wait)
+            self._backgrounds[camera.name] = Background(camera, sigma, max(round(wait), 2)) if still else None
+        return self._backgrounds[camera.name]
+
+    def know_background(self, sensor: str, depth: NDArray) -> None:
+        """State what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known."""
+        camera = self.rig[sensor]
+        if np.shape(depth) != camera.size[::-1]:
+            problem = f"a background of shape {np.shape(depth)}, camera {sensor} has {camera.size}"
+            raise ObservationError(problem, remedy="Give an image of this camera.")
+        background = self.background(camera)
+        if background is not None:
+            background.know(depth)
+
+    def anew(self) -> Sensors:
+        """The same sensors for another run over the take, which know the same backgrounds."""
+        own = [self._sensors[name] for name in sorted(self._own)]
+        out = Sensors(self.rig, self.rate, self.sigma, self.settings, own)
+        out._backgrounds = self._backgrounds
+        return out
+
+    def _of_frame(self, frame: Frame) -> Sensor:
+        name = f"silhouette {frame.sensor}" if isinstance(frame, SilhouetteFrame) else frame.sensor
+        if name not in self._sensors:
+            self._sensors[name] = self._makers[type(frame)](frame.sensor)
+        return self._sensors[name]
+
+    def _keypoints(self, name: str) -> KeypointSensor:
+        s = self.settings
+        return KeypointSensor(self.rig, self.sigma, s.pixel, s.loss, s.near)
+
+    def _markers(self, name: str) -> MarkerSensor:
+        s = self.settings
+        return MarkerSensor(name, self.sigma.get(name, s.marker), s.loss, s.near)
+
+    def _depth(self, name: str) -> DepthImageSensor:
+        camera, s = self.rig[name], self.settings
+        return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
+
+    def _cloud(self, name: str) -> PointCloudSensor:
+        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings)
+
+    def _silhouette(self, name: str) -> SilhouetteSensor:
+        sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)
+        return SilhouetteSensor(self.rig[name], sigma, self.settings)
+
+
+def _check_measurement(m: Any) -> None:
+    if not isinstance(m, Measurement) or not isinstance(getattr(m, "sensor", None), str):
+        problem = f"a sensor's `prepare` gave a {type(m).__name__}"
+        raise ObservationError(problem, remedy="It must return a Measurement with the name of its `sensor`.")
+
+
+def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
+    """Time [s] of one step: as given, or the frames' mean.
+
+    Raises
+    ------
+    ObservationError
+        No frame, or a time that is not finite; what is no frame; a sensor that is not known.
+    """
+    names = [sensor.name for sensor in own]
+    for frame in frames:
+        if isinstance(frame, Frame | Measurement):
+            continue
+        if not isinstance(getattr(frame, "sensor", None), str):
+            kinds = ", ".join(kind.__name__ for kind in get_args(Frame))
+            problem = f"a {type(frame).__name__} among the frames"
+            raise ObservationError(problem, remedy=f"Give {kinds}, a Measurement, or a frame of a sensor of your own.")
+        if frame.sensor not in own._own:
+            raise ObservationError(choices("sensor", frame.sensor, names), remedy="Give it to the tracker: sensors=[...].")
+    if time is None:
+        time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
+    if not np.isfinite(time):
+        problem = "frames whose time is not finite" if len(frames) else "no frame"
+        raise ObservationError(problem, remedy="Give what the sensors saw, each with its time in seconds.")
+    return time
