@@ -13,7 +13,8 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Measurement, RowsOf
 from kinefit.subject.fit import fit_subject
-from kinefit.subject.parameters import CameraExtrinsics, OwnUnknowns, PointOffsets, SegmentScales
+from kinefit.subject.parameters import PointOffsets, SegmentScales
+from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 
 POST = np.array([0.3, -1.5, 0.3])
 
@@ -28,14 +29,14 @@ def within(subject, truth, bars=4.0):
 
 
 def test_lengths_and_keypoints_of_a_person_come_back_from_pixels():
-    """From 10 frames of four cameras; a bone that both its points lengthen looks the same as a longer one."""
+    """From 6 frames of four cameras; a bone that both its points lengthen looks the same as a longer one."""
     truth = grown(HUMANOID, 1)
     parameters = [SegmentScales(HUMANOID), PointOffsets(HUMANOID, "BODY_25B", 0.005)]
     shifts = np.random.default_rng(1).normal(scale=0.005, size=len(parameters[1].names))
     shifts *= np.sqrt(np.diag(parameters[1].information)) <= 1.0 / 0.005 + 1e-6
     body = HUMANOID.scaled(np.exp(truth))
     body = body.with_keypoints("BODY_25B", body.keypoints("BODY_25B").points + parameters[1].shifts(shifts))
-    states = measured.people(10)
+    states = measured.people(6)
     steps = measured.pixels(body, states)
     subject = fit_subject(HUMANOID, RIG, steps, measured.shaken(states), parameters, rounds=2)
     before = np.linalg.norm(HUMANOID.tree.offsets - body.tree.offsets, axis=1)
@@ -86,7 +87,7 @@ def test_where_a_load_cell_says_that_the_rope_pulls_its_length_has_a_bar():
     """Taut in three frames of twelve, with a person whose lengths are unknown, too."""
     truth, length = grown(ARM, 8, 0.03), 1.12
     body = ARM.scaled(np.exp(truth))
-    states = [s for s in measured.arms(400, seed=4) if reached(body, [s])[0] < length]
+    states = [s for s in measured.arms(3000, seed=4) if reached(body, [s])[0] < length]
     taut = sorted(states, key=lambda s: length - reached(body, [s])[0])[:3]
     assert np.all(np.abs(reached(body, taut) - length) < 0.003)
     states = [*taut, *states[:9]]
@@ -119,8 +120,8 @@ def test_cameras_that_were_moved_beside_markers():
     steps = [a + b for a, b in zip(seen, worn)]
     subject = fit_subject(HUMANOID, RIG, steps, states, [CameraExtrinsics(RIG, None, (0.01, 0.005))], rounds=2)
     assert within(subject, twists.ravel()).all()
-    assert np.abs(subject.mean - twists.ravel()).max() < 0.004
-    assert np.all(subject.std.reshape(4, 6)[:, 3:] < 0.001)
+    assert np.abs(subject.mean - twists.ravel()).max() < 0.006
+    assert np.all(subject.std.reshape(4, 6)[:, 3:] < 0.002)
     assert set(subject.excess) == {*RIG.names, "mocap"}
 
 
