@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kinefit.tracking.fusion import FusionTracker
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure
@@ -26,8 +27,6 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
 from kinefit.subject.silhouettes import fit_silhouettes
-from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.silhouette_take import silhouettes_of
 from kinefit.tracking.take import track_take
 
 STEPS, POSES = 100, 6
@@ -73,7 +72,7 @@ def first_motion(folder: Path) -> tuple[Rig, tuple[SilhouetteVideo, ...], list[B
         path.write_text(take_text(folder, "masks").replace("[take]\n", f"[take]\nframes = [0, {STEPS}]\n", 1))
         take = read_take(path)
         seen = load_observations(take)
-        masks, motion = silhouettes_of(take, seen), track_take(path)[0]
+        masks, motion = seen.silhouettes, track_take(path)[0]
     assert seen.rig is not None
     return seen.rig, masks, [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles)]
 

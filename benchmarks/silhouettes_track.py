@@ -19,7 +19,6 @@ from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import render_body, scaled
-from kinefit.tracking.silhouette_take import silhouettes_of
 from kinefit.tracking.take import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
@@ -80,7 +79,7 @@ def run() -> None:
         path.write_text(take_text(folder, "masks"))
         take = read_take(path)
         seen = load_observations(take)
-        masks = silhouettes_of(take, seen)
+        masks = seen.silhouettes
     assert seen.rig is not None
     motion = tracked(take_text(folder, "masks"))
     given = overlaps(motion, seen.rig, masks)

@@ -19,7 +19,7 @@ LEVELS = [
     {"correspondences"},
     {"solvers"},
     {"identification", "sensors"},
-    {"multiview"},
+    {"multiview", "frame"},
     {"initialization", "subject"},
     {"smoothing"},
     {"markers"},
@@ -33,7 +33,6 @@ LEVELS = [
 BESIDE = {
     ("motion", "bodies"), ("readers", "images"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
     ("subject", "initialization"),
-    ("smoothing", "tracking"), ("initialization", "tracking"), ("smoothing", "subject"),
 }
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from tests.oracle import central_differences, design
-from tests.sensors.test_silhouette import at, ring
+from tests.sensors.scenes import at, ring
 from tests.tracking.fusion_oracle import BODY, SENSOR, a_motion, a_rig, images, turned
 
 from kinefit.bodies import load_body
@@ -174,13 +174,13 @@ def test_evidence_and_residuals_by_segments():
     assert not told.lost.any() and told.quality[arm] > 0.9 and lost.lost[arm] and not lost.lost[0]
     aside = there.at(TRUTH.retract(np.r_[0.02 * a_rig()["depth"].T_camera_world[2, :3], np.zeros(22)]))
     for where, low, high in ((there, -0.004, 0.004), (aside, 0.008, 0.03)):
-        summary = match.summary(where)
+        summary = match.leftovers(where)[0]
         many = summary.count > 20
         assert many.sum() >= 5 and summary.count.sum() == len(match.points.weight) + len(match.samples.weight)
-        assert ((summary.median[many] > low) & (summary.median[many] < high)).all()
-        assert (summary.rms[many] >= np.abs(summary.median[many]) / 2).all()
-    empty = measured(depth=np.zeros((120, 160))).match(there, 0.05).summary(there)
-    assert (empty.count == 0).all() and np.isnan(empty.median).all() and np.isnan(empty.rms).all()
+        assert ((summary.values[:, 0][many] > low) & (summary.values[:, 0][many] < high)).all()
+        assert (summary.rms[many] >= np.abs(summary.values[:, 0][many]) / 2).all()
+    empty = measured(depth=np.zeros((120, 160))).match(there, 0.05).leftovers(there)[0]
+    assert (empty.count == 0).all() and np.isnan(empty.values).all() and np.isnan(empty.rms).all()
 
 
 def test_its_own_hidden_parts_are_found_anew_after_some_matches():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
-from tests.sensors.test_silhouette import at, ring
+from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import Morphing

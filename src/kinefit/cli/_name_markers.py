@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.bodies.marker_sets import find_marker_set, load_marker_set
+from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
 from kinefit.cli._screen import Step
 from kinefit.errors import ObservationError
 from kinefit.identification.model.files import load_model
@@ -136,7 +136,7 @@ def _together(models: list[MarkerModel], found: list[TakeIdentification], marker
 
 
 def _prefixed(name: str, label: str) -> str:
-    return f"{name}:{label.rpartition(':')[2]}"
+    return f"{name}:{bare(label)}"
 
 
 def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> str:

@@ -35,11 +35,12 @@ def warmup(verbose: bool) -> None:
 
 def _video() -> None:
     from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+    from kinefit.tracking.recording import Recording
     from kinefit.tracking.video import track
 
     motion = cut(squat_and_wave(), 0, 4)
     rig = studio_rig(motion)
-    track(rig, simulate_keypoints(motion, rig, "BODY_25B"), motion.body, up=motion.up)
+    track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig, "BODY_25B"), up=motion.up), motion.body)
 
 
 def _depth() -> None:
@@ -48,11 +49,11 @@ def _depth() -> None:
     from kinefit.motion import UP_AXES
     from kinefit.observations import DepthFrame
     from kinefit.simulation import KINECT, cut, in_front, simulate_depth, squat_and_wave
-    from kinefit.tracking.fusion import FusionTracker
+    from kinefit.tracking.tracker import Tracker
 
     motion = cut(squat_and_wave(), 0, 3)
     camera = in_front(motion, KINECT.camera(name="kinect"), near=KINECT.near, far=KINECT.far)
     video = simulate_depth(motion, camera, KINECT)
-    tracker = FusionTracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
+    tracker = Tracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
     for i in range(len(motion)):
         tracker.update([DepthFrame("kinect", motion.times[i], video.frame(i).depth)])

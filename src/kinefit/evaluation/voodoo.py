@@ -194,9 +194,9 @@ def voodoo_method(run: Sequence, inputs: Inputs, start: BodyState, settings: Set
 
 def fusion_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
     """The fusion tracker: a tree of hard joints, limits, robust weights, visibility."""
-    from kinefit.tracking.fusion import FusionTracker
+    from kinefit.tracking.tracker import Tracker
 
-    tracker = FusionTracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy)
+    tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy)
     tracker.start_at(start)
     found = [tracker.update(seen) for seen in run.seen(inputs)]
     return _motion(run, run.truth.body, [result.state for result in found if result is not None])

@@ -89,7 +89,8 @@ def known_points(
         pixels = [f for f in frames if isinstance(f, KeypointFrame)]
         told = [f for f in frames if isinstance(f, Measurement)]
         told += [keypoints.prepare(pixels, scene)] if pixels else []
-        told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in frames if isinstance(f, MarkerFrame)]
+        marked = [f for f in frames if isinstance(f, MarkerFrame)]
+        told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
     sets, places = [], [np.zeros((0, 3))]
     for m in told:
         hints = m.hints(scene)

@@ -10,11 +10,14 @@ import numpy as np
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
+from kinefit.frame.fit import FrameFit
+from kinefit.frame.results import FrameResult
+from kinefit.frame.routing import Sensors
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteMeasurement
-from kinefit.tracking.fused_fit import FusedFit, FusionResult
 
 
 class Level(NamedTuple):
@@ -41,7 +44,7 @@ _PATIENCE = 3  # times as many iterations in each level as a frame of a sequence
 class FarFit(NamedTuple):
     """What was found from afar: the judged pose, and its overlap 0..1 with the silhouettes (mean IoU)."""
 
-    result: FusionResult
+    result: FrameResult
     overlap: float
 
 
@@ -78,15 +81,18 @@ def coarse_to_fine(
         own = replace(
             settings, outline=level.side, far=level.far, near=level.near, angle=level.angle, iterations=steps
         )
-        fits.append(FusedFit(own_body, rig, 1.0, dict(accuracy or {}), own, {}))
+        first_scene = Scene(own_body, state, rig, samples=own.samples)
+        fits.append((FrameFit(own_body, own), Sensors(rig, 1.0, dict(accuracy or {}), own), first_scene))
     best: FarFit | None = None
     for first in range(len(levels) - 1, -1, -1):
         now = state
-        for fit in fits[first:]:
-            result, _ = fit.run(0.0, now, None, fit.measurements(frames, now))
+        for fit, sensors, scene in fits[first:]:
+            there = scene.at(now)
+            result = fit.run(there, None, sensors.measurements(frames, there)).result
             now = result.state
-        last = [m for m in fits[-1].measurements(frames, now) if isinstance(m, SilhouetteMeasurement)]
-        overlap = float(np.mean([m.overlap(now) for m in last]))
+        there = fits[-1][2].at(now)
+        last = [m for m in fits[-1][1].measurements(frames, there) if isinstance(m, SilhouetteMeasurement)]
+        overlap = float(np.mean([m.overlap(there) for m in last]))
         if best is None or overlap > best.overlap + _GAIN:
             best = FarFit(result, overlap)
     assert best is not None

@@ -10,20 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from kinefit.bodies import Body, BodyState
-from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.motion import UP_AXES, Motion
-from kinefit.observations import DepthFrame, Frame
+from kinefit.motion import Motion
+from kinefit.observations import Frame
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
-from kinefit.tracking.fusion import FusionTracker
-from kinefit.tracking.fusion_run import Sized, run_steps, sized_by_depth
-
-_SIZES = 4  # depth images that the person's size is found from ...
-_FIRST = 150  # ... among so many first ones
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.video import track
 
 
 def depth_fusion(
@@ -60,30 +54,7 @@ def depth_fusion(
     TrackingError
         The body is found in none of the first steps.
     """
-    times = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
-    known = np.flatnonzero(np.isfinite(times))
-    if not len(known):
-        raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
-    times = np.interp(np.arange(len(times)), known, np.array(times)[known])
-    found = Sized(body, None if start is None else (0, start))
-    if size and start is None:
-        found = _sized(steps, body, rig, np.array(UP_AXES[up]), progress)
-    tracker = FusionTracker(found.body, rig, rate=rate, accuracy=accuracy, up=UP_AXES[up], settings=settings)
-    return run_steps(
-        tracker, lambda i: steps[i], times, up=up, start=found.start, provenance=found.told, progress=progress
+    recording = Recording.of_frames(
+        steps, rig, rate=rate, sigma=accuracy, up=up, start=None if start is None else (0, start)
     )
-
-
-def _sized(
-    steps: Sequence[Sequence[Frame]], body: Body, rig: Rig, up: np.ndarray, progress: Progress | None
-) -> Sized:
-    """The body in the person's size, from images of the depth camera that comes first."""
-    shown = {i: f for i, seen in enumerate(steps[:_FIRST]) for f in seen if isinstance(f, DepthFrame)}
-    sensor = next((f.sensor for f in shown.values()), None)
-    mine = [i for i, f in shown.items() if f.sensor == sensor]
-    if sensor is None:
-        return Sized(body)
-    if progress:
-        progress("size", 0, 1)
-    chosen = {mine[k]: shown[mine[k]] for k in np.linspace(0, len(mine) - 1, min(_SIZES, len(mine))).astype(int)}
-    return sized_by_depth(body, chosen, rig[sensor], up)
+    return track(recording, body, size=size and start is None, smooth=False, settings=settings, progress=progress)

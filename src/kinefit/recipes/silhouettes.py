@@ -5,7 +5,7 @@
 3. Each point of it is paired with the nearest contour point (ICP), which stands for a ray of projection.
 4. The motor of the pose and the joint angles follow from (M X M̃) × L = 0 for all pairs at once; until nothing moves.
 
-The tracker (`FusionTracker` with `SilhouetteFrame`) beside it lets outlines glide along each other, looks which way
+The tracker (`Tracker` with `SilhouetteFrame`) beside it lets outlines glide along each other, looks which way
 they face, pairs in both directions, weighs outliers down, predicts, judges every segment, and fits any other sensor
 along.
 """

@@ -94,12 +94,13 @@ class Matched(ABC):
 
     Attributes
     ----------
-    sensor : name of the sensor
+    sensor, time : name of the sensor, and when [s] it measured; those of the measurement where they are not set
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     """
 
     sensor: str = ""
+    time: float = np.nan
     of_points: bool = True
     shows_surface: bool = False
 
@@ -205,13 +206,19 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
     ObservationError
         What a sensor's `match` gave is no match.
     """
-    matched = measurement.match(scene, reach)
+    matched = measurement.match(scene.at_time(measurement.time), reach)
     if not isinstance(matched, Matched):
         problem = f"`match` of sensor '{measurement.sensor}' gave a {type(matched).__name__}"
         raise ObservationError(problem, remedy="It must return a Matched, such as RowsOf(function).")
     if not matched.sensor:
         object.__setattr__(matched, "sensor", measurement.sensor)
+    object.__setattr__(matched, "time", measurement.time)
     return matched
+
+
+def rows_at(matched: Matched, scene: Scene) -> list[AnyRows]:
+    """Rows of a match, with the body where it is at the time of the measurement; see `check_rows` for errors."""
+    return check_rows(matched.rows(scene.at_time(matched.time)), matched.sensor, scene.body)
 
 
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:

@@ -10,23 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.correspondences import depth_image_rows, free_space_rows, surface_rows
+from kinefit.correspondences import depth_image_rows, surface_rows
 from kinefit.correspondences.free_space import FreeSpace
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.observations import DepthFrame
-from kinefit.rows import AnyRows, Rows
+from kinefit.rows import AnyRows
 from kinefit.sensors import _kernels_depth_image as kernels
 from kinefit.sensors.background import Background
-from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.depth_gate import gathered, person_view, window_of
-from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.occlusion import DepthSeen
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface import Surface
-from kinefit.sensors.surface_match import FreePairs, SegmentResiduals, SurfacePairs, by_segment
+from kinefit.sensors.surface_match import FreePairs, SurfacePairs
 from kinefit.sensors.visibility import judge_segments
 
 AGREES = 3.0  # standard deviations of a measurement that agrees
@@ -252,8 +250,8 @@ class DepthImageMatched(Matched):
         """Pixels for and against each segment; see `judge_segments`."""
         return self.measurement.evidence(scene)
 
-    def summary(self, scene: Scene) -> SegmentResiduals:
+    def leftovers(self, scene: Scene) -> list[Leftover]:
         """Distances [m] of what was measured from the surface, by segments."""
         both = [pairs.on_segments(scene) for pairs in (self.points, self.samples)]
         residual, segment = (np.concatenate([getattr(r, name) for r in both]) for name in ("residual", "segment"))
-        return by_segment(residual, segment, len(scene.body.tree.segments))
+        return [by_segments(self.sensor, scene.body, residual, segment, "m")]

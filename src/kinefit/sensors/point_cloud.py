@@ -2,81 +2,138 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from kinefit.bodies import BodyState
+import numpy as np
+
 from kinefit.correspondences import surface_rows
 from kinefit.observations import PointCloud
-from kinefit.rows import Rows
-from kinefit.sensors import _kernels_depth_image as kernels
+from kinefit.rows import AnyRows, Rows
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.depth_image import AGREES
-from kinefit.sensors.depth_view import DepthView, camera_at, splat, view_of
+from kinefit.sensors.depth_view import camera_at, splat, view_of
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface import Surface
+from kinefit.sensors.surface_match import SurfacePairs
 
 _PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
 
 
-class CloudMeasurement:
-    """Points on some surface, on the body, or on one segment of it (P2 2.3), towards the body's surface.
+class PointCloudSensor(Sensor):
+    """A scanner: points on some surface, on the body, or on one segment of it (P2 2.3), towards the body's surface.
 
     Parameters
     ----------
-    frame : PointCloud
-    surface, vertices, sigma, settings : see `DepthMeasurement`
-
-    Raises
-    ------
-    BodyError
-        A segment that the body does not have.
+    name : as its frames are named
+    sigma : float [m] standard deviation of a point.
+    settings : TrackSettings
     """
 
-    def __init__(
-        self, frame: PointCloud, surface: Surface, vertices: NDArray, sigma: float, settings: TrackSettings
-    ) -> None:
-        self.sensor, self.surface, self.sigma, self._eye = frame.sensor, surface, sigma, frame.viewpoint
-        self._segment = None if frame.segment is None else np.int64(surface.body.tree.segment(frame.segment))
+    def __init__(self, name: str, sigma: float, settings: TrackSettings) -> None:
+        self.name, self.sigma, self.settings = name, sigma, settings
+
+    def prepare(self, frame: PointCloud, scene: Scene) -> PointCloudMeasurement:
+        """The points about the body.
+
+        Raises
+        ------
+        BodyError
+            A segment that the body does not have; a body without surfaces.
+        """
+        return PointCloudMeasurement(self, frame, scene)
+
+
+class PointCloudMeasurement(Measurement):
+    """Points of one time.
+
+    Parameters
+    ----------
+    of : PointCloudSensor
+    frame : PointCloud
+    scene : Scene with the body where it is expected: points that may be another's are taken about it.
+
+    Attributes
+    ----------
+    points : (N, 3) [m]
+    """
+
+    settled = False
+
+    def __init__(self, of: PointCloudSensor, frame: PointCloud, scene: Scene) -> None:
+        s = of.settings
+        self.sensor, self.time, self.sigma, self._eye = of.name, frame.time, of.sigma, frame.viewpoint
+        self._segment = None if frame.segment is None else np.int64(scene.body.tree.segment(frame.segment))
         self._certain = frame.on_body or frame.segment is not None
-        x = frame.points
+        x, vertices = frame.points, scene.surface.posed(scene.state)
         if not self._certain:
-            low, high = vertices.min(axis=0) - settings.reach, vertices.max(axis=0) + settings.reach
+            low, high = vertices.min(axis=0) - s.reach, vertices.max(axis=0) + s.reach
             x = x[((x > low) & (x < high)).all(axis=1)]
-        every = max(len(x) // settings.points, 1)
-        self._points = np.ascontiguousarray(x[::every])
-        cells = np.floor(np.clip(self._points, -1e6, 1e6) / settings.patch).astype(np.int64)
+        self.points = np.array(x[:: max(len(x) // s.points, 1)], float)
+        cells = np.floor(np.clip(self.points, -1e6, 1e6) / s.patch).astype(np.int64)
         patches = len(np.unique(cells @ _PRIMES))
-        self._point_sigma = sigma * np.sqrt(max(len(self._points) / max(patches, 1), 1.0))
+        self._point_sigma = of.sigma * np.sqrt(max(len(self.points) / max(patches, 1), 1.0))
 
-    def rows(self, state: BodyState, bound: float) -> list[Rows]:
-        """One row a point; those known to be the body's are sought twice as far."""
-        bound = max(2.0 * bound if self._certain else bound, AGREES * self.sigma)
-        rows = self._near(state, bound)
-        kernels.soften(rows.data, bound / 2.0)
-        rows.group[:] = -1  # softened already
-        return [rows]
+    def match(self, scene: Scene, reach: float) -> PointCloudMatched:
+        """Nearest points of the surface; for points known to be the body's twice as far."""
+        bound = max(2.0 * reach if self._certain else reach, AGREES * self.sigma)
+        return PointCloudMatched(self, SurfacePairs.nearest(self._near(scene, bound), self.points, scene, bound / 2.0))
 
-    def _near(self, state: BodyState, reach: float) -> Rows:
+    def _near(self, scene: Scene, reach: float) -> Rows:
         return surface_rows(
-            self.surface.body, state, self._points, max_distance=reach, sigma=self._point_sigma, viewpoint=self._eye,
-            segment=self._segment,
+            scene.body, scene.state, self.points, max_distance=reach, sigma=self._point_sigma, viewpoint=self._eye,
+            segment=self._segment, frames=scene.frames,
         )  # fmt: skip
 
-    def evidence(self, state: BodyState) -> Evidence:
+    def evidence(self, scene: Scene) -> Evidence:
         """For a segment, as much as there are points near it, of those that its share of the surface should have."""
-        rows = self._near(state, AGREES * self.sigma)
-        count, none = len(self._points), np.zeros(len(self.surface.areas))
+        rows, areas = self._near(scene, AGREES * self.sigma), scene.surface.areas
+        count, none = len(self.points), np.zeros(len(areas))
         if self._segment is not None:
             share, told = len(rows) / max(count, 1), Evidence(none, none.copy())
             told.agreeing[self._segment], told.contrary[self._segment] = share, (1.0 - share) * bool(count)
             return told
-        expected = np.maximum(count * self.surface.areas / max(self.surface.areas.sum(), 1e-12), 1.0)
+        expected = np.maximum(count * areas / max(areas.sum(), 1e-12), 1.0)
         return Evidence(np.minimum(np.bincount(rows.segment, minlength=len(none)) / expected, 1.0), none)
 
-    def view(self) -> DepthView | None:
+    def hints(self, scene: Scene) -> Hints:
         """The points as a camera at the sensor would show them."""
-        if not len(self._points):
-            return None
-        coarse, small = splat(self._points, camera_at(self._points, self._eye))
-        return view_of(coarse, coarse > 0, small) if (coarse > 0).any() else None
+        if not len(self.points):
+            return Hints()
+        coarse, small = splat(self.points, camera_at(self.points, self._eye))
+        return Hints(view=view_of(coarse, coarse > 0, small) if (coarse > 0).any() else None)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloudMatched(Matched):
+    """A cloud with its correspondences.
+
+    Parameters
+    ----------
+    measurement : PointCloudMeasurement
+    pairs : SurfacePairs of points and the nearest ones of the surface
+    """
+
+    measurement: PointCloudMeasurement
+    pairs: SurfacePairs
+    of_points = False
+    shows_surface = True
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the cloud's sensor."""
+        return self.measurement.sensor
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """One row a point."""
+        return [self.pairs.rows(scene)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """For a segment, as much as there are points near it, of those that its share of the surface should have."""
+        return self.measurement.evidence(scene)
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Distances [m] of the points from the surface, by segments."""
+        rows = self.pairs.on_segments(scene)
+        return [by_segments(self.sensor, scene.body, rows.residual, rows.segment, "m")]

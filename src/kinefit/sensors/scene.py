@@ -66,7 +66,7 @@ class Scene:
 
     def at_time(self, time: float) -> Scene:
         """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own."""
-        if self.velocity is None or abs(time - self.time) < 1e-9:
+        if self.velocity is None or not abs(time - self.time) > 1e-9:
             return self
         return self.at(self.state.retract((time - self.time) * self.velocity), time=time)
 

@@ -32,7 +32,7 @@ class TrackSettings:
         measurements count as there are patches.
     render_every : int
         Iterations after which the body's own hidden parts are found anew.
-    depth, pixel, marker, silhouette : float [m], [px], [m], [px]
+    depth, pixel, marker, silhouette, line : float [m], [px], [m], [px], [px]
         Standard deviation of a sensor that none is given for.
     outline : int [px]
         Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
@@ -88,6 +88,7 @@ class TrackSettings:
     pixel: float = 4.0
     marker: float = 0.005
     silhouette: float = 4.0
+    line: float = 2.0
     outline: int = 320
     angle: float = 1.0
     background: float = 0.5

@@ -19,33 +19,6 @@ from kinefit.sensors.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentResiduals:
-    """Residuals of a surface or an outline by segments.
-
-    Parameters
-    ----------
-    median : (S,) signed [m] or [px], above 0 where the measurement lies outside the body; NaN where there is none.
-    rms : (S,) root mean square, in the same unit; NaN where there is none.
-    count : (S,) int
-    """
-
-    median: NDArray
-    rms: NDArray
-    count: NDArray
-
-
-def by_segment(residual: NDArray, segment: NDArray, segments: int) -> SegmentResiduals:
-    """Residuals (N,) of segments (N,) int for each of a number of segments."""
-    count = np.bincount(segment, minlength=segments)
-    median, rms = np.full((2, segments), np.nan)
-    order = np.argsort(segment, kind="stable")
-    for s, own in enumerate(np.split(residual[order], np.cumsum(count)[:-1])):
-        if len(own):
-            median[s], rms[s] = np.median(own), np.sqrt(np.mean(own**2))
-    return SegmentResiduals(median, rms, count)
-
-
-@dataclass(frozen=True, eq=False)
 class SurfacePairs:
     """N measured points, each with the point of the surface that it belongs to: point to plane (P2 2.3).
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, DofRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by
+from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.equations import normal_equations
@@ -76,25 +76,30 @@ class OtherSensors:
         """A stretch of it."""
         return replace(self, times=self.times[frames], measurements=self.measurements[frames])
 
-    def scene(self, f: int, state: BodyState) -> Scene:
-        """Of one frame."""
-        return self.scene_of(state, float(self.times[f])).at(state, measurements=self.measurements[f])
+    def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
+        """Of one frame of states (T, 4, 4), (T, D), with the velocity that they have there."""
+        state, (a, b) = BodyState(roots[f], angles[f]), (max(f - 1, 0), min(f + 1, len(roots) - 1))
+        velocity = None
+        if b > a:
+            step = BodyState(roots[a], angles[a]).difference(BodyState(roots[b], angles[b]))
+            velocity = step / max(float(self.times[b] - self.times[a]), 1e-6)
+        scene = self.scene_of(state, float(self.times[f]))
+        return scene.at(state, measurements=self.measurements[f], velocity=velocity)
 
     def linearised(self, body: Body, roots: NDArray, angles: NDArray) -> Linearised:
         """All frames matched and linearised about states (T, 4, 4), (T, D)."""
         T, n = len(roots), body.tree.n_dofs
         H, g, cost, rows, matches = np.zeros((T, n, n)), np.zeros((T, n)), np.zeros(T), np.zeros(T), []
         for f in range(T):
-            state = BodyState(roots[f], angles[f])
-            scene = self.scene(f, state)
+            scene = self.scene(f, roots, angles)
             matched = tuple(matched_by(m, scene, self.reach) for m in self.measurements[f])
             matches.append(matched)
-            parts = [weaker(r, self.scale.get(m.sensor, 1.0)) for m in matched for r in m.rows(scene)]
+            parts = [weaker(r, self.scale.get(m.sensor, 1.0)) for m in matched for r in rows_at(m, scene)]
             rows[f] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)
             if parts:
-                equations = normal_equations(body, state, parts)
+                equations = normal_equations(body, scene.state, parts)
                 H[f], g[f], cost[f] = equations.matrix, equations.gradient, equations.cost
         return Linearised(H, g, cost, np.array(roots), np.array(angles), tuple(matches), rows)
 

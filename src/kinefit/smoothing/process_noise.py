@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, PointSet
 from kinefit.losses import Loss
+from kinefit.sensors.base import rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
@@ -196,9 +197,9 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
     for take in takes:
         assert take.others is not None and take.linear is not None
         for f, matched in enumerate(take.linear.matched):
-            scene = take.others.scene(f, BodyState(take.roots[f], take.angles[f]))
+            scene = take.others.scene(f, take.roots, take.angles)
             for m in matched:
-                for rows in m.rows(scene):
+                for rows in rows_at(m, scene):
                     square, factor = squares_of(rows)
                     squares.setdefault(m.sensor, []).append(square[factor > INLIER])
     told = {name: np.concatenate(parts) for name, parts in squares.items()}

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body
 from kinefit.rows import DofRows, Rows
-from kinefit.sensors.base import Matched
+from kinefit.sensors.base import Matched, rows_at
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.solvers.equations import design
 
@@ -73,18 +73,18 @@ def other_noise(
     shifts: list[list[tuple[str, NDArray]]] = []
     counts: dict[str, list[int]] = {}
     for f in range(T):
-        state, push, moved = BodyState(roots[f], angles[f]), list[tuple[str, NDArray]](), list[tuple[str, NDArray]]()
-        scene = others.scene(f, state)
+        push, moved = list[tuple[str, NDArray]](), list[tuple[str, NDArray]]()
+        scene = others.scene(f, roots, angles)
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
-            for part, rows in enumerate(m.rows(scene)):
+            for part, rows in enumerate(rows_at(m, scene)):
                 if not isinstance(rows, Rows | DofRows) or not len(rows):
                     continue
-                J, w = design(body, state, rows), rows.weight * squares_of(rows)[1] / scale**2
+                J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
                 weighted = J * w[:, None]
                 information[f] += J.T @ weighted
-                by_segment = not m.of_points and isinstance(rows, Rows)
-                names = rows.segment if by_segment else np.arange(len(rows))
+                single = m.of_points or isinstance(rows, DofRows)
+                names = np.arange(len(rows)) if single else rows.segment
                 counts.setdefault(m.sensor, []).append(len(np.unique(names)))
                 mine = channels.setdefault(m.sensor, {})
                 for c in np.unique(names):

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.multiview.observability import SHORTEST, levers, near
+from kinefit.sensors.base import Matched
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.left_right import find_swaps, limb_groups
-from kinefit.sensors.results import BLIND, FrameResult, judged
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
@@ -82,13 +83,13 @@ def smooth_results(
         take, _ = _solve(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     fitted = take.fitted(take.roots, take.angles)
-    # Outliers and quality are judged by the stated standard deviations, as for a single frame: they compare between takes.
+    # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
     took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
     weight = take.confidence / np.square(channels.sigma)
     smoothed = []
     for f, result in enumerate(results):
         state = BodyState(take.roots[f], take.angles[f])
-        matched = tuple(
+        matched: tuple[Matched, ...] = tuple(
             replace(m, uv=np.where(weight[f][:, None] > 0, take.uv[f], np.nan), weight=weight[f], swapped=swapped[f])
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
@@ -140,7 +141,7 @@ def _take(
 
 
 def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
-    """Coordinates (F, D) that each frame observes by itself: by all sensors, by all but keypoints; rows of the latter."""
+    """Coordinates (F, D) that each frame observes: by all sensors, by all but keypoints; rows of the latter (F,)."""
     tree, (T, D) = take.body.tree, take.angles.shape
     packed, _, _ = take.seen(channels.sigma).equations(take.body)(take.roots, take.angles)
     more = np.zeros((T, tree.n_dofs, tree.n_dofs))

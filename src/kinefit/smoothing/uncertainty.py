@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.results import ANYWHERE, FrameResult
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.solvers.equations import inverse

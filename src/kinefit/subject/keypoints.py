@@ -33,20 +33,24 @@ class Subject:
     """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
 
     `shape` tells from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a
-    body that was given.
+    body that was given. `length_share` (G,) is each scale's standard deviation over it, where other sensors told it.
     """
 
     body: Body
     scales: NDArray
     shape: Shape | None = None
     covariance: NDArray | None = None
+    length_share: NDArray | None = None
 
     @property
     def length_std(self) -> dict[str, float]:
         """[m] standard deviation of each length, from one segment's joint to the next's: "thigh_l-shank_l"."""
-        if self.covariance is None:
+        share = self.length_share
+        if self.covariance is not None:
+            share = np.sqrt(np.diag(self.covariance)[: len(self.scales)]) / self.scales
+        if share is None:
             return {}
-        tree, share = self.body.tree, np.sqrt(np.diag(self.covariance)[: len(self.scales)]) / self.scales
+        tree = self.body.tree
         lengths = np.linalg.norm(tree.offsets, axis=1)
         return {
             f"{tree.segments[p]}-{tree.segments[s]}": float(lengths[s] * share[self.body.segment_scale[p]])

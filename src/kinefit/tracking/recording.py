@@ -1,4 +1,4 @@
-"""A recording: what all sensors saw at each of its times, from a take, from arrays in memory, or kept of a live session."""
+"""A recording: what all sensors saw at each of its times, from a take or from arrays in memory."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ class Recording:
     sigma : {sensor: standard deviation}, [px] of cameras' keypoints and of "silhouette CAMERA", else [m]
     sensors : of one's own, see `kinefit.sensors.base`
     markers : labelled recordings among what the steps show, whole, for the subject fit
+    marker_sets : of each, its marker set on the body, and how far [m] each marker may sit elsewhere; None for nowhere
     depth : some of the first images of the depth sensor that comes first, by step, for the subject fit
     on_body : depth cameras whose images show nothing but the body
     backgrounds : {depth camera: (H, W) [m]} of the empty scene
@@ -54,6 +55,7 @@ class Recording:
     keypoint_sigma: tuple[float, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     markers: tuple[Markers, ...] = ()
+    marker_sets: tuple[tuple[str, NDArray | None], ...] = ()
     depth: Mapping[int, DepthFrame] = field(default_factory=dict)
     on_body: tuple[str, ...] = ()
     backgrounds: Mapping[str, NDArray] = field(default_factory=dict)
@@ -90,7 +92,8 @@ class Recording:
             Nobody is seen in any frame.
         """
         if not keypoints:
-            raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+            remedy = "Name at least one [[keypoints]] in the take."
+            raise ObservationError("there are no keypoints to track", remedy=remedy)
         lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
         if len(lengths) > 1 or len(rates) > 1:
             told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
@@ -140,7 +143,7 @@ class Recording:
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
-        """Some of its steps."""
+        """A stretch of its steps."""
         first = range(len(self))[frames].start
         return replace(
             self, times=self.times[frames], steps=lambda i: self.steps(i + first),

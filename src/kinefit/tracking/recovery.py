@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
+from kinefit.frame.prediction import forgetting
+from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.base import Measurement
-from kinefit.sensors.results import ANYWHERE, FrameResult
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
-from kinefit.tracking.prediction import forgetting
 
 if TYPE_CHECKING:
     from kinefit.tracking.tracker import Tracker

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
+from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
-from kinefit.sensors.results import FrameResult
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.recording import Recording
@@ -87,7 +85,7 @@ def run(
         left[i] = [rest for m in found.matched for rest in m.leftovers(scene)]
         pixels_only = tuple(m for m in found.matched if isinstance(m, KeypointMatched))
         kept[i] = tuple(m.compact() for m in found.measurements if not isinstance(m, KeypointMeasurement))
-        return replace(found, time=float(times[i]), matched=pixels_only, measurements=())
+        return replace(found, matched=pixels_only, measurements=())
 
     stopped = False
     try:
@@ -105,7 +103,7 @@ def run(
         first = min(results)
         back = tracker.backwards(results[first].state)
         for i in range(first - 1, -1, -1):
-            again = step(back, i, float(-times[i]))
+            again = step(back, i, float(times[i]))
             assert again is not None
             results[i] = again
             if progress:

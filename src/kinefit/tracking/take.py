@@ -6,56 +6,54 @@ from os import PathLike
 
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError
+from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
+from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
+from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Subject, fit_subject
-from kinefit.tracking.fusion_take import fuse_take
-from kinefit.tracking.tracker import Settings
+from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import Progress, track
 
 
 def track_take(
-    take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False, settings: Settings | None = None,
-    progress: Progress | None = None,
+    take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
+    settings: TrackSettings | None = None, progress: Progress | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file; `smooth` and `contacts` as in `track`.
-
-    A take with depth, stereo, silhouettes or markers is fused frame by frame from all of its sensors (`fuse_take`),
-    any other is fitted to the keypoints of its cameras.
+    """Track the person of a take file in all that its sensors saw; `smooth` and `contacts` as in `track`.
 
     Returns the motion and what the sensors saw (for overlays).
 
     Raises
     ------
     TakeError
-        The take has no keypoints, or its subject's trial has another body.
+        Nothing in the take tells where the person is, or its subject's trial has another body.
     KinefitError
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
-    if take.depth or take.stereo or take.silhouettes or take.markers:
-        observations = load_observations(take)
-        return fuse_take(take, observations, progress=progress), observations
-    body, observations = load_body(take.body), load_keypoints(take)
-    assert observations.rig is not None
+    seen = with_names(take, load_observations(take), progress=progress)
+    body = load_body(take.body) if take.start is None else read_motion(take.start).body
+    alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines
+    if take.silhouettes and not alone:
+        raise TakeError(
+            "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
+            remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
+        )  # fmt: skip
+    if not alone:
+        raise TakeError(
+            "the take has no [[keypoints]], nor any other sensor", file=take.path,
+            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+        )  # fmt: skip
+    recording, body = recording_of(take, seen, body)
     motion = track(
-        observations.rig,
-        observations.keypoints,
-        body,
-        accuracy=[entry.sigma for entry in take.keypoints],
-        trial=trial_of(take),
-        contacts=contacts,
-        smooth=smooth,
-        settings=settings,
-        height=take.height,
-        up=take.up,
-        name=take.name,
-        progress=progress,
-    )
-    return motion, observations
+        recording, body, trial=trial_of(take), height=take.height, size=take.start is None, smooth=smooth,
+        contacts=contacts, settings=settings, progress=progress,
+    )  # fmt: skip
+    return motion, seen
 
 
 def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:

@@ -13,18 +13,18 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
 from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.frame.fit import Fitted, FrameFit
+from kinefit.frame.prediction import Prediction
+from kinefit.frame.results import FrameResult
+from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
-from kinefit.sensors.results import FrameResult
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fit import Fitted, FrameFit
-from kinefit.tracking.prediction import Prediction
 from kinefit.tracking.recovery import Recovery
-from kinefit.tracking.routing import Sensors, time_of
 
 __all__ = ["FrameResult", "TrackSettings", "Tracker"]
 
@@ -64,6 +64,7 @@ class Tracker:
         self.dropped = self.late = 0
         self._last: FrameResult | None = None
         self._time: float | None = None
+        self._direction = 1.0  # of time
         self._wear(body)
 
     def _wear(self, body: Body) -> None:
@@ -119,7 +120,7 @@ class Tracker:
             self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings,
             values=self.values,
         )  # fmt: skip
-        out.sensors = self.sensors.anew()
+        out.sensors, out._direction = self.sensors.anew(), -1.0
         out.start_at(state)
         return out
 
@@ -201,19 +202,20 @@ class Tracker:
         return self._fit.apart(scene)
 
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
-        scene = self._scene.at(state, time=time, velocity=self._prediction.velocity * self.rate)
+        scene = self._scene.at(state, time=time, velocity=self._direction * self.rate * self._prediction.velocity)
         measurements = self.sensors.measurements(frames, scene)
         return scene.at(state, measurements=tuple(measurements)), measurements
 
     def _steps(self, time: float) -> float | None:
         """Frames since the last update, which is remembered; None for one that came too late."""
         s, before = self.settings, self._time
-        steps = 1.0 if before is None else (time - before) * self.rate
-        if before is not None and -s.pause < time - before <= 0.0:
+        gone = 0.0 if before is None else self._direction * (time - before)  # [s]
+        steps = 1.0 if before is None else gone * self.rate
+        if before is not None and -s.pause < gone <= 0.0:
             self.late += 1
             return None
         self._time = time
-        if before is not None and abs(time - before) > s.pause:
+        if before is not None and abs(gone) > s.pause:
             self._recovery.forget()
             if self._prediction.state is not None:
                 self._prediction.start(self._prediction.state)

@@ -9,9 +9,9 @@ import numpy as np
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
+from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover
-from kinefit.sensors.results import FrameResult
+from kinefit.sensors.base import Leftover, Matched
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.sensor_noise import other_noise
@@ -64,7 +64,8 @@ def track(
         Ctrl-C after at least one tracked frame.
     """
     if contacts and not smooth:
-        raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need the whole take.")
+        remedy = "Leave smooth as it is: contacts need the whole take."
+        raise ObservationError("contacts without smoothing", remedy=remedy)
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     settings = settings or TrackSettings()
@@ -95,9 +96,9 @@ def _motion(
     if any(tracked.measurements):
         others = OtherSensors(
             times, tuple(tracked.measurements), tracker.scene_of, tracker.apart, settings.near,
-            {name: 1.0 for name in {m.sensor for several in tracked.measurements for m in several}},
+            dict.fromkeys({m.sensor for several in tracked.measurements for m in several}, 1.0),
         )  # fmt: skip
-    matched = None
+    matched: tuple[tuple[Matched, ...], ...] | None = None
     if smooth:
         done = smooth_results(
             body, channels, results, rate, settings, tracker.scene_of, others=others, contacts=contacts,
@@ -105,7 +106,7 @@ def _motion(
         )  # fmt: skip
         results, take, weight = done.results, done.take, done.weight
         provenance["smoothing"] = done.provenance
-        others, matched = take.others, take.linear and take.linear.matched
+        others, matched = take.others, None if take.linear is None else take.linear.matched
         leftovers = [
             [rest for m in r.matched for rest in m.leftovers(tracker.scene_of(r.state, r.time))] for r in results
         ]

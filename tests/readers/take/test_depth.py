@@ -153,3 +153,20 @@ def test_depth_beside_video_keeps_the_cameras_first(folder, data_dir):
     assert (seen.rig.names, seen.rate, seen.frames, seen.depth[0].rate) == (("cam03", "tof"), 60.0, (0, 100), 60.0)
 
 
+
+
+def test_clouds_on_one_segment(folder):
+    (folder / "c").mkdir()
+    (folder / "c" / "1.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+        "end_header\n0 0 1\n0.1 0 1\n"
+    )
+    more = '[[depth]]\nname = "tof"\nfile = "c"\nsegment = "forearm_l"\n'
+    seen = load(folder, None, "rate = 10", more)
+    frame = seen.clouds[0].frame(0)
+    assert (frame.segment, frame.on_body, len(frame)) == ("forearm_l", True, 2)
+    assert seen.recordings == seen.clouds
+    with pytest.raises(TakeError, match="'background' has no use with clouds"):
+        load(folder, None, "rate = 10", more + 'background = "empty"\n')
+    with pytest.raises(TakeError, match="'segment' is of clouds of points"):
+        load(folder, ALONE + 'rate = 15\nsegment = "forearm_l"\n')

@@ -210,7 +210,9 @@ WRONG = {
     "empty with head": ('[take]\nname = "x"', "an empty take"),
     "no calibration": ('[[camera]]\nname = "a"', "cameras without calibration"),
     "unknown set": (take_text(keys='set = "BODY_26"'), "no keypoint set 'BODY_26'; there are: BODY_25B"),
-    "set of another detector": (take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe .COCO_17"),
+    "set of another detector": (
+        take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe 'COCO_17'"
+    ),
     "frames": (take_text(head="frames = [9, 2]"), r"frames \[9, 2\]"),
     "height in cm": (take_text(head="height = 175"), "height 175 m"),
     "rate": (take_text(head="rate = -1"), "rate -1 Hz"),

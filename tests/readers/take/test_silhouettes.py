@@ -9,7 +9,6 @@ from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.silhouettes import read_silhouettes
-from kinefit.tracking.silhouette_take import silhouettes_of
 from kinefit.tracking.take import track_take
 
 
@@ -85,7 +84,7 @@ def test_a_take_with_silhouettes_alone(tmp_path):
     assert told.silhouettes[0].sigma == 2.0
     seen = load_observations(told)
     assert (seen.rate, seen.frames, len(seen.silhouettes)) == (30.0, (0, 3), 1)
-    (video,) = silhouettes_of(told, seen)
+    (video,) = seen.silhouettes
     assert video.frame(0).mask[20, 12] == 255
 
 

@@ -17,6 +17,7 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import PointPixels
 from kinefit.solvers.shape import PixelFrames
 from kinefit.subject.keypoints import Subject, fit_subject
+from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
 Progress = Callable[[str, int, int], None]
@@ -103,9 +104,8 @@ def sight(
     alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
     channels = make_channels(body, rig, alone, choose_people(rig, alone), [accuracy] * len(alone))
     subject = fit_subject(body, channels)
-    motion = track(
-        rig, alone, body, accuracy=accuracy, subject=subject, up=up, smooth=False, progress=progress
-    )
+    recording = Recording.of_keypoints(rig, alone, accuracy=accuracy, up=up)
+    motion = track(recording, body, subject=subject, smooth=False, progress=progress)
     uv = np.concatenate([motion.residuals[name].measured for name in channels.sources], axis=1)
     own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)
     confidence = np.where(own, channels.confidence, channels.confidence[:, channels.partner])

@@ -203,6 +203,7 @@ def _files(take: Take) -> None:
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
     named += [("[take] subject", take.subject), ("[take] start", take.start)]
     named += [("markers", entry.file) for entry in take.markers]
+    named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]

@@ -85,6 +85,7 @@ class MarkersEntry(_Entry, frozen=True, kw_only=True):
     file: Path
     unit: str | None = None  # where the file does not tell it
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
+    model: Path | None = None  # of the subject, for markers without names; default: they have names
     time_offset: float = 0.0  # [s]
     sigma: float = 0.005  # [m] standard deviation
 

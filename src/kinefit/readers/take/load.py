@@ -79,7 +79,7 @@ class Observations:
     notes: tuple[str, ...] = ()
 
     @property
-    def videos_of_frames(self) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | KeypointVideo | LineVideo, ...]:
+    def recordings(self) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | KeypointVideo | LineVideo, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: depth, clouds, silhouettes, skin, lines."""
         return (*self.depth, *self.clouds, *self.silhouettes, *self.skin, *self.lines)
 
@@ -125,13 +125,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
     skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None})
     lines = load_lines(take, images, rates)
-    rates |= {f"lines {video.sensor}": video.rate for video in lines}
     recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
     if not (lengths or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
     check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
-    own = [*(recording.rate for recording in recordings), *(m.rate for m in markers)]
+    own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
     rate = take.rate or next(iter(rates.values()), None) or own[0]
     if lengths:
         frames = common_frames(lengths, offsets, rate, take.frames, file=take.path)

@@ -1,8 +1,9 @@
-"""Silhouettes in files: masks as pictures, and those of the built-in detector."""
+"""Silhouettes of a take: masks in files, by a video's background or the body's colour, of the built-in detector."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -12,12 +13,15 @@ from numpy.typing import NDArray
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
+from kinefit.images.silhouette_background import BackgroundPlate
 from kinefit.observations import Detections, SilhouetteVideo
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
+_SIDE = 1000  # [px] of a picture that its background is taken from: larger ones are made smaller by a whole number
+_LEARNT = 30  # pictures of a video from which its background is learnt
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
@@ -62,7 +66,7 @@ def read_silhouettes(
 def load_silhouettes(
     take: Take, rig: Rig | None, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
 ) -> tuple[SilhouetteVideo, ...]:
-    """All `[[silhouette]]` of a take that are in files, masks and the detector's; `rates` [Hz] of its other streams.
+    """All `[[silhouette]]` of a take, in its order; `rates` [Hz] of its other streams.
 
     Raises
     ------
@@ -73,8 +77,6 @@ def load_silhouettes(
     """
     out = []
     for entry in take.silhouettes:
-        if entry.format == "background":
-            continue  # what is behind the body is learnt by whoever follows it
         try:
             out.append(_silhouettes(entry, take, rig, images[entry.camera], rates))
         except KinefitError as error:
@@ -104,6 +106,11 @@ def _silhouettes(
         )  # fmt: skip
     if entry.format == "threshold":
         return _coloured(entry, camera, size, frame)
+    if entry.format == "background":
+        assert camera.video is not None
+        scene = _BeforeBackground(camera.video, entry.file, size, frame)
+        times = offset + np.arange(len(scene.video)) / scene.video.rate
+        return SilhouetteVideo(entry.camera, scene.video.rate, times, size, scene.mask, str(camera.video))
     found = read_detections(entry.file or detections_file(take.path, entry.camera))
     times = offset + np.arange(len(found)) / found.rate
     return SilhouetteVideo(
@@ -133,6 +140,38 @@ def _coloured(
 
     times = camera.time_offset + np.arange(len(video)) / video.rate
     return SilhouetteVideo(entry.camera, video.rate, times, size, image, str(camera.video))
+
+
+class _BeforeBackground:
+    """Masks of a video before its background, which is learnt when it is first asked for."""
+
+    def __init__(self, video: Path, plate: Path | None, size: tuple[int, int], frame: ImageFrame) -> None:
+        self.video, self._file, self._size, self._frame = Video(video), plate, size, frame
+        if plate is not None:
+            assert self.plate  # told now where it does not fit
+
+    @cached_property
+    def plate(self) -> BackgroundPlate:
+        if self._file is not None:
+            picture = cv2.imread(str(self._file), cv2.IMREAD_COLOR)
+            if picture is None:
+                raise FileError("not a picture, or damaged", file=self._file, remedy="Give a PNG or JPEG.")
+            if picture.shape[1::-1] != self.video.size:
+                problem = f"the background has {picture.shape[1::-1]} px, the video {self.video.size}"
+                raise ObservationError(problem, file=self._file, remedy="Take it with the same camera and settings.")
+            return BackgroundPlate(self._smaller(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))
+        chosen = np.unique(np.linspace(0, len(self.video) - 1, _LEARNT).astype(int))
+        return BackgroundPlate.of(self._smaller(self.video.read(int(i))) for i in chosen)
+
+    def _smaller(self, picture: NDArray) -> NDArray:
+        by = -(-max(self.video.size) // _SIDE)
+        size = self.video.size[0] // by, self.video.size[1] // by
+        return picture if by == 1 else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+    def mask(self, i: int) -> NDArray:
+        mask = self.plate.mask(self._smaller(self.video.read(i)))
+        mask = cv2.resize(mask, self.video.size, interpolation=cv2.INTER_LINEAR)
+        return in_calibration(mask, self._size, self._frame)
 
 
 def _everybody(found: Detections, i: int) -> NDArray:

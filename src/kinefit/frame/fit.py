@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.frame.prediction import belief
+from kinefit.frame.results import FrameResult, judged
 from kinefit.rows import AnyRows, ParameterRows
-from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
-from kinefit.sensors.results import FrameResult, judged
+from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
-from kinefit.tracking.prediction import belief
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
@@ -84,7 +84,7 @@ class FrameFit:
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
     ) -> list[AnyRows]:
         """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart."""
-        parts = [rows for m in matched for rows in check_rows(m.rows(scene), m.sensor, self.body)]
+        parts = [rows for m in matched for rows in rows_at(m, scene)]
         if held is not None:
             parts.append(belief(scene.state, *held))
         usual = self.body.tree.usual

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.frame.prediction import Prediction, belief, forgetting
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import normal_equations
-from kinefit.tracking.prediction import Prediction, belief, forgetting
 
 BODY = load_body("arm")
 N = BODY.tree.n_dofs

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, SilhouetteFrame
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, LineFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.sensors.background import Background
 from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.image_lines import ImageLineSensor
 from kinefit.sensors.keypoints import NAME as KEYPOINTS
 from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.markers import MarkerSensor
@@ -59,7 +60,7 @@ class Sensors:
         self._backgrounds: dict[str, Background | None] = dict.fromkeys(on_body)
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
-            PointCloud: self._cloud, SilhouetteFrame: self._silhouette,
+            PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -122,7 +123,8 @@ class Sensors:
         return out
 
     def _of_frame(self, frame: Frame) -> Sensor:
-        name = f"silhouette {frame.sensor}" if isinstance(frame, SilhouetteFrame) else frame.sensor
+        kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
+        name = kind + frame.sensor
         if name not in self._sensors:
             self._sensors[name] = self._makers[type(frame)](frame.sensor)
         return self._sensors[name]
@@ -141,6 +143,10 @@ class Sensors:
 
     def _cloud(self, name: str) -> PointCloudSensor:
         return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings)
+
+    def _lines(self, name: str) -> ImageLineSensor:
+        s, own = self.settings, f"lines {name}"
+        return ImageLineSensor(own, self.sigma.get(own, s.line), s.loss, s.near)
 
     def _silhouette(self, name: str) -> SilhouetteSensor:
         sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)
@@ -170,7 +176,8 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
             problem = f"a {type(frame).__name__} among the frames"
             raise ObservationError(problem, remedy=f"Give {kinds}, a Measurement, or a frame of a sensor of your own.")
         if frame.sensor not in own._own:
-            raise ObservationError(choices("sensor", frame.sensor, names), remedy="Give it to the tracker: sensors=[...].")
+            remedy = "Give it to the tracker: sensors=[...]."
+            raise ObservationError(choices("sensor", frame.sensor, names), remedy=remedy)
     if time is None:
         time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
     if not np.isfinite(time):

@@ -1,0 +1,1 @@
+"""One time: what the sensors saw becomes measurements, is fitted, and judged."""

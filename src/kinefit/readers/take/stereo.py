@@ -1,0 +1,69 @@
+"""Stereo pairs of a take as recordings of depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError, KinefitError, TakeError
+from kinefit.images.stereo import StereoRectifier
+from kinefit.observations import DepthVideo
+from kinefit.readers.take.entries import StereoEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+from kinefit.readers.video import Video
+
+_TYPICAL = 0.67  # share of the range at which a standard deviation of disparity becomes one of depth
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A stereo pair as a recording of depth."""
+
+    rectifier: StereoRectifier
+    left: Video
+    right: Video
+
+    def image(self, i: int) -> NDArray:
+        return self.rectifier.frame(self.left.read(i), self.right.read(i), 0.0).depth
+
+
+def load_stereo(take: Take, seen: Observations) -> tuple[DepthVideo, ...]:
+    """Depth of all stereo pairs of a take, in its order.
+
+    Raises
+    ------
+    TakeError, CalibrationError
+        No video of a camera; cameras that are not calibrated, or that no pair can be rectified of.
+    """
+    return tuple(_pair(take, seen, entry) for entry in take.stereo)
+
+
+def stereo_sigma(entry: StereoEntry, video: DepthVideo, seen: Observations) -> float:
+    """[m] standard deviation of a depth, at two thirds of the range."""
+    assert video.camera is not None and seen.rig is not None
+    left, right = seen.rig[entry.left], seen.rig[entry.right]
+    baseline = float(np.linalg.norm(left.centre_world - right.centre_world))
+    z = _TYPICAL * entry.range[1]
+    return entry.sigma * z**2 / (video.camera.matrix[0, 0] * baseline)
+
+
+def _pair(take: Take, seen: Observations, entry: StereoEntry) -> DepthVideo:
+    lacking = [name for name in (entry.left, entry.right) if name not in seen.videos]
+    if lacking or seen.rig is None:
+        problem = f"no video of camera {', '.join(lacking)}" if lacking else "its cameras are not calibrated"
+        raise TakeError(problem, file=take.path, place=f"stereo {entry.name}", remedy="Add it to the [[camera]].")
+    near, far = entry.range
+    try:
+        left, right = seen.rig[entry.left], seen.rig[entry.right]
+        rectifier = StereoRectifier(left, right, near=near, far=far, name=entry.name)
+    except KinefitError as error:
+        raise CalibrationError(error.problem, file=take.path, place=error.place, remedy=error.remedy) from error
+    both = _Pair(rectifier, Video(seen.videos[entry.left]), Video(seen.videos[entry.right]))
+    count = min(len(both.left), len(both.right))
+    return DepthVideo(
+        sensor=entry.name, rate=seen.rate, times=np.arange(count) / seen.rate, size=rectifier.camera.size,
+        image=both.image, near=near, far=far, camera=rectifier.camera, source=str(seen.videos[entry.left]),
+    )  # fmt: skip

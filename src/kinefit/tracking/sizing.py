@@ -1,0 +1,217 @@
+"""The body fitted to the person of a recording: first by what tells it from nothing, then by all sensors together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.errors import KinefitError, ObservationError, TrackingError
+from kinefit.initialization.from_depth import sized_start
+from kinefit.markers.subject import fit_marker_subject
+from kinefit.sensors.base import Measurement
+from kinefit.sensors.channels import Channels, make_channels
+from kinefit.sensors.keypoints import KeypointMeasurement, Layout
+from kinefit.sensors.settings import TrackSettings
+from kinefit.subject import fit as joint
+from kinefit.subject.keypoints import Progress, Subject, fit_subject
+from kinefit.subject.parameters import OwnUnknowns, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.surfaces import CylinderShape
+from kinefit.tracking.recording import Recording, spread
+from kinefit.tracking.run import run
+
+_TRIED = 100  # steps that are tracked to find the person's shape ...
+_POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
+_SEEN = 0.5  # quality of a frame that the shape may be found from
+
+Start = tuple[int, BodyState]
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A body of the person's size and shape.
+
+    Parameters
+    ----------
+    recording : Recording
+    subject : Subject with the body
+    channels : the person's keypoints on this body
+    start : step and state to begin with
+    values : {sensor: {name: value}} of the sensors' own unknowns
+    told : what there is to tell of it, for `Motion.provenance`
+    joint : what the fit of all sensors together found
+    """
+
+    recording: Recording
+    subject: Subject
+    channels: Channels
+    start: Start | None = None
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    told: Mapping[str, Any] = field(default_factory=dict)
+    joint: joint.Subject | None = None
+
+
+def fitted_to_person(
+    recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None, trial: Subject | None,
+    height: float | None, size: bool, frames: int, progress: Progress | None,
+) -> Person:  # fmt: skip
+    """The body in the person's size and shape; arguments as of `track`.
+
+    Raises
+    ------
+    ObservationError
+        A trial, which tells lengths from keypoints, for a recording without keypoints of two cameras.
+    KinefitError
+        What the fits raise.
+    """
+    channels = Channels.none(recording.rig, len(recording))
+    if recording.keypoints:
+        channels = make_channels(
+            body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma
+        )
+    cameras = len({k.camera for k in recording.keypoints})
+    others = _others(recording)
+    if cameras == 1 and not (others or recording.start):
+        name = recording.keypoints[0].camera
+        problem = f"the keypoints are of one camera only, {name}"
+        raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
+    if trial is not None and (cameras < 2 or not size):
+        problem = "a trial of the same person tells lengths by keypoints, and this recording has none of two cameras"
+        raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
+    person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
+    if subject is not None:
+        return _wearing(person, subject)
+    if not size:
+        return person
+    if cameras >= 2:
+        found = fit_subject(body, channels, frames=frames, height=height, trial=trial, progress=progress)
+        person = _wearing(person, found)
+    elif recording.markers and recording.marker_sets[0][0]:
+        person = _by_markers(person, height, progress)
+    else:
+        if height:
+            scales = np.full(len(body.scale_groups), height / body.stature)
+            person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
+        if recording.depth:
+            person = _by_depth(person, progress)
+    return _by_all(person, settings, progress) if others else person
+
+
+def _others(recording: Recording) -> bool:
+    """Whether any sensor but the keypoints' detectors sees something in the first steps."""
+    return any(len(recording.steps(i)) for i in range(min(len(recording), _TRIED)))
+
+
+def _wearing(person: Person, subject: Subject, **told: Any) -> Person:
+    channels = person.channels.with_points(subject.body)
+    return replace(person, subject=subject, channels=channels, told={**person.told, **told})
+
+
+def _by_markers(person: Person, height: float | None, progress: Progress | None) -> Person:
+    """Lengths and the markers' own places, from the markers alone."""
+    r, body = person.recording, person.subject.body
+    found = fit_marker_subject(body, r.markers[0], r.marker_sets[0][0], height=height, progress=progress)
+    subject = Subject(found.body, found.scales, length_share=found.scale_std / found.scales)
+    return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames})
+
+
+def _by_depth(person: Person, progress: Progress | None) -> Person:
+    """The body in the size of the person in some depth images; as it is where nobody is found in them."""
+    r, body = person.recording, person.subject.body
+    frames = r.depth
+    camera = r.rig[next(iter(frames.values())).sensor]
+    if progress:
+        progress("size", 0, 1)
+    try:
+        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, up=r.up_axis)
+    except KinefitError as error:
+        return replace(person, told={**person.told, "size": f"not found: {error.problem}"})
+    finally:
+        if progress:
+            progress("size", 1, 1)
+    step, best = max(zip(frames, starts), key=lambda found: found[1].score)
+    told = dict(zip(fit.names, map(float, fit.factors)))
+    person = _wearing(person, replace(person.subject, body=fit.body), size=told)
+    return person if person.start is not None else replace(person, start=(step, best.state))
+
+
+def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) -> Person:
+    """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
+
+    The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
+    """
+    r, body = person.recording, person.subject.body
+    first = 0 if person.start is None else person.start[0]
+    stretch = slice(first, min(first + _TRIED, len(r)))
+    start = None if person.start is None else (0, person.start[1])
+    counted = None
+    if progress:
+        counted = lambda what, done, total: progress("shape", done, total)
+    try:
+        tracked = run(
+            r.part(stretch), body, person.channels.part(range(*stretch.indices(len(r)))), settings, start=start,
+            progress=counted,
+        )  # fmt: skip
+    except TrackingError as error:
+        return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
+    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
+    chosen = [good[k] for k in spread(len(good), _POSES)]
+    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]])
+    if not chosen or not parameters:
+        return person
+    layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
+    steps: list[list[Measurement]] = []
+    for k in chosen:
+        f, result = first + tracked.steps[k], tracked.results[k]
+        pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
+        steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
+    states = [tracked.results[k].state for k in chosen]
+    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss)
+    told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
+    begin = first + tracked.steps[chosen[0]], found.states[0]
+    person = _wearing(person, replace(person.subject, body=found.body), shape=told)
+    return replace(person, start=begin, values=found.values, joint=found)
+
+
+def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:
+    """What the sensors that took part can tell, beyond what the first fit found."""
+    r, body = person.recording, person.subject.body
+    out: list[Parameters] = []
+    surfaces = any(not m.settled for m in measurements)
+    if surfaces or r.markers:
+        out.append(_Lengths(body, person.subject))
+    if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
+        out.append(CylinderShape(body))
+    sets = {name: std for name, std in r.marker_sets if std is not None}
+    if len({k.camera for k in r.keypoints}) >= 2:  # else the markers' own fit has found them
+        out += [PointOffsets(body, name, std) for name, std in sets.items()]
+    unknown = [s for s in r.sensors if s.unknowns]
+    return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]
+
+
+class _Lengths(SegmentScales):
+    """Scales of a body that was fitted already, as sure of each as that fit was."""
+
+    def __init__(self, body: Body, subject: Subject) -> None:
+        super().__init__(body)
+        object.__setattr__(self, "_known", subject)
+
+    @property
+    def mean(self) -> NDArray:
+        """(G,) logarithms: none."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(G, G) of the first fit, or the prior's."""
+        subject: Subject = getattr(self, "_known")  # noqa: B009
+        if subject.covariance is None:
+            return super().information
+        count = len(self.names)
+        share = subject.covariance[:count, :count] / np.outer(subject.scales, subject.scales)
+        return np.linalg.inv(share)

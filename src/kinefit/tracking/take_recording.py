@@ -1,0 +1,177 @@
+"""From what a take names to a recording: every sensor, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
+from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.images.depth_scene import background_model
+from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers
+from kinefit.readers.motion import read_motion
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+from kinefit.readers.take.stereo import load_stereo, stereo_sigma
+from kinefit.tracking.recording import Recording, spread
+
+_EMPTY = 30  # images of an empty scene that are looked at: more tell no more
+_SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMarkers:
+    """A marker recording with the names that a body's marker set has for its labels.
+
+    Parameters
+    ----------
+    sensor : name of the sensor
+    markers : Markers, with those names
+    marker_set : of the body, "" for its landmarks
+    time_offset : float [s]
+    std : (K,) [m] by which the set's markers may sit elsewhere on this person; None where the body has their places
+    """
+
+    sensor: str
+    markers: Markers
+    marker_set: str
+    time_offset: float
+    std: NDArray | None
+
+    def at(self, time: float) -> MarkerFrame | None:
+        """The frame nearest to a time [s], None where there is none within half a frame."""
+        k = round((time - self.time_offset) * self.markers.rate)
+        if not 0 <= k < len(self.markers):
+            return None
+        own = k / self.markers.rate + self.time_offset
+        return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)
+
+
+def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording, Body]:
+    """What all sensors of a take saw, and the body with the marker sets that they name.
+
+    Parameters
+    ----------
+    seen : of the take
+    body : the take's
+
+    Raises
+    ------
+    KinefitError
+        What the sensors' readers raise; markers of which the body knows none.
+    """
+    stereo = load_stereo(take, seen)
+    depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
+    rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
+    start = None if take.start is None else _start(take, body)
+    marked, body = _markers(take, seen, body)
+    first, rate = seen.frames[0], seen.rate
+    times = np.arange(*seen.frames) / rate
+    videos = (*stereo, *seen.videos_of_frames)
+
+    def steps(i: int) -> Sequence[Any]:
+        out: list[Any] = []
+        for video in videos:
+            k = video.at_step(first + i, rate)
+            if k is not None:
+                out.append(video.frame(k))
+        frames = (m.at(float(times[i])) for m in marked)
+        return [*out, *(f for f in frames if f is not None)]
+
+    recording = Recording(
+        times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(m.markers for m in marked),
+        marker_sets=tuple((m.marker_set, m.std) for m in marked), depth=_first_depth(depth, seen),
+        on_body=tuple(v.sensor for v in depth if v.on_body), backgrounds=_backgrounds(depth), start=start, up=take.up,
+        name=take.name,
+    )  # fmt: skip
+    if seen.keypoints:
+        pixels = Recording.of_keypoints(rig, seen.keypoints, accuracy=[entry.sigma for entry in pixel_entries(take)])
+        recording = replace(
+            recording, keypoints=pixels.keypoints, people=pixels.people, keypoint_sigma=pixels.keypoint_sigma
+        )
+    return recording, body
+
+
+def pixel_entries(take: Take) -> list[Any]:
+    """The `[[keypoints]]` that detectors wrote; those by the colour of the skin are followed as they are asked for."""
+    return [entry for entry in take.keypoints if entry.format != "skin"]
+
+
+def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
+    """Standard deviation of every sensor, [m] or [px]."""
+    out = {entry.name: entry.sigma for entry in take.depth}
+    out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
+    out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
+    out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
+    out |= {entry.camera: entry.sigma for entry in take.keypoints}
+    return out | {_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
+
+
+def _sensor(take: Take, k: int) -> str:
+    return "markers" if len(take.markers) == 1 else f"markers {k + 1}"
+
+
+def _start(take: Take, body: Body) -> tuple[int, BodyState]:
+    assert take.start is not None
+    motion = read_motion(take.start)
+    if len(motion.body.tree.coordinates) != len(body.tree.coordinates):
+        raise BodyError(
+            f"the motion that the take starts from has the body {motion.body.name}", file=take.path,
+            place="[take] start", remedy="Start from a motion of the take's own body.",
+        )  # fmt: skip
+    return 0, BodyState(motion.Ts_world_root[0], motion.angles[0])
+
+
+def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:
+    """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
+    out = []
+    for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
+        std: NDArray | None = None
+        try:
+            own = known_set(body, markers.names, entry.set if entry.set in body.marker_sets else None)
+            if entry.set and entry.set != own:
+                raise ObservationError(f"marker set {entry.set} is not the body's own")
+            known = body.markers(own) if own else body.landmarks
+        except KinefitError as unknown:
+            try:
+                placed = find_placement(body, {bare(n) for n in markers.names}, entry.set)
+            except KinefitError as error:
+                raise type(error)(
+                    error.problem, file=entry.file, place=f"[[markers]] {k + 1}", remedy=error.remedy
+                ) from unknown
+            own, known, std = placed.name, placed.points, placed.spread
+            body = replace(body, marker_sets={**body.marker_sets, own: known})
+        names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))
+        here = [i for i, n in enumerate(names) if n in known.names]
+        named = replace(
+            markers, names=tuple(names[i] for i in here), positions=markers.positions[:, here]
+        )
+        out.append(NamedMarkers(_sensor(take, k), named, own, entry.time_offset, std))
+    return out, body
+
+
+def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, DepthFrame]:
+    """Some images of the first depth sensor from the beginning of the take, by step."""
+    start, stop = seen.frames
+    for video in depth:
+        frames = {s - start: k for s in range(start, stop) if (k := video.at_step(s, seen.rate)) is not None}
+        first = [step for step in frames if step <= min(frames) + _FIRST * seen.rate]
+        if first:
+            return {first[c]: video.frame(frames[first[c]]) for c in spread(len(first), _SIZES)}
+    return {}
+
+
+def _backgrounds(depth: Sequence[DepthVideo]) -> dict[str, NDArray]:
+    """What depth sensors saw of the empty scene."""
+    out = {}
+    for video in depth:
+        if video.background is not None:
+            empty = [video.background.frame(i).depth for i in range(min(len(video.background), _EMPTY))]
+            out[video.sensor] = background_model(empty, share=0.5)
+    return out

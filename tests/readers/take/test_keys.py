@@ -1,0 +1,78 @@
+"""Every key of a take file is explained, old ones are read and named, keys without a use are refused."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from kinefit.errors import TakeError
+from kinefit.readers.take.entries import RENAMED
+from kinefit.readers.take.file import TABLES, Take, read_take
+
+PAGE = (Path(__file__).resolve().parents[3] / "docs" / "take-file.md").read_text("utf-8")
+KEYS = [(table, key) for table, entry in TABLES.items() for key in entry.__struct_fields__]
+
+
+def section(table):
+    """What the page says of a table: from its headline to the next."""
+    found = re.search(rf"^## `\[+{table}\]+`\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
+    assert found, f"docs/take-file.md has no section of [{table}]"
+    return found[1]
+
+
+@pytest.mark.parametrize(("table", "key"), KEYS)
+def test_the_page_explains_every_key(table, key):
+    cells = [line.split("|")[1] for line in section(table).splitlines() if line.startswith("| `")]
+    assert any(f"`{key}`" in cell for cell in cells), f"docs/take-file.md: [{table}] {key}"
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_the_page_explains_no_key_that_is_none(table):
+    cells = [line.split("|")[1] for line in section(table).splitlines() if line.startswith("| `")]
+    told = {key for cell in cells for key in re.findall(r"`(\w+)`", cell)}
+    assert told == set(TABLES[table].__struct_fields__)
+
+
+def test_old_keys_have_new_ones_and_are_none_themselves():
+    for table, names in RENAMED.items():
+        fields = set(TABLES[table].__struct_fields__)
+        assert set(names.values()) <= fields and not set(names) & fields
+
+
+def take(folder, text, *, files=("m.trc",)):
+    for name in files:
+        (folder / name).write_text("")
+    (folder / "take.toml").write_text(text)
+    return read_take(folder / "take.toml")
+
+
+def test_an_old_key_is_read_and_named(tmp_path):
+    with pytest.warns(FutureWarning, match=r"\[\[markers\]\] 1: 'accuracy' is now called 'sigma'"):
+        old = take(tmp_path, '[[markers]]\nfile = "m.trc"\naccuracy = 0.02\n')
+    assert isinstance(old, Take) and old.markers[0].sigma == 0.02
+    with pytest.raises(TakeError, match="one key"):
+        take(tmp_path, '[[markers]]\nfile = "m.trc"\naccuracy = 0.02\nsigma = 0.02\n')
+    with pytest.raises(TakeError, match="no key 'accurracy'"):
+        take(tmp_path, '[[markers]]\nfile = "m.trc"\naccurracy = 0.02\n')
+
+
+CAMERA = '[calibration]\nfile = "c"\n[[camera]]\nname = "a"\nvideo = "v"\n'
+
+
+@pytest.mark.parametrize(
+    ("entry", "key"),
+    [
+        ('[[keypoints]]\ncamera = "a"\nformat = "detect"\nrate = 30', "rate"),
+        ('[[keypoints]]\ncamera = "a"\nformat = "detect"\nframe = "video"', "frame"),
+        ('[[keypoints]]\ncamera = "a"\nfile = "v"\nface = [1, 2, 3, 4]', "face"),
+        ('[[keypoints]]\ncamera = "a"\nformat = "skin"\nfile = "v"', "file"),
+        ('[[silhouette]]\ncamera = "a"\nfile = "v"\nsmooth = 2', "smooth"),
+        ('[[silhouette]]\ncamera = "a"\nformat = "background"\nrate = 30', "rate"),
+        ('[[silhouette]]\ncamera = "a"\nformat = "background"\nlow = [1, 1, 1]', "low"),
+        ('[[silhouette]]\ncamera = "a"\nformat = "detect"\nframe = "video"', "frame"),
+        ('[[silhouette]]\ncamera = "a"\nformat = "threshold"\nlow = [1, 1, 1]\nhigh = [2, 2, 2]\nfile = "v"', "file"),
+    ],
+)
+def test_a_key_without_use_is_refused(tmp_path, entry, key):
+    with pytest.raises(TakeError, match=f"'{key}' has no use with format"):
+        take(tmp_path, CAMERA + entry, files=("c", "v"))
