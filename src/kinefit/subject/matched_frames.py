@@ -1,4 +1,4 @@
-"""Frames with their correspondences in worlds that parameters make: the problem that the solver of a subject fit sees."""
+"""Frames with their correspondences, in worlds that parameters make: the problem that a subject fit solves."""
 
 from __future__ import annotations
 
