@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kinefit import Tracker, TrackSettings, levenberg_marquardt, load_body
-from kinefit.bodies import BodyState
+from kinefit import BodyState, Tracker, TrackSettings, levenberg_marquardt, load_body
 from kinefit.correspondences import prior_rows
 from kinefit.frame.routing import Sensors
 from kinefit.observations import KeypointFrame
