@@ -34,7 +34,7 @@ _FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
 _LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
-_NEAR = 3e-3  # [m, rad] of moves within which derivatives by parameters stay as they are
+_NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
 _LEAST = 3.0  # [1/m², 1/rad²] damping of poses when they move with parameters
 
 
@@ -141,7 +141,8 @@ def solve(
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
         damping = max(damping, _LITTLE * mean)
         if new < cost:
-            far += max(float(np.abs(a.difference(b)).max()) for a, b in zip(states, moved)) + np.abs(delta).max()
+            turns = np.array([a.difference(b) for a, b in zip(states, moved)])
+            far += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
             theta, states, frames, cost = trial, moved, settled, new
             near = blocks if far <= _NEAR else None
             far = far if near else 0.0
