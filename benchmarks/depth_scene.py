@@ -41,9 +41,9 @@ _GOALS = (
 
 def tracker(body: Any, rig: Any, rate: float) -> Any:
     """What is measured: the tracker as it comes."""
-    from kinefit.tracking.fusion import FusionTracker
+    from kinefit.tracking.tracker import Tracker
 
-    return FusionTracker(body, rig, rate=rate)
+    return Tracker(body, rig, rate=rate)
 
 
 def run() -> None:

@@ -125,10 +125,10 @@ class Stage:
     def follow(self, frames: Sequence[Any], points: int = POINTS) -> tuple[NDArray, list[Any]]:
         """CPU time [ms] and result of each frame, from the second frame of the movement on."""
         from kinefit.sensors.settings import TrackSettings
-        from kinefit.tracking.fusion import FusionTracker
+        from kinefit.tracking.tracker import Tracker
 
         settings = TrackSettings(points=points, search=False)
-        tracker = FusionTracker(
+        tracker = Tracker(
             self.motion.body, self.rig, rate=self.motion.rate, settings=settings,
             accuracy={self.camera.name: self.accuracy},
         )  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure
@@ -81,7 +81,7 @@ def follow(
     body: Body, rig: Rig, masks: tuple[SilhouetteVideo, ...], first: BodyState, count: int
 ) -> list[BodyState]:
     """The movement of a body, from silhouettes alone."""
-    tracker, out = FusionTracker(body, rig, rate=masks[0].rate), []
+    tracker, out = Tracker(body, rig, rate=masks[0].rate), []
     tracker.start_at(first)
     for i in range(count):
         frames = [replace(video.frame(i), time=i / masks[0].rate) for video in masks]

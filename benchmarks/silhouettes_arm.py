@@ -26,7 +26,7 @@ from kinefit.readers.video import Video
 from kinefit.rendering import render_body, scaled
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 
 UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them
 FIRST, LAST, START, RATE = 40, 378, 160, 30.0
@@ -133,7 +133,7 @@ def tracked(body: Body, rig: Rig, pictures: Pictures, start: BodyState) -> dict[
     out = {}
     for steps in (range(START, LAST), range(START - 1, FIRST - 1, -1)):
         accuracy = {f"silhouette {c.name}": SIGMA for c in rig}
-        follow = FusionTracker(body, rig, rate=RATE, accuracy=accuracy, settings=SETTINGS)
+        follow = Tracker(body, rig, rate=RATE, accuracy=accuracy, settings=SETTINGS)
         follow.start_at(start)
         for k, i in enumerate(steps):
             result = follow.update(pictures(i), k / RATE)

@@ -17,7 +17,7 @@ from kinefit.initialization.from_silhouettes import Level, coarse_to_fine
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 
 FRAMES = 120  # three degrees a frame
 LENGTH = 0.3  # [m]
@@ -79,7 +79,7 @@ def run() -> None:
     views = [("front", (0.0, 0.45, 0.9)), ("side", (0.85, 0.35, 0.4))]
     rig = Rig(tuple(looking(name, np.array(eye), middle, (640, 480), 900.0) for name, eye in views))
     accuracy = {f"silhouette {name}": 0.5 for name in rig.names}
-    tracker = FusionTracker(body, rig, rate=25.0, up=(0, 1, 0), accuracy=accuracy, settings=SETTINGS)
+    tracker = Tracker(body, rig, rate=25.0, up=(0, 1, 0), accuracy=accuracy, settings=SETTINGS)
     tracker.start_at(placed(np.radians(-4.0)))
     turns, shifts = [], []
     for i in range(FRAMES):

@@ -23,7 +23,7 @@ from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import Canvas, render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS = 45, 5, 3
 RED, GREEN = (200, 60, 50), (30, 90, 40)
@@ -101,7 +101,7 @@ def _pictures(body: Body, rig: Rig) -> list[dict[str, np.ndarray]]:
 def _frame_ms(body: Body, rig: Rig, pictures: list[dict[str, np.ndarray]], count: int) -> tuple[float, float, float]:
     """Medians of a frame's time and of its processor time [ms], and the mean error of the last frames' angles [deg]."""
     truth = swaying(body, FRAMES)
-    tracker = FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False))
+    tracker = Tracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False))
     tracker.start_at(truth[0])
     spent, used, off = [], [], []
     for i, seen in enumerate(pictures):

@@ -7,7 +7,7 @@ Here both are simulated from a wave of the hand, with a first Kinect's errors, s
 
 import numpy as np
 
-from kinefit import FusionTracker
+from kinefit import Tracker
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame
 from kinefit.simulation import KINECT, in_front, movement, people, simulate_depth
@@ -24,7 +24,7 @@ def main(frames=30, seed=0):
     points = person.body.landmarks.select(JOINTS)
     rng = np.random.default_rng(seed)
 
-    tracker = FusionTracker(person.body, Rig((camera,)), rate=15.0, accuracy={"kinect": 0.008})
+    tracker = Tracker(person.body, Rig((camera,)), rate=15.0, accuracy={"kinect": 0.008})
     tracker.start_at(truth.state(0))  # left out, the tracker finds its start in the first image
     errors = []
     for i in range(min(frames, len(truth))):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from tests.tracking.fusion_oracle import BODY, a_motion, a_rig, cloud_frame, keypoint_frame, marker_frame, off, turned
+from tests.tracking.movements import BODY, a_motion, a_rig, cloud_frame, keypoint_frame, marker_frame, off, turned
 
 from kinefit.errors import CalibrationError
 from kinefit.initialization.candidates import GAIN, LEAP, dofs_of_limbs, find_limbs, find_starts

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.tracking.fusion_oracle import a_rig
+from tests.tracking.movements import a_rig
 
-from kinefit import FusionTracker, Markers, fit_marker_subject, learn_model
+from kinefit import Markers, Tracker, fit_marker_subject, learn_model
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import TrackingError
 from kinefit.recipes.unlabelled_markers import name_frame, start_from_markers
@@ -41,7 +41,7 @@ def test_a_state_from_points_without_names(person):
 def test_the_tracker_starts_and_starts_again_far_away(person):
     motion, labelled, subject, model = person
     up = np.eye(3)["xyz".index(motion.up)]
-    tracker = FusionTracker(subject.body, a_rig(), rate=30.0, accuracy={"markers": 0.01}, up=up)
+    tracker = Tracker(subject.body, a_rig(), rate=30.0, accuracy={"markers": 0.01}, up=up)
     for step, frame in enumerate((0, 1, 2)):
         found = tracker.update([name_frame(model, shuffled(labelled, frame), step / 30, marker_set=subject.marker_set)])
         assert found is not None

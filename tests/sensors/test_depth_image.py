@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, ring
-from tests.tracking.fusion_oracle import BODY, SENSOR, a_motion, a_rig, images, turned
+from tests.tracking.movements import BODY, SENSOR, a_motion, a_rig, images, turned
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import JointMotion, Morphing

@@ -5,15 +5,17 @@ from itertools import product
 import numpy as np
 import pytest
 
-from kinefit.bodies import BodyState, parse_body
+from kinefit.bodies import BodyState, load_body, parse_body
 from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.observations import LineFrame
+from kinefit.rows import DofRows
 from kinefit.sensors.image_lines import ImageLineSensor, image_lines
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton
+from kinefit.tracking.tracker import Tracker
 
 CORNERS = dict(zip("abcdefgh", product((0.0, 0.6), (0.0, 0.4), (0.0, 0.3))))
 EDGES = {m + n: (m, n) for m in CORNERS for n in CORNERS if m < n and np.sum(np.array(CORNERS[m]) != CORNERS[n]) == 1}
@@ -121,6 +123,34 @@ def test_a_wrong_line_does_not_pull_and_speaks_against_the_crate():
     assert costs[0] > costs[1]  # a wider correspondence distance lets a wrong line count for more
 
 
+def test_what_the_fit_leaves_over_is_the_way_to_the_line():
+    scene, frame = Scene(CRATE, TRUTH, rig()), seen()
+    ends = np.array(frame.ends)
+    across = np.array([[0.0, -1.0], [1.0, 0.0]]) @ (ends[0, 1] - ends[0, 0])
+    ends[0] += 6.0 * across / np.linalg.norm(across)
+    moved = LineFrame("cam", 0.0, frame.names, frame.landmarks, ends)
+    match = matched(moved, scene, geman_mcclure(3.0))
+    (left,) = match.leftovers(scene)
+    assert (left.label, left.unit, left.names[:2]) == ("lines cam", "px", ("ab: a", "ab: b")) and len(left.names) == 24
+    np.testing.assert_allclose(np.linalg.norm(left.values, axis=1), [6.0] * 2 + [0.0] * 22, atol=1e-6)
+    np.testing.assert_allclose(left.values[0], 6.0 * across / np.linalg.norm(across), atol=1e-6)
+    np.testing.assert_allclose(match.squares(scene), [2 * (6.0 / 1.5) ** 2] + [0.0] * 11, atol=1e-8)
+    (rows,) = match.rows(scene)
+    np.testing.assert_allclose(np.bincount(rows.group, rows.weight * rows.residual**2), match.squares(scene), atol=1e-8)
+    assert left.weights[0] < 0.2 and left.weights[2:].min() > 0.99
+
+
+def test_the_tracker_follows_a_crate_by_its_edges():
+    tracker = Tracker(CRATE, rig(), rate=30.0, accuracy={"lines cam": 1.0})
+    tracker.start_at(TRUTH)
+    state = TRUTH
+    for k in range(15):
+        state = state.retract(np.array([0.004, 0.002, 0.005, 0.0, 0.01, 0.005]))
+        frame = seen(state, noise=0.3)
+        result = tracker.update([LineFrame("cam", k / 30.0, frame.names, frame.landmarks, frame.ends)], k / 30.0)
+    np.testing.assert_allclose(result.state.T_world_root, state.T_world_root, atol=0.01)
+
+
 def test_what_cannot_be_is_told():
     scene = Scene(CRATE, TRUTH, rig())
     ends = np.array([[[0.0, 0.0], [9.0, 9.0]]])
@@ -134,3 +164,30 @@ def test_what_cannot_be_is_told():
     ):
         with pytest.raises(ObservationError, match=said):
             LineFrame("cam", 0.0, names, landmarks, points)
+
+
+def test_on_a_body_whose_joints_move():
+    """A shoulder that follows the arm: derivatives of the morphed body, and what lines say of segments."""
+    body = load_body("humanoid_morphing")
+    angles = np.array(body.tree.usual)
+    angles[body.tree.coordinates.index("arm_add_r")] += 0.8
+    state = BodyState(np.eye(4), angles).retract(np.append([0.0, 0.0, 3.0], np.zeros(body.tree.n_dofs - 3)))
+    scene = Scene(body, state, rig())
+    own = ("r_humeral_lateral_epicondyle", "r_radial_styloid")
+    uv = rig().cameras[0].project(np.array([scene.position(n) for n in own]))
+    frame = LineFrame("cam", 0.0, ("forearm",), (own,), uv[None] + np.array([0.0, 1.0]))
+    match = matched(frame, scene)
+    (rows,) = match.rows(scene)
+    assert isinstance(rows, DofRows) and list(rows.group) == [0, 0]
+    step = 1e-6
+
+    def off(delta):
+        (rows,) = match.rows(scene.at(state.retract(delta)))
+        return np.sqrt(rows.weight) * rows.residual
+
+    n = body.tree.n_dofs
+    numeric = np.stack([(off(step * e) - off(-step * e)) / (2 * step) for e in np.eye(n)], axis=1)
+    analytic = -np.sqrt(rows.weight)[:, None] * rows.jacobian
+    np.testing.assert_allclose(numeric, analytic, atol=1e-4 * np.abs(analytic).max())
+    evidence, arm = match.evidence(scene), body.landmarks.segments[[body.landmarks.index(n) for n in own]]
+    assert np.all(evidence.agreeing[arm] > 0) and not evidence.contrary.any()

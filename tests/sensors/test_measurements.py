@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement, of_points
-from tests.tracking.fusion_oracle import (
+from tests.tracking.movements import (
     BODY,
     SENSOR,
     SET,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 from kinefit.sensors.measurements import KeypointMeasurement
-from tests.tracking.fusion_oracle import BODY, RATE, a_motion, a_rig
+from kinefit.tracking.fused_fit import FusedFit
+from tests.tracking.movements import BODY, RATE, a_motion, a_rig
 
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame
@@ -11,7 +12,6 @@ from kinefit.rendering import render_body
 from kinefit.sensors.occlusion import THICK, InSight, beside
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import normal_equations
-from kinefit.tracking.fused_fit import FusedFit
 
 TRUTH = a_motion().state(0)
 CAMERA = a_rig()["depth"]

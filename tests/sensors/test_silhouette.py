@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from tests.sensors.scenes import at, posture, ring
 
 from kinefit.bodies import BodyState, load_body
@@ -18,8 +18,8 @@ from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.take import track_take
+from kinefit.tracking.tracker import Tracker
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def silhouettes(body, state, cameras, time, mesh=None):
 
 
 def tracker(body, rig, **settings):
-    return FusionTracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False, **settings))
+    return Tracker(body, rig, rate=30.0, up=(0, 1, 0), settings=TrackSettings(search=False, **settings))
 
 
 def joints(body, state):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
+from kinefit.tracking.fused_fit import FusedFit
 from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
@@ -15,8 +16,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fused_fit import FusedFit
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 
 JOINTS = ("arm_flex_r", "arm_add_r", "arm_flex_l", "elbow_flex_r")
 
@@ -60,7 +60,7 @@ def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
     """The morphing body finds the arms' angles; the same one held stiff is off."""
     model, ends = Morphing(body), {}
     for name, own in (("morphing", body), ("stiff", replace(body, morphs=()))):
-        follow = FusionTracker(own, rig, rate=30.0, settings=TrackSettings(search=False))
+        follow = Tracker(own, rig, rate=30.0, settings=TrackSettings(search=False))
         follow.start_at(posture(body, 0))
         for i in range(8):
             truth, frames = posture(body, i), []

@@ -14,7 +14,8 @@ from kinefit.geometry.camera import Camera
 from kinefit.losses import Loss
 from kinefit.observations import LineFrame
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, Sensor
+from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor
+from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
 
@@ -46,8 +47,9 @@ class ImageLineSensor(Sensor):
         points = [(k, n) for k in np.flatnonzero(seen) for n in frame.landmarks[k]]
         line = np.array([k for k, _ in points], np.int64)
         made = ImageLineMeasurement(
-            self, frame.sensor, frame.time, tuple(n for _, n in points), line, np.ascontiguousarray(frame.ends[line])
-        )
+            self, frame.sensor, frame.time, tuple(n for _, n in points), line, np.ascontiguousarray(frame.ends[line]),
+            frame.names,
+        )  # fmt: skip
         scene.rig.index(frame.sensor)
         made.points_of(scene.body)  # which tells what the body lacks
         return made
@@ -63,12 +65,14 @@ class ImageLineMeasurement(Measurement):
     time : float [s]
     names : (K,) landmarks; line : (K,) int, the line of each; those of one line are adjacent
     ends : (K, 2, 2) [px] two points of the line of each landmark, in the calibration's image
+    titles : (L,) names of all lines of the sensor
     """
 
     def __init__(
-        self, of: ImageLineSensor, camera: str, time: float, names: tuple[str, ...], line: NDArray, ends: NDArray
-    ) -> None:
-        self.sensor, self.time, self.of = of.name, time, of
+        self, of: ImageLineSensor, camera: str, time: float, names: tuple[str, ...], line: NDArray, ends: NDArray,
+        titles: tuple[str, ...],
+    ) -> None:  # fmt: skip
+        self.sensor, self.time, self.of, self.titles = of.name, time, of, titles
         self.camera, self.names, self.line, self.ends = camera, names, line, ends
         self._points: tuple[Body, PointSet] | None = None
 
@@ -77,6 +81,16 @@ class ImageLineMeasurement(Measurement):
         if self._points is None or self._points[0] is not body:
             self._points = body, body.landmarks.select(self.names)
         return self._points[1]
+
+    def lines(self, scene: Scene) -> NDArray:
+        """(K, 3) image lines a u + b v + c = 0 of the landmarks, where they are; see `image_lines`."""
+        return image_lines(scene.rig[self.camera], self.ends, scene.positions(self.points_of(scene.body)))
+
+    def across(self, scene: Scene) -> NDArray:
+        """(K, 2) [px] the shortest way from each landmark's pixel to its line; NaN behind the camera."""
+        uv, lines = scene.rig[self.camera].project(scene.positions(self.points_of(scene.body))), self.lines(scene)
+        off = np.sum(lines[:, :2] * uv, axis=1) + lines[:, 2]
+        return np.asarray(-(off / np.sum(lines[:, :2] ** 2, axis=1))[:, None] * lines[:, :2])
 
     def match(self, scene: Scene, reach: float) -> ImageLineMatched:
         """As the lines are named."""
@@ -91,16 +105,46 @@ class ImageLineMatched(Matched):
     measurement: ImageLineMeasurement
     loss: Loss
 
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the sensor."""
+        return self.measurement.sensor
+
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a landmark: its pixel should lie on the image line; one robust weight a line."""
         m = self.measurement
-        points, k = m.points_of(scene.body), scene.rig.index(m.camera)
-        camera = scene.rig.cameras[k]
-        lines = image_lines(camera, m.ends, scene.positions(points))
+        points, k, lines = m.points_of(scene.body), scene.rig.index(m.camera), m.lines(scene)
         weight = np.full(len(points), 1.0 / m.of.sigma**2)
         index = np.full(len(points), k, np.int64)
         rows = scene.rows_of(_kernels.image_line_rows, 1, points, scene.rig.packed, index, lines, weight)
         return [replace(rows, group=np.ascontiguousarray(m.line[rows.group]), loss=self.loss)]
+
+    def squares(self, scene: Scene) -> NDArray:
+        """(L,) squared residual of each line, in variances: of both ends of an edge together."""
+        across = self.measurement.across(scene) / self.measurement.of.sigma
+        seen = np.isfinite(across).all(axis=1)
+        _, line = np.unique(self.measurement.line[seen], return_inverse=True)
+        return np.bincount(line, np.square(across[seen]).sum(axis=1))
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Of every landmark: from its pixel the shortest way to its line."""
+        m = self.measurement
+        points, values = m.points_of(scene.body), m.across(scene)
+        seen = np.isfinite(values).all(axis=1)
+        square = np.bincount(m.line[seen], np.square(values[seen]).sum(axis=1), minlength=int(m.line.max(initial=-1)) + 1)
+        factor = np.where(seen, self.loss.factor(square[m.line] / m.of.sigma**2), 0.0)
+        measured = scene.rig[m.camera].project(scene.positions(points)) + values
+        names = tuple(f"{m.titles[k]}: {name}" for k, name in zip(m.line, m.names))
+        return [Leftover(m.sensor, names, points.segments, values, factor, "px", measured)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """A line speaks for the segments of its landmarks within three standard deviations, and against them beyond."""
+        out, m = np.zeros((2, len(scene.body.tree.segments))), self.measurement
+        across, segments = m.across(scene) / m.of.sigma, m.points_of(scene.body).segments
+        for line in np.unique(m.line[np.isfinite(across).all(axis=1)]):
+            far = int(np.nansum(across[m.line == line] ** 2) >= AGREES**2)
+            out[far, np.unique(segments[m.line == line])] += SHOWN
+        return Evidence(*out)
 
 
 def image_lines(camera: Camera, ends: NDArray, x_world: NDArray) -> NDArray:

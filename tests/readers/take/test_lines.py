@@ -47,7 +47,7 @@ def test_lines_of_a_table(tmp_path):
 
 
 def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
-    rows = [dict(frame=0, line="hips", u1=10, v1=20, u2=30, v2=40)]
+    rows = [{"frame": 0, "line": "hips", "u1": 10, "v1": 20, "u2": 30, "v2": 40}]
     (tmp_path / "lines.json").write_text(json.dumps(rows))
     lines = LINES.replace(".csv", ".json") + 'frame = "video"\n'
     (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').lines

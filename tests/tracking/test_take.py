@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from kinefit.tracking.fusion_take import FrameSource, fuse_take
 
 from kinefit import read_motion
 from kinefit.cli import main
@@ -13,7 +14,6 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave, write_synthetic_take
 from kinefit.simulation.movements import movement, people
-from kinefit.tracking.fusion_take import FrameSource, fuse_take
 from kinefit.tracking.take import track_take
 
 MARKERS = ("l_wrist", "r_wrist", "l_knee")

@@ -14,7 +14,7 @@ from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
 from kinefit.simulation.scenes import Scene
 from kinefit.simulation.sensors import KINECT, measured_depth
-from kinefit.tracking.fusion import FusionTracker
+from kinefit.tracking.tracker import Tracker
 
 BODY = load_body("humanoid10")
 RATE = 30.0
@@ -81,7 +81,7 @@ def cloud_frame(i, segment=None, name="wave", every=3):
 
 def a_tracker(name="wave", start=0, settings=STILL, **more):
     """A tracker that begins at the truth of a frame, or with nothing known where `start` is None."""
-    tracker = FusionTracker(BODY, a_rig(name), rate=RATE, settings=settings, **more)
+    tracker = Tracker(BODY, a_rig(name), rate=RATE, settings=settings, **more)
     if start is not None:
         tracker.start_at(a_motion(name).state(start))
     return tracker

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from tests.tracking.fusion_oracle import (
+from tests.tracking.movements import (
     BODY,
     RATE,
     SET,
@@ -32,7 +32,7 @@ from kinefit.errors import BodyError, CalibrationError, KinefitError, Observatio
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.fusion import FusionResult, FusionTracker
+from kinefit.tracking.tracker import FrameResult, Tracker
 
 FEW = ("neck", "r_wrist", "l_ankle")
 KINDS = {
@@ -72,7 +72,7 @@ def test_depth_alone_is_followed(alone):
 
 def test_a_result_has_the_shapes_that_it_says(alone):
     for i, result in enumerate(alone["depth"][0]):
-        assert isinstance(result, FusionResult) and result.time == i / RATE and result.iterations >= 1
+        assert isinstance(result, FrameResult) and result.time == i / RATE and result.iterations >= 1
         assert result.state.T_world_root.shape == (4, 4) and result.state.angles.shape == (D,)
         assert result.dof_std.shape == (N,) and result.joint_std.shape == (S, 3)
         for name, kind in (("segment_quality", float), ("lost", bool), ("hidden", bool)):
@@ -389,23 +389,23 @@ def test_wrong_frames_are_told_and_do_no_harm(says, kind, frames):
 @pytest.mark.parametrize("accuracy", [0.0, -0.01, np.nan, np.inf])
 def test_an_accuracy_that_is_none_is_told(accuracy):
     with pytest.raises(ObservationError, match="standard deviations of depth"):
-        FusionTracker(BODY, a_rig(), accuracy={"depth": accuracy})
+        Tracker(BODY, a_rig(), accuracy={"depth": accuracy})
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf])
 def test_a_rate_that_is_none_is_told(rate):
     with pytest.raises(ObservationError, match="Hz"):
-        FusionTracker(BODY, a_rig(), rate=rate)
+        Tracker(BODY, a_rig(), rate=rate)
 
 
 def test_depth_needs_surfaces_and_markers_do_not():
     bare = replace(BODY, surfaces=())
-    tracker = FusionTracker(bare, a_rig(), settings=STILL)
+    tracker = Tracker(bare, a_rig(), settings=STILL)
     tracker.start_at(a_motion().state(0))
     for frame in (depth_frame(0), cloud_frame(0)):
         with pytest.raises(BodyError, match="no surfaces"):
             tracker.update([frame])
-    tracker = FusionTracker(bare, a_rig(), settings=STILL)
+    tracker = Tracker(bare, a_rig(), settings=STILL)
     tracker.start_at(a_motion().state(0))
     assert off(tracker.update([marker_frame(0, FEW)]).state, 0).mean() < 0.01
 
@@ -461,5 +461,5 @@ def test_no_garbage_stops_a_search(data):
 
 
 def test_public_names():
-    assert kinefit.FusionTracker is FusionTracker and kinefit.FusionResult is FusionResult
+    assert kinefit.Tracker is Tracker and kinefit.FrameResult is FrameResult
     assert kinefit.TrackSettings is TrackSettings
