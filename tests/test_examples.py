@@ -105,3 +105,15 @@ def test_a_morph_of_ones_own(tmp_path):
     assert errors["morphing"] < 0.6
     assert errors["rigid"] > 3 * errors["morphing"]
     assert (tmp_path / "arm.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_sensor_of_ones_own(seed, capsys):
+    subject, errors, taut = example("07_own_sensor").main(seed=seed)
+    length, std = subject.value("rope length")
+    assert abs(length - 0.8) < 0.005
+    assert abs(length - 0.8) < 3 * std < 0.015
+    assert 20 < taut.sum() < 50
+    assert np.median(errors["one camera and the rope"]) < 0.8 * np.median(errors["one camera"])
+    assert np.median(errors["one camera and the rope"][taut]) < 0.5 * np.median(errors["one camera"][taut])
+    assert "m is the truth" in capsys.readouterr().out

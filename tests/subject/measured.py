@@ -8,7 +8,6 @@ from tests.oracle import posture, rig_around
 from kinefit.bodies import BodyState, load_body
 from kinefit.correspondences import _kernels
 from kinefit.losses import geman_mcclure
-from kinefit.rows import Rows
 from kinefit.sensors.base import Measurement, RowsOf, Sensor, Unknown
 
 ARM = load_body("arm")
@@ -58,12 +57,13 @@ class Worn(Measurement):
 
 
 @dataclass(frozen=True, eq=False)
-class Taut(Measurement):
-    """A rope from a landmark to a post that pulls and never pushes."""
+class Pulling(Measurement):
+    """A rope from a landmark to a post that pulls and never pushes; `taut` where a load cell says that it does."""
 
     sensor: str
     time: float
     post: np.ndarray
+    taut: bool = False
     sigma: float = 0.001
 
     def match(self, scene, reach):
@@ -74,7 +74,8 @@ class Taut(Measurement):
         away = self.post - scene.positions(hand)[0]
         distance = np.linalg.norm(away)
         pull = distance - scene.value(self.sensor, "length", 1.0)
-        return scene.along(hand, away[None] / distance, [pull], self.sigma if pull > 0.0 else np.inf)
+        felt = self.taut or pull > 0.0
+        return scene.along(hand, away[None] / distance, [pull], self.sigma if felt else np.inf)
 
 
 class Rope(Sensor):
@@ -83,7 +84,7 @@ class Rope(Sensor):
     name, unknowns = "rope", {"length": Unknown(1.0, 0.3)}
 
     def prepare(self, frame, scene):
-        return Taut(self.name, *frame)
+        return Pulling(self.name, *frame)
 
 
 def arms(count, seed=0):
@@ -138,7 +139,3 @@ def markers(body, states, points="worn", noise=0.001, seed=0):
         x = body.positions(state, body.markers(points))
         steps.append([Worn("mocap", k / 10, points, x + noise * random.normal(size=x.shape), max(noise, 5e-4))])
     return steps
-
-
-def rows_of_nothing():
-    return Rows.concat()

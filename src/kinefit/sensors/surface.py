@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,10 +30,8 @@ class Surface:
 
     Attributes
     ----------
-    samples : SurfaceSamples
     mesh : BodyMesh of its simple surfaces, for depth
     morphing : Morphing, its skin (the mesh, where it has none) and what changes that, for outlines
-    areas : (S,) [m²] of each segment
     judged : the state that was drawn segment by segment last, in all cameras
 
     Raises
@@ -44,19 +44,27 @@ class Surface:
         if not body.surfaces:
             remedy = "Depth needs some; see the catalogue's bodies."
             raise BodyError(f"body '{body.name}' has no surfaces", remedy=remedy)
-        self.body, self.morphing = body, Morphing(body)
+        self.body, self.count, self.morphing = body, count, Morphing(body)
         self.mesh = self.morphing.mesh if isinstance(self.morphing.mesh, BodyMesh) else body_mesh(body)
-        points, normals, segment = sample(body, count)
-        self.samples = SurfaceSamples(segment, points.T, normals.T)
-        corners = self.mesh.vertices[self.mesh.faces]
-        twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        self.areas = 0.5 * np.bincount(self.mesh.face_segment, twice, len(body.tree.segments))
         self.judged: BodyState | None = None
         self._posed: tuple[BodyState, NDArray] | None = None
         self._pose: MorphedPose | None = None
         self._canvases: dict[Camera, Canvas] = {}
         self._rims: dict[Camera, RimFinder] = {}
         self._layers: dict[Camera, Layers] = {}
+
+    @cached_property
+    def samples(self) -> SurfaceSamples:
+        """Points spread over all of it."""
+        points, normals, segment = sample(self.body, self.count)
+        return SurfaceSamples(segment, points.T, normals.T)
+
+    @cached_property
+    def areas(self) -> NDArray:
+        """(S,) [m²] of each segment."""
+        corners = self.mesh.vertices[self.mesh.faces]
+        twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        return np.asarray(0.5 * np.bincount(self.mesh.face_segment, twice, len(self.body.tree.segments)))
 
     def posed(self, state: BodyState) -> NDArray:
         """(V, 3) [m] its mesh in the world; kept for the state that was asked for last."""

@@ -10,40 +10,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
-from kinefit.errors import ObservationError
+from kinefit.bodies import BodyState
 from kinefit.losses import SQUARED, Loss
-from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
+from kinefit.solvers.border_frames import (
+    POSTURE,
+    Frame,
+    Problem,
+    Weighing,
+    differences,
+    gram,
+    limits,
+    settle,
+    solved,
+)
 from kinefit.solvers.equations import lock
-from kinefit.solvers.whitened import Pose, columns, residuals, softening
-
-POSTURE = 0.01
-"""Share of the body's posture prior that holds poses here: in full it would bend lengths."""
 
 _FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
+_LITTLE = 1e-9  # damping, as such a share, that is as good as none
+_STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
-_FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
-
-Part = tuple[str, AnyRows]
-"""Rows, and the name of the sensor that made them."""
-
-
-class Problem(Protocol):
-    """What the parameters and the frames are."""
-
-    def body(self, theta: NDArray) -> Body:
-        """The body with parameters (p,)."""
-        ...
-
-    def parts(self, theta: NDArray, frame: int, state: BodyState) -> Sequence[Part]:
-        """Rows of one frame's sensors; the same in number and order for all parameters and states."""
-        ...
+_NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
+_LEAST = 3.0  # [1/m², 1/rad²] damping of poses when they move with parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +80,12 @@ class Bordered:
 class _Block:
     """One frame's part of the arrow."""
 
-    H: NDArray  # (n, n)
+    frame: Frame
+    by_theta: NDArray  # (N, p) whitened, as it was found
+    felt: NDArray  # (N,) bool
     B: NDArray  # (n, p)
     S: NDArray  # (p, p)
-    g: NDArray  # (n,)
     b: NDArray  # (p,)
-    held: NDArray  # (n,) bool, at a limit or fixed: does not move
-    fixed: NDArray  # (n,) bool, known
 
 
 def solve(
@@ -108,7 +99,7 @@ def solve(
     loss: Loss = SQUARED,
     posture: float = POSTURE,
     max_iterations: int = 20,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
 
@@ -130,30 +121,36 @@ def solve(
     ObservationError
         A sensor whose rows differ in number between two worlds; rows that the body cannot take.
     """
-    task = _Task(problem, prior, np.asarray(steps, float), dict(shares or {}), loss, posture)
-    theta = np.array(theta, float)
-    tree = problem.body(theta).tree
-    bounds = tree.lower, tree.upper
-    states = tuple(s.retract(np.zeros(tree.n_dofs), bounds) for s in states)
-    cost, blocks = task.cost(theta, states), task.blocks(theta, states)
-    mean = float(np.mean([np.trace(b.H) / len(b.H) for b in blocks])) if blocks else 1.0
-    damping, growth, converged, iteration = _FIRST * mean, 2.0, False, 0
-    for iteration in range(1, max_iterations + 1):
+    task = _Task(problem, prior, np.asarray(steps, float), Weighing(shares or {}, loss, posture))
+    theta, bounds = np.array(theta, float), limits(problem.body(theta))
+    states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
+    frames, states = settle(problem, theta, states, task.weighing)
+    cost, blocks = task.cost(theta, frames), task.blocks(theta, states, frames, None)
+    mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
+    damping, growth, converged, iterations, far = _FIRST * mean, 2.0, False, 0, 0.0
+    while iterations < max_iterations and not converged:
+        iterations += 1
         delta, moves, predicted = task.step(theta, blocks, damping)
         if predicted <= tolerance * cost + 1e-300:
             converged = True
-            break
+            continue
         trial = theta + delta
-        moved = tuple(s.retract(m, bounds) for s, m in zip(states, moves, strict=True))
-        new = task.cost(trial, moved)
+        moved = [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)]
+        settled, moved = settle(problem, trial, moved, task.weighing)
+        new = task.cost(trial, settled)
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
+        damping = max(damping, _LITTLE * mean)
         if new < cost:
-            theta, states, cost = trial, moved, new
-            blocks = task.blocks(theta, states)
+            turns = np.array([a.difference(b) for a, b in zip(states, moved)])
+            far += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
+            theta, states, frames, cost = trial, moved, settled, new
+            near = blocks if far <= _NEAR else None
+            far = far if near else 0.0
+            blocks = task.blocks(theta, states, frames, near)
         elif damping > _MOST * mean:
             converged = True
-            break
-    return Bordered(theta, states, _information(blocks, len(theta)), prior, cost, iteration, converged)
+    information = _information(blocks, len(theta), lock(problem.body(theta), None))
+    return Bordered(theta, tuple(states), information, prior, cost, iterations, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,122 +160,57 @@ class _Task:
     problem: Problem
     prior: Prior
     steps: NDArray
-    shares: Mapping[str, float]
-    loss: Loss
-    posture: float
+    weighing: Weighing
 
-    def _pull(self, body: Body) -> NDArray:
-        """(D,) weight of the posture prior: no more than the sensor counts that counts most."""
-        most = max(self.shares.values()) if self.shares else 1.0
-        return np.asarray(most * self.posture / np.square(body.tree.spread))
+    @property
+    def _least(self) -> float:
+        """Damping of poses in steps with θ: angles that hardly anything holds settle by themselves."""
+        return _LEAST * self.weighing.most
 
-    def cost(self, theta: NDArray, states: Sequence[BodyState]) -> float:
+    def cost(self, theta: NDArray, frames: Sequence[Frame]) -> float:
         """Of rows, postures and prior."""
-        body, away = self.problem.body(theta), theta - self.prior.mean
-        pull, total = self._pull(body), float(away @ self.prior.information @ away)
-        for f, state in enumerate(states):
-            total += float(pull @ np.square(state.angles - body.tree.usual))
-            for sensor, rows in self.problem.parts(theta, f, state):
-                total += self.shares.get(sensor, 1.0) * softening(rows, self.loss)[1]
-        return total
+        away = theta - self.prior.mean
+        return float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
 
-    def blocks(self, theta: NDArray, states: Sequence[BodyState]) -> list[_Block]:
-        """The frames' parts of the arrow."""
-        body = self.problem.body(theta)
-        centre = [self.problem.parts(theta, f, s) for f, s in enumerate(states)]
-        soft = [
-            np.concatenate([np.sqrt(self.shares.get(k, 1.0)) * softening(r, self.loss)[0] for k, r in parts] or [[]])
-            for parts in centre
-        ]
-        by_theta = self._differences(theta, states, centre)
-        pull, locked = self._pull(body), lock(body, None)
+    def blocks(
+        self, theta: NDArray, states: Sequence[BodyState], frames: Sequence[Frame], near: Sequence[_Block] | None
+    ) -> list[_Block]:
+        """The frames' parts of the arrow, with the derivatives by θ of `near` blocks where those will do."""
+        felt = [frame.felt for frame in frames]
+        if near is not None and all(np.array_equal(a.felt, b) for a, b in zip(near, felt, strict=True)):
+            by_theta = [block.by_theta for block in near]
+        else:
+            by_theta = differences(self.problem, theta, self.steps, states)
         out = []
-        for state, parts, factor, T in zip(states, centre, soft, by_theta, strict=True):
-            pose = Pose.of(body, state)
-            n = body.tree.n_dofs
-            J = factor[:, None] * np.concatenate([columns(r, pose) for _, r in parts] or [np.empty((0, n))])
-            T, left = factor[:, None] * T, factor * _stacked(parts)
-            H, g = J.T @ J, J.T @ left
-            H[range(6, n), range(6, n)] += pull
-            g[6:] -= pull * (state.angles - body.tree.usual)
-            held = locked.copy()
-            held[6:] |= (state.angles <= body.tree.lower) & (g[6:] < 0.0)
-            held[6:] |= (state.angles >= body.tree.upper) & (g[6:] > 0.0)
-            out.append(_Block(H, J.T @ T, T.T @ T, g, T.T @ left, held, locked))
-        return out
-
-    def _differences(
-        self, theta: NDArray, states: Sequence[BodyState], centre: Sequence[Sequence[Part]]
-    ) -> list[NDArray]:
-        """(N, p) of every frame: how far each row's point moves, whitened, with each parameter."""
-        out = [np.zeros((sum(len(r) for _, r in parts), len(theta))) for parts in centre]
-        counted = [np.concatenate([_counted(r) for _, r in parts] or [np.empty(0, bool)]) for parts in centre]
-        for k, step in enumerate(self.steps):
-            for sign in (-1.0, 1.0):
-                other = theta.copy()
-                other[k] += sign * step
-                for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-                    moved = self.problem.parts(other, f, state)
-                    _same(parts, moved)
-                    out[f][:, k] -= sign * _stacked(moved) / (2.0 * step)
-        for rows, some in zip(out, counted, strict=True):
-            rows[~some] = 0.0
+        for frame, D, some in zip(frames, by_theta, felt, strict=True):
+            T = (frame.factor * some)[:, None] * D
+            out.append(_Block(frame, D, some, gram(frame.J, T), gram(T, T), frame.left @ T))
         return out
 
     def step(self, theta: NDArray, blocks: Sequence[_Block], damping: float) -> tuple[NDArray, list[NDArray], float]:
         """δθ (p,), each pose's δ (n,), and the predicted fall of the cost."""
         p = len(theta)
-        S = self.prior.information + damping * np.eye(p)
+        S = self.prior.information + _STIFF * damping * np.eye(p)
         pull = self.prior.information @ (self.prior.mean - theta)
         b, kept = pull.copy(), []
         for block in blocks:
-            back = _eliminated(block, block.held, damping)
-            S += block.S - block.B.T @ back[:, :p]
-            b += block.b - block.B.T @ back[:, p]
+            frame = block.frame
+            back = solved(frame.H, np.column_stack([block.B, frame.g]), frame.held, damping + self._least)
+            both = gram(block.B, back)
+            S += block.S - both[:, :p]
+            b += block.b - both[:, p]
             kept.append(back)
-        delta = np.linalg.solve(S, b) if p else np.empty(0)
+        delta = np.linalg.solve(S, b)
         moves = [back[:, p] - back[:, :p] @ delta for back in kept]
-        fall = float(delta @ pull) + damping * float(delta @ delta)
+        fall = float(delta @ pull) + _STIFF * damping * float(delta @ delta)
         for block, move in zip(blocks, moves, strict=True):
-            fall += float(block.b @ delta + block.g @ move) + damping * float(move @ move)
+            fall += float(block.b @ delta + block.frame.g @ move) + (damping + self._least) * float(move @ move)
         return delta, moves, fall
 
 
-def _eliminated(block: _Block, held: NDArray, damping: float) -> NDArray:
-    """(n, p + 1) H⁻¹ [B, g] of a pose, zero for what is held."""
-    n = len(block.g)
-    A, right = block.H.copy(), np.column_stack([block.B, block.g])
-    A[range(n), range(n)] += damping + _FLOOR * float(np.trace(block.H)) / n + 1e-12
-    A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
-    A[held, held] = 1.0
-    return np.linalg.solve(A, right)
-
-
-def _information(blocks: Sequence[_Block], p: int) -> NDArray:
+def _information(blocks: Sequence[_Block], p: int, known: NDArray) -> NDArray:
     """(p, p) what all frames tell of θ with their poses unknown; limits of joints tell nothing."""
     out = np.zeros((p, p))
     for block in blocks:
-        out += block.S - block.B.T @ _eliminated(block, block.fixed, 0.0)[:, :p]
+        out += block.S - gram(block.B, solved(block.frame.H, block.B, known, 0.0))
     return 0.5 * (out + out.T)
-
-
-def _stacked(parts: Sequence[Part]) -> NDArray:
-    """(N,) whitened residuals of all rows of a frame."""
-    return np.concatenate([residuals(r) for _, r in parts]) if parts else np.empty(0)
-
-
-def _counted(rows: AnyRows) -> NDArray:
-    """(N,) bool, rows with a weight: a slack rope's row must not feel its length."""
-    return np.ones(len(rows), bool) if rows.weight.ndim == 2 else rows.weight > 0.0
-
-
-def _same(parts: Sequence[Part], moved: Sequence[Part]) -> None:
-    """Rows of one match correspond one to one in all worlds."""
-    for (sensor, a), (other, b) in zip(parts, moved):
-        if sensor != other or len(a) != len(b) or type(a) is not type(b):
-            problem = f"sensor '{sensor}' gives {len(a)} rows of a match, and {len(b)} of the same with another body"
-            raise ObservationError(problem, remedy="Give all rows of a match always; weight 0 for one that is not felt.")
-    if len(parts) != len(moved):
-        sensor = max(parts, moved, key=len)[-1][0]
-        problem = f"sensor '{sensor}' gives other kinds of rows of the same match with another body"
-        raise ObservationError(problem, remedy="Give all rows of a match always; weight 0 for one that is not felt.")

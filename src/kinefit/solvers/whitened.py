@@ -1,4 +1,4 @@
-"""Rows of any kind as whitened residuals √w·r, with their derivatives by the degrees of freedom: what a border needs."""
+"""Rows of any kind as whitened residuals √w·r, with their derivatives by the degrees of freedom."""
 
 from __future__ import annotations
 

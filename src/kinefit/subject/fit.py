@@ -16,12 +16,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
-from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, check_rows
-from kinefit.sensors.scene import Scene
-from kinefit.solvers.border import POSTURE, Bordered, Part, Prior, solve
+from kinefit.sensors.base import Measurement
+from kinefit.solvers.border import Bordered, Prior, solve
+from kinefit.solvers.border_frames import POSTURE
 from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
+from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
 
 REACH = (0.08, 0.05, 0.03)
@@ -30,10 +30,9 @@ REACH = (0.08, 0.05, 0.03)
 TOLD = 0.1
 """Share of the prior's variance that data must explain for a direction to count as measured."""
 
-_ITERATIONS = 15  # of the solver, a round of settled correspondences
-_ANEW = 3  # of one where some are sought anew
+_ITERATIONS = 15  # of the solver, in the last rounds
+_COARSE = 4  # of one where some are sought anew, or reach farther than in the end
 _DONE = 0.01  # posterior standard deviations of a change between rounds that is none
-_KEPT = 64  # worlds and rows that are remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,31 +147,30 @@ def fit_subject(
         problem = f"{rounds} rounds, {len(reach)} reaches, {looks} looks"
         raise ObservationError(problem, remedy="Give one round and one reach at least, and looks above 0.")
     names, mean, information, step = stacked(parameters)
-    worlds, prior = _Worlds(World(body, rig), parameters), Prior(mean, information)
+    worlds, prior = Worlds(World(body, rig), parameters), Prior(mean, information)
     theta = np.array(mean if start is None else start, float)
     if theta.shape != mean.shape:
         raise ObservationError(f"a start of shape {theta.shape}", remedy=f"Give ({len(mean)},): {', '.join(names)}.")
-    settled = {m.sensor: m.settled for several in steps for m in several}
-    iterations = _ITERATIONS if all(settled.values()) else _ANEW
-    sensors, solved, shares, used = tuple(settled), None, {}, 0
-    fit = lambda problem, theta, states, shares, iterations: solve(
-        problem, theta, states, prior, step, shares=shares, loss=loss, posture=posture, max_iterations=iterations
-    )
-    if looks is not None:
-        shares = dict.fromkeys(sensors, min(looks / len(steps), 1.0))
+    sensors = tuple({m.sensor: None for several in steps for m in several})
+    anew = not all(m.settled for several in steps for m in several)
+    shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
+    told = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
-        problem = _Frames(worlds, steps, velocities, theta, states, reach[min(used, len(reach)) - 1])
-        before = theta
-        solved = fit(problem, theta, states, shares, iterations)
-        theta, states = solved.theta, solved.states
-        moved = float((theta - before) @ (prior.information + solved.information) @ (theta - before))
-        if used > 1 and all(settled.values()) and solved.converged and moved < _DONE**2:
+        frames = MatchedFrames(worlds, steps, velocities, theta, states, reach[min(used, len(reach)) - 1])
+        coarse, before = anew or used < min(len(reach), rounds), theta
+        solved = solve(
+            frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
+            max_iterations=_COARSE if coarse else _ITERATIONS,
+        )  # fmt: skip
+        theta, states, moved = solved.theta, solved.states, solved.theta - before
+        if not coarse and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
             break
-    told = dict.fromkeys(sensors, 1.0 / shares[sensors[0]]) if shares else {}
     if looks is None:
-        told = excess(problem.all_parts(theta, states), settled, _followed(body, solved))
+        told = excess(frames.seen(theta, states), _followed(body, solved))
         shares = {sensor: 1.0 / told.get(sensor, 1.0) for sensor in sensors}
-        solved = fit(problem, theta, states, shares, _ITERATIONS)
+        solved = solve(
+            frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture, max_iterations=_ITERATIONS
+        )
     world = worlds.at(solved.theta)
     return Subject(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),
@@ -198,93 +196,3 @@ def _followed(body: Body, solved: Bordered) -> float:
     """How many mean residuals a fit can make zero."""
     posterior = inverse(solved.prior.information + solved.information)
     return body.tree.n_dofs + len(solved.theta) - float(np.sum(solved.prior.information * posterior))
-
-
-class _Worlds:
-    """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
-
-    def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
-        self._first, self._parameters = world, tuple(parameters)
-        self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
-        self._scenes: dict[tuple[int, int], tuple[World, Scene]] = {}
-
-    def at(self, theta: NDArray) -> World:
-        """The world with parameters (p,)."""
-        world, first = self._first, 0
-        for one in self._parameters:
-            values = theta[first : first + len(one.names)]
-            first += len(values)
-            key = id(world), values.tobytes()
-            if key not in self._kept:
-                if len(self._kept) >= _KEPT:
-                    self._kept.pop(next(iter(self._kept)))
-                self._kept[key] = world, one.apply(world, values)
-            self._kept[key] = self._kept.pop(key)  # the latest last
-            world = self._kept[key][1]
-        return world
-
-    def scene(self, world: World, state: BodyState) -> Scene:
-        """A scene of a world; those of one body and rig share what was made for them."""
-        key = id(world.body), id(world.rig)
-        if key not in self._scenes:
-            if len(self._scenes) >= 4:
-                self._scenes.pop(next(iter(self._scenes)))
-            self._scenes[key] = world, Scene(world.body, state, world.rig)
-        return self._scenes[key][1].at(state, values=world.values)
-
-
-class _Frames:
-    """Frames with their correspondences: the problem that the solver sees."""
-
-    def __init__(
-        self, worlds: _Worlds, steps: Sequence[Sequence[Measurement]], velocities: Sequence[NDArray] | None,
-        theta: NDArray, states: Sequence[BodyState], reach: float,
-    ) -> None:  # fmt: skip
-        self._worlds, self._steps, self._velocities = worlds, steps, velocities
-        self._matched: list[list[Matched]] = []
-        self._latest: dict[tuple[int, int], tuple[BodyState, World, list[AnyRows]]] = {}
-        world = worlds.at(theta)
-        for f, state in enumerate(states):
-            scene = self._scene(world, f, state)
-            self._matched.append([m.match(scene, reach) for m in steps[f]])
-
-    def body(self, theta: NDArray) -> Body:
-        """The body with parameters (p,)."""
-        return self._worlds.at(theta).body
-
-    def parts(self, theta: NDArray, frame: int, state: BodyState) -> list[Part]:
-        """Rows of one frame's sensors."""
-        world = self._worlds.at(theta)
-        scene = self._scene(world, frame, state)
-        out: list[Part] = []
-        for i, (measurement, matched) in enumerate(zip(self._steps[frame], self._matched[frame], strict=True)):
-            out += [(measurement.sensor, rows) for rows in self._rows((frame, i), measurement.sensor, matched, scene, world)]
-        return out
-
-    def all_parts(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Part]]:
-        """Rows of all frames."""
-        return [self.parts(theta, f, state) for f, state in enumerate(states)]
-
-    def _rows(
-        self, key: tuple[int, int], sensor: str, matched: Matched, scene: Scene, world: World
-    ) -> list[AnyRows]:
-        """Rows of one measurement; those of a world that differs in nothing that it can know of are not made again."""
-        kept = self._latest.get(key)
-        same = kept is not None and kept[0] is scene.state
-        if same and kept is not None and _alike(kept[1], world, sensor):
-            return kept[2]
-        rows = check_rows(matched.rows(scene), sensor, world.body)
-        if not same:
-            self._latest[key] = scene.state, world, rows
-        return rows
-
-    def _scene(self, world: World, frame: int, state: BodyState) -> Scene:
-        several = self._steps[frame]
-        velocity = None if self._velocities is None else self._velocities[frame]
-        scene = self._worlds.scene(world, state)
-        return scene.at(state, time=several[0].time, velocity=velocity, measurements=several)
-
-
-def _alike(a: World, b: World, sensor: str) -> bool:
-    """Whether a sensor's rows are the same in two worlds."""
-    return a.body is b.body and a.rig is b.rig and a.values.get(sensor) == b.values.get(sensor)

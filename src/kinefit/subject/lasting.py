@@ -7,7 +7,7 @@ one F-th of the variance of a single one. That ratio is by how much the data of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,61 +36,84 @@ class _Residuals:
         return np.bincount(index), np.bincount(index, self.value[good]), size
 
 
-def excess(
-    frames: Sequence[Sequence[tuple[str, AnyRows]]], settled: Mapping[str, bool], followed: float
-) -> dict[str, float]:
-    """{sensor: factor ≥ 1} by which the variance of what all frames tell together is larger than rows say.
-
-    A channel is a row's measurement id (`Rows.group`) and its place in it; of correspondences that are sought anew
-    (`settled` False), also whole segments, because the error of a surface lasts over a patch of it.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Rows of one measurement of a frame, at the fit.
 
     Parameters
     ----------
-    frames : rows of every frame, by sensor, at the fit.
-    settled : {sensor: bool}
+    sensor : str
+    rows : Sequence of rows of any kind
+    of_points : whether each point has errors of its own; else those of one segment err alike
+    names : of the points, where ids of measurements (`Rows.group`) count those seen only; else the ids name them
+    """
+
+    sensor: str
+    rows: Sequence[AnyRows]
+    of_points: bool = True
+    names: tuple[str, ...] | None = None
+
+
+def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float]:
+    """{sensor: factor ≥ 1} by which the variance of what all frames tell together is larger than rows say.
+
+    A channel is a row's measurement id and its place in it; of surfaces also a whole segment, because their errors last
+    over a patch.
+
+    Parameters
+    ----------
+    frames : what every frame's sensors saw
     followed : number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data tell.
     """
-    by_channel, by_segment = _collect(frames, segments=False), _collect(frames, segments=True)
+    by_channel, by_segment = _collect(frames, _channels), _collect(frames, _segments)
+    surfaces = {one.sensor for several in frames for one in several if not one.of_points}
     sums = {name: one.sums() for name, one in by_channel.items() if len(one.value) >= _FEWEST}
     channels = sum(len(count) for count, _, _ in sums.values())
     hidden = min(followed / max(channels, 1), _MOST_HIDDEN)
     out = {}
     for name, (count, total, size) in sums.items():
-        lasting = float(np.sum(total**2)) / max(float(count.sum()), 1.0) / (1.0 - hidden)
-        if not settled.get(name, True):
-            count, total, _ = by_segment[name].sums()
-            lasting = max(lasting, float(np.sum(total**2)) / max(float(count.sum()), 1.0))
+        lasting = _lasting(count, total) / (1.0 - hidden)
+        if name in surfaces:
+            lasting = max(lasting, _lasting(*by_segment[name].sums()[:2]))
         out[name] = max(lasting, size**2, 1.0)
     return out
 
 
-def _collect(frames: Sequence[Sequence[tuple[str, AnyRows]]], *, segments: bool) -> dict[str, _Residuals]:
+def _lasting(count: NDArray, total: NDArray) -> float:
+    """Variance of channels' means, times the number of frames: one where nothing lasts."""
+    return float(np.sum(total**2)) / max(float(count.sum()), 1.0)
+
+
+def _collect(
+    frames: Sequence[Sequence[Seen]], channels: Callable[[AnyRows, tuple[str, ...] | None, int], list[Hashable]]
+) -> dict[str, _Residuals]:
     """Residuals of each sensor with their channels."""
     values: dict[str, list[NDArray]] = {}
-    channels: dict[str, list[NDArray]] = {}
-    for parts in frames:
-        count: dict[str, int] = {}
-        for sensor, rows in parts:
-            place = count[sensor] = count.get(sensor, -1) + 1
-            felt = rows.weight > 0.0 if rows.weight.ndim == 1 else np.ones(len(rows), bool)
-            own = _segments(rows) if segments else _channels(rows) + 1_000_000 * place
-            values.setdefault(sensor, []).append(residuals(rows)[felt])
-            channels.setdefault(sensor, []).append(own[felt])
-    return {s: _Residuals(np.concatenate(values[s]), np.concatenate(channels[s])) for s in values}
+    found: dict[str, list[int]] = {}
+    known: dict[Hashable, int] = {}
+    for several in frames:
+        for one in several:
+            for place, rows in enumerate(one.rows):
+                felt = rows.weight > 0.0 if rows.weight.ndim == 1 else np.ones(len(rows), bool)
+                values.setdefault(one.sensor, []).append(residuals(rows)[felt])
+                own = channels(rows, one.names, place)
+                ids = [known.setdefault(own[k], len(known)) for k in np.flatnonzero(felt)]
+                found.setdefault(one.sensor, []).extend(ids)
+    return {s: _Residuals(np.concatenate(v), np.array(found[s], np.int64)) for s, v in values.items()}
 
 
-def _segments(rows: AnyRows) -> NDArray:
+def _segments(rows: AnyRows, names: tuple[str, ...] | None, place: int) -> list[Hashable]:
     """(N,) segment of each row; one for all where they are on several."""
-    return rows.segment if isinstance(rows, Rows) else np.zeros(len(rows), np.int64)
+    return rows.segment.tolist() if isinstance(rows, Rows) else [0] * len(rows)
 
 
-def _channels(rows: AnyRows) -> NDArray:
-    """(N,) measurement id and place within it, of up to ten rows; else the place among all."""
-    if not isinstance(rows, Rows | DofRows) or np.any(rows.group < 0):
-        return np.arange(len(rows))
-    order = np.argsort(rows.group, kind="stable")
-    ids = rows.group[order]
-    first = np.searchsorted(ids, ids)
-    place = np.empty(len(rows), np.int64)
-    place[order] = np.minimum(np.arange(len(rows)) - first, 9)
-    return 10 * rows.group + place
+def _channels(rows: AnyRows, names: tuple[str, ...] | None, place: int) -> list[Hashable]:
+    """(N,) what each row measures: which rows of a measurement, its id or name, and its place in it."""
+    if not isinstance(rows, Rows | DofRows):
+        return [(place, k) for k in range(len(rows))]
+    count: dict[int, int] = {}
+    out: list[Hashable] = []
+    for g in rows.group.tolist():
+        count[g] = count.get(g, -1) + 1
+        out.append((place, names[g] if names is not None and 0 <= g < len(names) else g, count[g]))
+    return out

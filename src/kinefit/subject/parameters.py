@@ -6,7 +6,7 @@ knows of parameters: the solver compares the rows of the same correspondences in
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -17,9 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.errors import BodyError, ObservationError, choices
-from kinefit.geometry import se3
-from kinefit.geometry.camera import Camera, Rig
-from kinefit.sensors.base import Sensor, Unknown
+from kinefit.geometry.camera import Rig
 from kinefit.solvers.shape import PROPORTIONS, mirror_points
 
 UNKNOWN_SIZE, KNOWN_SIZE = 0.2, 0.02
@@ -214,121 +212,6 @@ class PointOffsets:
         return replace(world, body=replace(body, marker_sets={**body.marker_sets, self.name: moved}))
 
 
-@dataclass(frozen=True, eq=False)
-class CameraExtrinsics:
-    """Six parameters a camera: the twist (v, ω) [m, rad] of its pose, in its own frame.
-
-    Cameras and bodies may move together unseen. So one camera is the gauge, and stays; or none, where other sensors
-    such as markers know where the world is.
-
-    Parameters
-    ----------
-    rig : Rig, the prior mean.
-    held : name of the camera that stays; None where other sensors hold the world.
-    std : (2,) standard deviations of v [m] and ω [rad].
-    """
-
-    rig: Rig
-    held: str | None
-    std: tuple[float, float] = (0.02, 0.01)
-
-    def __post_init__(self) -> None:
-        if self.held is not None:
-            self.rig.index(self.held)
-        if not min(self.std) > 0:
-            raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
-
-    @property
-    def free(self) -> tuple[str, ...]:
-        """Names of the cameras that move."""
-        return tuple(name for name in self.rig.names if name != self.held)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(6 C,)."""
-        return tuple(f"{camera} {axis}" for camera in self.free for axis in ("tx", "ty", "tz", "rx", "ry", "rz"))
-
-    @property
-    def mean(self) -> NDArray:
-        """(6 C,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
-    def information(self) -> NDArray:
-        """(6 C, 6 C)."""
-        return np.diag(np.tile(np.repeat(self.std, 3), len(self.free)) ** -2.0)
-
-    @property
-    def step(self) -> NDArray:
-        """(6 C,)."""
-        return np.full(len(self.names), _STEP)
-
-    def apply(self, world: World, values: NDArray) -> World:
-        """The rig with its cameras moved."""
-        twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
-        cameras = tuple(_moved(c, twist[c.name]) if c.name in twist else c for c in world.rig)
-        return replace(world, rig=Rig(cameras))
-
-
-def _moved(camera: Camera, twist: NDArray) -> Camera:
-    return camera.with_pose(se3.exp(twist) @ camera.T_camera_world)
-
-
-@dataclass(frozen=True, eq=False)
-class OwnUnknowns:
-    """What sensors do not know of themselves: a rope's length, a clock's delay; `Sensor.unknowns`.
-
-    Parameters
-    ----------
-    unknowns : {sensor: {name: Unknown}}
-    """
-
-    unknowns: Mapping[str, Mapping[str, Unknown]]
-
-    def __post_init__(self) -> None:
-        for sensor, own in self.unknowns.items():
-            for name, unknown in own.items():
-                if not (np.isfinite(unknown.mean) and 0.0 < unknown.std < np.inf):
-                    problem = f"sensor '{sensor}' knows '{name}' as {unknown.mean} ± {unknown.std}"
-                    raise ObservationError(problem, remedy="Give a mean, and a standard deviation above 0.")
-
-    @classmethod
-    def of(cls, sensors: Iterable[Sensor]) -> OwnUnknowns:
-        """Of all sensors that have some."""
-        return cls({s.name: dict(s.unknowns) for s in sensors if s.unknowns})
-
-    @property
-    def _each(self) -> list[tuple[str, str, Unknown]]:
-        return [(sensor, name, u) for sensor, own in self.unknowns.items() for name, u in own.items()]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(p,)."""
-        return tuple(f"{sensor} {name}" for sensor, name, _ in self._each)
-
-    @property
-    def mean(self) -> NDArray:
-        """(p,)."""
-        return np.array([u.mean for _, _, u in self._each])
-
-    @property
-    def information(self) -> NDArray:
-        """(p, p)."""
-        return np.diag([u.std**-2 for _, _, u in self._each])
-
-    @property
-    def step(self) -> NDArray:
-        """(p,) a thousandth of each standard deviation."""
-        return np.array([1e-3 * u.std for _, _, u in self._each])
-
-    def apply(self, world: World, values: NDArray) -> World:
-        """The world with these values."""
-        out = {sensor: dict(own) for sensor, own in world.values.items()}
-        for (sensor, name, _), value in zip(self._each, values, strict=True):
-            out.setdefault(sensor, {})[name] = float(value)
-        return replace(world, values=out)
-
-
 def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray, NDArray, NDArray]:
     """Names, mean (p,), information (p, p) and steps (p,) of several kinds together.
 
@@ -346,4 +229,5 @@ def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray,
     for one in parameters:
         own = slice(first, first := first + len(one.names))
         information[own, own] = one.information
-    return names, np.concatenate([p.mean for p in parameters]), information, np.concatenate([p.step for p in parameters])
+    mean, step = (np.concatenate([getattr(one, what) for one in parameters]) for what in ("mean", "step"))
+    return names, mean, information, step

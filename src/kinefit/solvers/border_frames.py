@@ -1,0 +1,202 @@
+"""One frame of a fit with shared parameters: its rows, the equations of its pose, and derivatives by parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
+from kinefit.losses import SQUARED, Loss
+from kinefit.rows import AnyRows
+from kinefit.solvers import _kernels_border, _kernels_linear
+from kinefit.solvers.equations import lock
+from kinefit.solvers.whitened import Pose, columns, residuals, softening
+
+POSTURE = 0.01
+"""Share of the body's posture prior that holds poses here: in full it would bend lengths."""
+
+_FIRST = 1e-3  # damping to begin with, as a share of the pose's mean diagonal
+_STEPS, _SETTLED = 6, 1e-3  # of a pose by itself, and the fall of its cost at which it rests
+_FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
+
+Part = tuple[str, AnyRows]
+"""Rows, and the name of the sensor that made them."""
+
+
+class Problem(Protocol):
+    """What the parameters and the frames are."""
+
+    def body(self, theta: NDArray) -> Body:
+        """The body with parameters (p,)."""
+        ...
+
+    def parts(self, theta: NDArray, frame: int, state: BodyState) -> Sequence[Part]:
+        """Rows of one frame's sensors; the same in number and order for all parameters and states."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Weighing:
+    """How much everything counts.
+
+    Parameters
+    ----------
+    shares : {sensor: 0..1} how much a sensor's rows count, where its errors last; 1 for those not named.
+    loss : Loss of rows without their own.
+    posture : share of the body's posture prior that holds the poses.
+    """
+
+    shares: Mapping[str, float] = field(default_factory=dict)
+    loss: Loss = SQUARED
+    posture: float = POSTURE
+
+    @property
+    def most(self) -> float:
+        """The share of the sensor that counts most; postures count no more."""
+        return max(self.shares.values()) if self.shares else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One frame's rows and the equations of its pose.
+
+    Parameters
+    ----------
+    parts : its rows, by sensor
+    factor : (N,) square root of shares and robust factors
+    J : (N, n) derivatives by the pose, whitened and softened; left : (N,) residuals, likewise
+    H, g : (n, n), (n,) equations of the pose, with its posture prior
+    held : (n,) bool, at a limit that it presses on, or fixed: does not move
+    cost : float
+    """
+
+    parts: Sequence[Part]
+    factor: NDArray
+    J: NDArray
+    left: NDArray
+    H: NDArray
+    g: NDArray
+    held: NDArray
+    cost: float
+
+    @property
+    def felt(self) -> NDArray:
+        """(N,) bool, rows with a weight: a slack rope's row must not feel its length."""
+        felt = [np.ones(len(r), bool) if r.weight.ndim == 2 else r.weight > 0.0 for _, r in self.parts]
+        return np.concatenate([*felt, np.empty(0, bool)])
+
+    def step(self, damping: float) -> tuple[NDArray, float]:
+        """δ (n,) of the pose alone, and the predicted fall of the cost."""
+        move = solved(self.H, self.g[:, None], self.held, damping)[:, 0]
+        return move, float(self.g @ move) + damping * float(move @ move)
+
+
+def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, weighing: Weighing) -> Frame:
+    """A frame's rows and equations at parameters (p,) and a state."""
+    body = problem.body(theta)
+    tree, n = body.tree, body.tree.n_dofs
+    parts, pose = problem.parts(theta, frame, state), Pose.of(body, state)
+    pull = weighing.most * weighing.posture / np.square(tree.spread)
+    away, factors, cost = state.angles - tree.usual, [np.empty(0)], 0.0
+    for sensor, rows in parts:
+        share = weighing.shares.get(sensor, 1.0)
+        soft, own = softening(rows, weighing.loss)
+        factors.append(np.sqrt(share) * soft)
+        cost += share * own
+    factor = np.concatenate(factors)
+    J = factor[:, None] * np.concatenate([*(columns(r, pose) for _, r in parts), np.empty((0, n))])
+    left = factor * _stacked(parts)
+    H, g, held = gram(J, J), left @ J, lock(body, None)
+    H[range(6, n), range(6, n)] += pull
+    g[6:] -= pull * away
+    held[6:] |= (state.angles <= tree.lower) & (g[6:] < 0.0)
+    held[6:] |= (state.angles >= tree.upper) & (g[6:] > 0.0)
+    return Frame(parts, factor, J, left, H, g, held, cost + float(pull @ np.square(away)))
+
+
+def settle(
+    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing
+) -> tuple[list[Frame], list[BodyState]]:
+    """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
+    bounds, frames, out = limits(problem.body(theta)), [], []
+    for f, state in enumerate(states):
+        frame = frame_at(problem, theta, f, state, weighing)
+        damping, growth = _FIRST * float(np.trace(frame.H)) / len(frame.H) + 1e-12, 2.0
+        for _ in range(_STEPS):
+            move, predicted = frame.step(damping)
+            if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
+                break
+            moved = state.retract(move, bounds)
+            new = frame_at(problem, theta, f, moved, weighing)
+            damping, growth = _kernels_linear.adapt(damping, growth, frame.cost - new.cost, predicted)
+            if new.cost < frame.cost:
+                frame, state = new, moved
+        frames.append(frame)
+        out.append(state)
+    return frames, out
+
+
+def limits(body: Body) -> tuple[NDArray, NDArray]:
+    """(D,) lower and upper ends of every coordinate."""
+    return body.tree.lower, body.tree.upper
+
+
+def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
+    """(N, p) of every frame: how far each row's point moves, whitened, with each parameter; central differences.
+
+    Raises
+    ------
+    ObservationError
+        A sensor whose rows differ in number or kind between two worlds.
+    """
+    centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
+    out = [np.zeros((sum(len(rows) for _, rows in parts), len(theta))) for parts in centre]
+    for k, step in enumerate(steps):
+        for sign in (-1.0, 1.0):
+            other = np.array(theta, float)
+            other[k] += sign * step
+            for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
+                moved = problem.parts(other, f, state)
+                _same(parts, moved)
+                out[f][:, k] -= sign * _stacked(moved) / (2.0 * step)
+    return out
+
+
+def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:
+    """(n, m) H⁻¹ right of a pose, zero for what is held."""
+    n = len(H)
+    A, right = H.copy(), np.ascontiguousarray(right).copy()
+    A[range(n), range(n)] += damping + _FLOOR * float(np.trace(H)) / n + 1e-12
+    A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
+    A[held, held] = 1.0
+    return right if _kernels_border.solve(A.copy(), right) else np.linalg.lstsq(A, right)[0]
+
+
+def gram(A: NDArray, B: NDArray) -> NDArray:
+    """(n, m) Aᵀ B."""
+    out = np.zeros((A.shape[1], B.shape[1]))
+    _kernels_border.gram(np.ascontiguousarray(A), np.ascontiguousarray(B), out)
+    return out
+
+
+def _stacked(parts: Sequence[Part]) -> NDArray:
+    """(N,) whitened residuals of all rows of a frame."""
+    return np.concatenate([residuals(r) for _, r in parts]) if parts else np.empty(0)
+
+
+def _same(parts: Sequence[Part], moved: Sequence[Part]) -> None:
+    """Rows of one match correspond one to one in all worlds."""
+    remedy = "Give all rows of a match always; weight 0 for one that is not felt."
+    for (sensor, a), (other, b) in zip(parts, moved):
+        if sensor != other or len(a) != len(b) or type(a) is not type(b):
+            problem = f"sensor '{sensor}' gives {len(a)} rows of a match, and {len(b)} of the same with another body"
+            raise ObservationError(problem, remedy=remedy)
+    if len(parts) != len(moved):
+        sensor = max(parts, moved, key=len)[-1][0]
+        problem = f"sensor '{sensor}' gives other kinds of rows of the same match with another body"
+        raise ObservationError(problem, remedy=remedy)

@@ -1,0 +1,126 @@
+"""Frames with their correspondences, in worlds that parameters make: the problem that a subject fit solves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
+from kinefit.sensors.scene import Scene
+from kinefit.solvers.border_frames import Part
+from kinefit.subject.lasting import Seen
+from kinefit.subject.parameters import Parameters, World
+
+_KEPT = 64  # worlds that are remembered
+
+
+class Worlds:
+    """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
+
+    def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
+        self._first = world
+        ends = np.cumsum([0, *(len(one.names) for one in parameters)])
+        self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
+        self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
+        self._scenes: dict[tuple[int, int], tuple[World, Scene]] = {}
+
+    def at(self, theta: NDArray) -> World:
+        """The world with parameters (p,)."""
+        world = self._first
+        for one, own in self._parameters:
+            values = theta[own]
+            key = id(world), values.tobytes()
+            if key not in self._kept:
+                if len(self._kept) >= _KEPT:
+                    self._kept.pop(next(iter(self._kept)))
+                self._kept[key] = world, one.apply(world, values)
+            self._kept[key] = self._kept.pop(key)  # the latest last
+            world = self._kept[key][1]
+        return world
+
+    def scene(self, world: World, state: BodyState) -> Scene:
+        """A scene of a world; those of one body and rig share what was made for them."""
+        key = id(world.body), id(world.rig)
+        if key not in self._scenes:
+            if len(self._scenes) >= 4:
+                self._scenes.pop(next(iter(self._scenes)))
+            self._scenes[key] = world, Scene(world.body, state, world.rig)
+        return self._scenes[key][1].at(state, values=world.values)
+
+
+class MatchedFrames:
+    """Frames with their correspondences: the problem that the solver sees."""
+
+    def __init__(
+        self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], velocities: Sequence[NDArray] | None,
+        theta: NDArray, states: Sequence[BodyState], reach: float,
+    ) -> None:  # fmt: skip
+        self._worlds, self._steps, self._velocities = worlds, steps, velocities
+        self._matched: list[list[Matched]] = []
+        self._latest: dict[tuple[int, int], tuple[BodyState, World, list[AnyRows]]] = {}
+        world = worlds.at(theta)
+        for f, state in enumerate(states):
+            scene = self._scene(world, f, state)
+            self._matched.append([matched_by(m, scene, reach) for m in steps[f]])
+
+    def body(self, theta: NDArray) -> Body:
+        """The body with parameters (p,)."""
+        return self._worlds.at(theta).body
+
+    def parts(self, theta: NDArray, frame: int, state: BodyState) -> list[Part]:
+        """Rows of one frame's sensors."""
+        world = self._worlds.at(theta)
+        scene = self._scene(world, frame, state)
+        out: list[Part] = []
+        for i, (measurement, matched) in enumerate(zip(self._steps[frame], self._matched[frame], strict=True)):
+            rows = self._rows((frame, i), measurement.sensor, matched, scene, world)
+            out += [(measurement.sensor, part) for part in rows]
+        return out
+
+    def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
+        """What every frame's sensors saw, with the names of what they saw."""
+        world, out = self._worlds.at(theta), []
+        for f, state in enumerate(states):
+            scene = self._scene(world, f, state)
+            out.append([
+                Seen(
+                    m.sensor, self._rows((f, i), m.sensor, matched, scene, world), matched.of_points,
+                    _names(matched, scene),
+                )
+                for i, (m, matched) in enumerate(zip(self._steps[f], self._matched[f], strict=True))
+            ])
+        return out
+
+    def _rows(
+        self, key: tuple[int, int], sensor: str, matched: Matched, scene: Scene, world: World
+    ) -> list[AnyRows]:
+        """Rows of one measurement; those of a world that differs in nothing that it can know of are not made again."""
+        kept = self._latest.get(key)
+        same = kept is not None and kept[0] is scene.state
+        if same and kept is not None and _alike(kept[1], world, sensor):
+            return kept[2]
+        rows = check_rows(matched.rows(scene), sensor, world.body)
+        if not same:
+            self._latest[key] = scene.state, world, rows
+        return rows
+
+    def _scene(self, world: World, frame: int, state: BodyState) -> Scene:
+        several = self._steps[frame]
+        velocity = None if self._velocities is None else self._velocities[frame]
+        scene = self._worlds.scene(world, state)
+        return scene.at(state, time=several[0].time, velocity=velocity, measurements=several)
+
+
+def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
+    """Names of the points that a match counts, where it has those of one detector or marker system only."""
+    told = matched.leftovers(scene) if matched.of_points else []
+    return told[0].names if len(told) == 1 and told[0].rms is None else None
+
+
+def _alike(a: World, b: World, sensor: str) -> bool:
+    """Whether a sensor's rows are the same in two worlds."""
+    return a.body is b.body and a.rig is b.rig and a.values.get(sensor) == b.values.get(sensor)

@@ -1,0 +1,188 @@
+"""Poses with a border of shared parameters: against a dense solver that knows all unknowns at once."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from tests.oracle import posture, rig_around
+
+from kinefit.bodies import BodyState, load_body
+from kinefit.correspondences import _kernels, pixel_rows, prior_rows, targets
+from kinefit.errors import ObservationError
+from kinefit.losses import SQUARED, huber
+from kinefit.rows import PairRows, ParameterRows
+from kinefit.solvers import _kernels_border
+from kinefit.solvers.border import Prior, solve
+from kinefit.solvers.border_frames import differences
+from kinefit.solvers.shape import shape_parameters
+from kinefit.solvers.whitened import Pose, columns, residuals
+
+ARM = load_body("arm")
+HUMANOID = load_body("humanoid")
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """An arm of unknown lengths (logarithms), its landmarks (K, 3) measured in every frame."""
+
+    seen: list
+    sigma: float = 0.01
+    loss: object = None
+
+    def body(self, theta):
+        return ARM.scaled(np.exp(theta))
+
+    def parts(self, theta, frame, state):
+        body = self.body(theta)
+        x = self.seen[frame]
+        rows = targets.fill(_kernels.point_rows, 3, body, state, body.landmarks, x, np.full(len(x), self.sigma**-2))
+        return [("mocap", replace(rows, loss=self.loss))]
+
+
+def task(frames=3, seed=0, loss=None):
+    random = np.random.default_rng(seed)
+    truth = random.normal(scale=0.05, size=3)
+    body = ARM.scaled(np.exp(truth))
+    tree = ARM.tree
+    states = [BodyState(np.eye(4), np.clip(tree.usual + random.normal(scale=0.3, size=7), tree.lower, tree.upper))
+              for _ in range(frames)]  # fmt: skip
+    seen = [body.positions(s, body.landmarks) + 0.01 * random.normal(size=(len(body.landmarks), 3)) for s in states]
+    return Landmarks(seen, loss=loss), states, Prior(np.zeros(3), np.diag([400.0, 100.0, 400.0]))
+
+
+def dense(problem, states, prior, posture=0.01):
+    """All unknowns together, by scipy: parameters, angles (K, D), and the information of θ with angles eliminated."""
+    tree, p = ARM.tree, len(prior.mean)
+
+    def all_residuals(z):
+        theta, angles = z[:p], z[p:].reshape(len(states), -1)
+        out = [np.linalg.cholesky(prior.information).T @ (theta - prior.mean)]
+        for f, a in enumerate(angles):
+            out += [residuals(r) for _, r in problem.parts(theta, f, BodyState(np.eye(4), a))]
+            out.append(np.sqrt(posture) * (a - tree.usual) / tree.spread)
+        return np.concatenate(out)
+
+    low = np.concatenate([np.full(p, -1.0), np.tile(tree.lower, len(states))]) - 1e-9
+    high = np.concatenate([np.full(p, 1.0), np.tile(tree.upper, len(states))]) + 1e-9
+    start = np.concatenate([prior.mean, *(s.angles for s in states)])
+    found = least_squares(all_residuals, start, bounds=(low, high), jac="3-point", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    H = found.jac.T @ found.jac
+    information = H[:p, :p] - H[:p, p:] @ np.linalg.solve(H[p:, p:], H[p:, :p]) - prior.information
+    return found.x[:p], found.x[p:].reshape(len(states), -1), information, 2.0 * found.cost
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_finds_what_a_dense_solver_finds(seed):
+    problem, states, prior = task(seed=seed)
+    theta, angles, information, cost = dense(problem, states, prior)
+    found = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), tolerance=1e-10, max_iterations=60)
+    assert found.converged
+    assert found.cost == pytest.approx(cost, rel=1e-6)
+    assert np.allclose(found.theta, theta, atol=2e-4)  # a fiftieth of a bar: derivatives are kept for small steps
+    assert np.allclose([s.angles for s in found.states], angles, atol=5e-3)
+    free = np.all((angles > ARM.tree.lower + 1e-6) & (angles < ARM.tree.upper - 1e-6))
+    if free:
+        assert np.allclose(found.information, information, rtol=0.02, atol=1.0)
+    assert np.allclose(found.information, found.information.T)
+    assert all(np.array_equal(s.T_world_root, np.eye(4)) for s in found.states)  # this body's root is fixed
+
+
+def test_limits_hold():
+    problem, states, prior = task()
+    beyond = [s.retract(np.concatenate([np.zeros(6), np.full(7, 3.0)])) for s in states]
+    found = solve(problem, np.zeros(3), beyond, prior, np.full(3, 1e-4))
+    for s in found.states:
+        assert np.all((s.angles >= ARM.tree.lower) & (s.angles <= ARM.tree.upper))
+
+
+def test_a_loss_keeps_an_outlier_from_the_lengths():
+    problem, states, prior = task(frames=4, loss=huber(1.5))
+    calm = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4))
+    wild = [x.copy() for x in problem.seen]
+    wild[0][4] += 0.5
+    robust = solve(replace(problem, seen=wild), np.zeros(3), states, prior, np.full(3, 1e-4))
+    plain = solve(replace(problem, seen=wild, loss=SQUARED), np.zeros(3), states, prior, np.full(3, 1e-4))
+    assert np.abs(robust.theta - calm.theta).max() < 0.02 < np.abs(plain.theta - calm.theta).max()
+
+
+def test_a_share_leaves_the_prior_more_to_say():
+    problem, states, prior = task()
+    full = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4))
+    less = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), shares={"mocap": 0.01})
+    assert np.allclose(less.information, 0.01 * full.information, rtol=0.05)
+    assert np.linalg.norm(less.theta) < np.linalg.norm(full.theta)
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Keypoints of a humanoid in a rig, by logarithms of its lengths."""
+
+    rig: object
+    uv: np.ndarray
+    camera: np.ndarray
+
+    def body(self, theta):
+        return HUMANOID.scaled(np.exp(theta))
+
+    def parts(self, theta, frame, state):
+        body = self.body(theta)
+        out = []
+        for c, one in enumerate(self.rig):
+            points = body.keypoints("COCO_17")
+            out.append((one.name, pixel_rows(body, state, points, self.rig, c, self.uv[self.camera == c], sigma=2.0)))
+        return out
+
+
+def test_differences_are_the_analytic_columns_of_lengths():
+    """`ShapeParameters.jacobian` knows them for keypoints; at scales of one logarithms change as the scales do."""
+    rig, points = rig_around((0.0, 0.0, 0.0), cameras=3), HUMANOID.keypoints("COCO_17")
+    state = posture(HUMANOID, 3, 0.3)
+    groups = len(HUMANOID.scale_groups)
+    model = shape_parameters(HUMANOID, points, np.ones(groups), 0.05, 0.01)
+    camera, column = np.repeat(np.arange(3), 17), np.tile(np.arange(17), 3)
+    theta = np.concatenate([np.ones(groups), np.zeros(len(model.mean) - groups)])
+    J = model.jacobian(theta, state, rig, camera, column).reshape(2 * len(camera), -1)
+    problem = Pixels(rig, model.pixels(theta, state, rig, camera, column) + 1.0, camera)
+    found = differences(problem, np.zeros(groups), np.full(groups, 1e-4), [state])[0]
+    n = HUMANOID.tree.n_dofs
+    assert np.abs(J[:, n : n + groups]).max() > 10.0
+    assert np.allclose(found, 0.5 * J[:, n : n + groups], rtol=1e-5, atol=1e-4)
+    pose = Pose.of(HUMANOID, state)
+    own = np.concatenate([columns(rows, pose) for _, rows in problem.parts(np.zeros(groups), 0, state)])
+    assert np.allclose(own, 0.5 * J[:, :n], rtol=1e-6, atol=1e-6)
+
+
+def test_rows_of_every_kind_have_their_columns():
+    state = posture(HUMANOID, 1, 0.3)
+    pose, n, random = Pose.of(HUMANOID, state), HUMANOID.tree.n_dofs, np.random.default_rng(0)
+    W = np.cov(random.normal(size=(3, 9)))
+    joint = ParameterRows(np.array([7, 9, 11]), np.array([0.1, 0.2, -0.3]), W)
+    J, r = columns(joint, pose), residuals(joint)
+    assert np.allclose(J.T @ J, np.einsum("ai,ab,bj->ij", np.eye(n)[joint.index], W, np.eye(n)[joint.index]))
+    assert np.allclose(J.T @ r, np.eye(n)[joint.index].T @ W @ joint.residual)
+    prior = prior_rows(HUMANOID, state)
+    assert np.allclose(columns(prior, pose).sum(0)[prior.index], np.sqrt(prior.weight))
+    hands = HUMANOID.landmarks.select(("r_wrist", "l_wrist"))
+    step = 1e-6 * random.normal(size=n)
+
+    def pair(state):
+        a, b = HUMANOID.positions(state, hands)
+        return PairRows(hands.segments[None], a[None], b[None], [[0.6, 0.8, 0.0]], [(b - a) @ [0.6, 0.8, 0.0]], [4.0])
+
+    moved = residuals(pair(state)) - residuals(pair(state.retract(step)))
+    assert moved == pytest.approx(columns(pair(state), pose) @ step, rel=1e-4)
+    with pytest.raises(ObservationError, match="degree of freedom 60"):
+        columns(ParameterRows(np.array([60]), np.zeros(1), np.ones(1)), pose)
+
+
+def test_small_sums_and_solutions():
+    random = np.random.default_rng(0)
+    A, B, H = random.normal(size=(30, 6)), random.normal(size=(30, 4)), np.ones((6, 4))
+    _kernels_border.gram(A, B, H)
+    assert np.allclose(H, 1.0 + A.T @ B)
+    S, right = A.T @ A, random.normal(size=(6, 3))
+    x = right.copy()
+    assert _kernels_border.solve(S.copy(), x)
+    assert np.allclose(S @ x, right)
+    assert not _kernels_border.solve(-S, x)

@@ -1,0 +1,133 @@
+"""Parameters apply as they say; lasting errors are told from fresh ones."""
+
+import numpy as np
+import pytest
+from tests.subject.measured import ARM, HUMANOID, RIG
+
+from kinefit.errors import BodyError, CalibrationError, ObservationError
+from kinefit.geometry import se3
+from kinefit.rows import ParameterRows, Rows
+from kinefit.sensors.base import Unknown
+from kinefit.subject.lasting import Seen, excess
+from kinefit.subject.parameters import KNOWN_SIZE, UNKNOWN_SIZE, PointOffsets, SegmentScales, World, stacked
+from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
+
+
+def test_lengths_follow_the_size():
+    loose, known = SegmentScales(HUMANOID), SegmentScales(HUMANOID, size=1.1)
+    covariance = np.linalg.inv(loose.information)
+    assert np.allclose(np.diag(covariance), 0.05**2 + UNKNOWN_SIZE**2)
+    assert np.allclose(covariance[0, 1:], UNKNOWN_SIZE**2)
+    assert np.allclose(known.mean, np.log(1.1))
+    assert np.linalg.inv(known.information)[0, 1] == pytest.approx(KNOWN_SIZE**2)
+    longer = known.apply(World(HUMANOID, RIG), known.mean).body
+    assert np.allclose(longer.tree.offsets, 1.1 * HUMANOID.tree.offsets)
+    with pytest.raises(BodyError, match="size"):
+        SegmentScales(HUMANOID, size=-1.0)
+
+
+def test_keypoints_shift_alike_left_and_right_and_hardly_to_the_side_in_the_middle():
+    offsets = PointOffsets(HUMANOID, "BODY_25B")
+    values = np.random.default_rng(0).normal(size=len(offsets.names))
+    moved = offsets.apply(World(HUMANOID, RIG), values).body.keypoints("BODY_25B")
+    shift = moved.points - HUMANOID.keypoints("BODY_25B").points
+    right, left = (shift[moved.index(name)] for name in ("RKnee", "LKnee"))
+    assert np.allclose(right, left * (1.0, 1.0, -1.0))
+    assert np.abs(right).min() > 0.0
+    std = dict(zip(offsets.names, np.diag(offsets.information) ** -0.5, strict=True))
+    assert std["BODY_25B Nose z"] == pytest.approx(0.002)
+    assert std["BODY_25B Nose x"] == pytest.approx(0.01)
+    single = PointOffsets(HUMANOID, "BODY_25B", mirror=False)
+    assert len(single.names) == 3 * 25 > len(offsets.names)
+
+
+def test_markers_shift_one_by_one():
+    count = len(ARM.markers("worn"))
+    offsets = PointOffsets(ARM, "worn", np.linspace(0.005, 0.03, count))
+    values = np.arange(3.0 * count)
+    body = offsets.apply(World(ARM, RIG), values).body
+    assert np.allclose(body.markers("worn").points - ARM.markers("worn").points, values.reshape(-1, 3))
+    assert np.array_equal(body.landmarks.points, ARM.landmarks.points)
+    assert np.diag(offsets.information)[[0, -1]] == pytest.approx([0.005**-2, 0.03**-2])
+    with pytest.raises(BodyError, match="no set of points .* 'foot'; there are: .*worn"):
+        PointOffsets(ARM, "foot")
+    with pytest.raises(BodyError, match="standard deviations"):
+        PointOffsets(ARM, "worn", np.ones(3))
+
+
+def test_cameras_move_but_the_one_that_is_held():
+    free = CameraExtrinsics(RIG, RIG.names[1])
+    assert len(free.names) == 6 * (len(RIG) - 1)
+    values = np.zeros(len(free.names))
+    values[6:12] = (0.1, 0.0, 0.0, 0.0, 0.0, 0.2)  # of the second that is free: the rig's third
+    rig = free.apply(World(ARM, RIG), values).rig
+    for k in (0, 1, 3):
+        assert np.allclose(rig.cameras[k].T_camera_world, RIG.cameras[k].T_camera_world)
+    expected = se3.exp(values[6:12]) @ RIG.cameras[2].T_camera_world
+    assert np.allclose(rig.cameras[2].T_camera_world, expected)
+    with pytest.raises(CalibrationError, match="no camera 'roof'"):
+        CameraExtrinsics(RIG, "roof")
+
+
+def test_what_a_sensor_does_not_know_of_itself_goes_into_the_world_beside_what_it_does():
+    own = OwnUnknowns({"rope": {"length": Unknown(1.0, 0.3)}, "watch": {"delay": Unknown(0.0, 0.01)}})
+    world = own.apply(World(ARM, RIG, {"rope": {"stiffness": 5.0}}), np.array([1.2, 0.004]))
+    assert world.values == {"rope": {"stiffness": 5.0, "length": 1.2}, "watch": {"delay": 0.004}}
+    assert own.names == ("rope length", "watch delay")
+    assert np.allclose(own.step, [3e-4, 1e-5])
+    with pytest.raises(ObservationError, match="sensor 'rope'.*'length'"):
+        OwnUnknowns({"rope": {"length": Unknown(1.0, 0.0)}})
+
+
+def test_kinds_of_parameters_stand_beside_each_other():
+    kinds = [SegmentScales(ARM), OwnUnknowns({"rope": {"length": Unknown(1.0, 0.5)}})]
+    names, mean, information, step = stacked(kinds)
+    assert names[-1] == "rope length"
+    assert mean.tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert np.array_equal(information[:3, :3], kinds[0].information)
+    assert information[3].tolist() == [0.0, 0.0, 0.0, 4.0]
+    assert step[3] == 5e-4
+
+
+def rows(residual, segment=None, group=None):
+    count = len(residual)
+    segment = np.zeros(count, np.int64) if segment is None else segment
+    return Rows.of(segment, np.zeros((count, 3)), np.tile([1.0, 0, 0], (count, 1)), residual, np.ones(count), group)
+
+
+def test_errors_that_last_are_told_from_fresh_ones():
+    random = np.random.default_rng(0)
+    fresh = [[Seen("a", [rows(random.normal(size=200))])] for _ in range(25)]
+    assert excess(fresh, 0.0)["a"] < 1.3
+    bias = random.normal(size=200)
+    half = [[Seen("a", [rows(0.7 * bias + 0.7 * random.normal(size=200))])] for _ in range(25)]
+    assert excess(half, 0.0)["a"] == pytest.approx(0.5 * 25, rel=0.2)
+    assert excess(half, 100.0)["a"] == pytest.approx(2.0 * excess(half, 0.0)["a"], rel=0.01)  # half of them followed
+    assert excess([[Seen("a", [rows(3.0 * random.normal(size=200))])] for _ in range(25)], 0.0)["a"] > 7.0
+
+
+def test_markers_that_come_and_go_are_known_by_their_names():
+    random, names = np.random.default_rng(1), np.array([f"m{k}" for k in range(60)])
+    bias, frames = random.normal(size=60), []
+    for _ in range(20):
+        seen = np.flatnonzero(random.random(60) < 0.5)
+        frames.append([Seen("mocap", [rows(bias[seen])], names=tuple(names[seen]))])
+    assert excess(frames, 0.0)["mocap"] > 4.0  # the largest biases count as outliers
+    without = [[Seen("mocap", one[0].rows)] for one in frames]
+    assert excess(without, 0.0)["mocap"] < 2.0
+
+
+def test_errors_of_a_surface_last_over_a_segment():
+    random, segment = np.random.default_rng(2), np.repeat(np.arange(10), 30)
+    bias = random.normal(size=10)[segment]
+    frames = [[Seen("depth", [rows(0.5 * bias + 0.8 * random.normal(size=300),
+                                   segment, random.permutation(100000)[:300])], of_points=False)]
+              for _ in range(10)]  # fmt: skip
+    assert excess(frames, 0.0)["depth"] > 30.0
+    points = [[Seen("depth", one[0].rows)] for one in frames]
+    assert excess(points, 0.0)["depth"] < 2.0
+
+
+def test_a_few_rows_tell_nothing_of_their_errors():
+    frames = [[Seen("rope", [ParameterRows(np.zeros(1, int), np.full(1, 5.0), np.ones(1))])] for _ in range(5)]
+    assert excess(frames, 0.0) == {}
