@@ -11,7 +11,7 @@ from kinefit.losses import SQUARED, huber
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.solvers.sequence import Planes, fit_sequence
 
-# Two ways to one minimum stop where a step would win 1e-12 of the cost. Where the points hardly hold a joint, such a step
+# Two ways to one minimum stop where a step would win 1e-12 of the cost. Where points hardly hold a joint, such a step
 # may move it a little: a measurement that differs by 1e-12 m can end 3e-6 m away. So the costs tell, sharply, that the
 # minimum is the same, and the positions need agree only far within what was measured (5 and 10 mm).
 SAME_COST, SAME_PLACE = 1e-7, 1e-3
