@@ -16,13 +16,14 @@ settings.load_profile("kinefit")
 
 @pytest.fixture(scope="session")
 def data_dir() -> Callable[[str], Path]:
-    """Find a folder of real recordings by name; skip the test where it is absent."""
+    """Find a folder of real recordings by name; skip the test where it is absent, fail with KINEFIT_REQUIRE_DATA."""
 
     def find(name: str) -> Path:
         root = Path(os.environ.get("KINEFIT_DATA") or ROOT.parent / "shared" / "data")
         folder = root / name
         if not folder.is_dir():
-            pytest.skip(f"no recording '{name}' in {root}: set KINEFIT_DATA to the folder of recordings")
+            refuse = pytest.fail if os.environ.get("KINEFIT_REQUIRE_DATA") else pytest.skip
+            refuse(f"no recording '{name}' in {root}: set KINEFIT_DATA to the folder of recordings")
         return folder
 
     return find

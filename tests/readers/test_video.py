@@ -1,13 +1,15 @@
 """Videos are read frame-exactly, upright and in step; damaged ones are refused with what can be read."""
 
+from collections.abc import Mapping
 from fractions import Fraction
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.readers.video import Video, VideoSet, common_frames
+from kinefit.readers.video import Video, VideoSet, _rotation, common_frames
 
 COUNT, WIDTH, HEIGHT = 40, 160, 96
 MATRICES = {  # clockwise turn: a, b, c, d of the display matrix, tx, ty
@@ -153,3 +155,28 @@ def test_streams_of_different_length_or_rate(tmp_path):
 def test_common_frames_without_overlap():
     with pytest.raises(ObservationError, match="no time that all streams saw"):
         common_frames({"a": 10, "b": 10}, {"b": 5.0}, 30.0)
+
+
+class SideData(Mapping):
+    """What stands beside a frame, as PyAV gives it: by name, but what it iterates over depends on its version."""
+
+    def __init__(self, kept, over):
+        self.kept, self.over = kept, over
+
+    def __len__(self):
+        return len(self.kept)
+
+    def __iter__(self):
+        return iter(self.kept.values() if self.over == "values" else [SimpleNamespace(name=name) for name in self.kept])
+
+    def __getitem__(self, key):
+        return self.kept[key]
+
+
+@pytest.mark.parametrize("over", ["values", "keys"])
+def test_rotation_is_found_whatever_the_side_data_iterates_over(over):
+    matrix = np.array([0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30], np.int32).tobytes()
+    kept = {"SEI_UNREGISTERED": b"x264", "DISPLAYMATRIX": matrix}
+    assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 90.0
+    del kept["DISPLAYMATRIX"]
+    assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 0.0

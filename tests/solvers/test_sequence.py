@@ -11,6 +11,11 @@ from kinefit.losses import SQUARED, huber
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.solvers.sequence import Planes, fit_sequence
 
+# Two ways to one minimum stop where a step would win 1e-12 of the cost. Where points hardly hold a joint, such a step
+# may move it a little: a measurement that differs by 1e-12 m can end 3e-6 m away. So the costs tell, sharply, that the
+# minimum is the same, and the positions need agree only far within what was measured (5 and 10 mm).
+SAME_COST, SAME_PLACE = 1e-7, 1e-3
+
 BODY = load_body("humanoid")
 POINTS = BODY.landmarks
 
@@ -39,8 +44,8 @@ def test_points_give_what_frame_by_frame_gives(loss, limits):
     for f, found in enumerate(states_of(result)):
         make = lambda s: point_rows(BODY, s, POINTS, measured[f], sigma=0.005)  # noqa: B023
         fit = levenberg_marquardt(BODY, start, make, loss=loss, limits=limits, tolerance=1e-12, max_iterations=100)
-        assert result.costs[f] == pytest.approx(fit.equations.cost, rel=1e-5)
-        np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=1e-4)
+        assert result.costs[f] == pytest.approx(fit.equations.cost, rel=SAME_COST)
+        np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=SAME_PLACE)
         start = fit.state
     assert np.all(result.iterations[1:] <= 8)
 
@@ -81,8 +86,8 @@ def test_planes_give_what_frame_by_frame_gives(missing):
     for f, found in enumerate(states_of(result)):
         make = lambda s: plane_rows(BODY, s, points, on_plane[f], normal[f], sigma=0.01)  # noqa: B023
         fit = levenberg_marquardt(BODY, states[f], make, tolerance=1e-12, max_iterations=100)
-        assert result.costs[f] == pytest.approx(fit.equations.cost, rel=1e-5)
-        np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=1e-4)
+        assert result.costs[f] == pytest.approx(fit.equations.cost, rel=SAME_COST)
+        np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=SAME_PLACE)
 
 
 def test_points_and_planes_together_and_points_that_are_missing():

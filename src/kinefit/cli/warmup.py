@@ -22,14 +22,14 @@ def warmup(verbose: bool) -> None:
     begin = perf_counter()
     with _screen.bars() as step:
         step("compiling", 0, 2)
-        from kinefit._jit import cache_directory
+        from kinefit._jit import kernel_folder
 
         _video()
         step("compiling", 1, 2)
         _depth()
         step("compiling", 2, 2)
-    kept = cache_directory() / "kernels"
-    where = f"the kernels lie in {kept}" if kept.is_dir() else f"none can be kept in {kept}: set KINEFIT_CACHE"
+    kept = kernel_folder()
+    where = f"the kernels lie in {kept.parent}" if kept else "none can be kept: set KINEFIT_CACHE"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
 
 

@@ -302,8 +302,8 @@ def _decoded_times(path: Path) -> list[int | None]:
 
 def _rotation(frame: Any) -> float:
     """Counterclockwise rotation [deg] that the file asks for."""
-    for data in frame.side_data or ():
-        if data.type.name == "DISPLAYMATRIX":
-            a, b = np.frombuffer(bytes(data), np.int32)[:2]
-            return float(-np.degrees(np.arctan2(b, a)))
-    return 0.0
+    data = frame.side_data.get("DISPLAYMATRIX")  # by name: PyAV up to 18 iterates over values, from 19 on over keys
+    if data is None:
+        return 0.0
+    a, b = np.frombuffer(bytes(data), np.int32)[:2]
+    return float(-np.degrees(np.arctan2(b, a)))
