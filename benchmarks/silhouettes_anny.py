@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from kinefit.tracking.tracker import Tracker
+from kinefit.subject.silhouettes import fit_silhouettes
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure
@@ -26,8 +26,8 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
-from kinefit.subject.silhouettes import fit_silhouettes
 from kinefit.tracking.take import track_take
+from kinefit.tracking.tracker import Tracker
 
 STEPS, POSES = 100, 6
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "anny.jpg"

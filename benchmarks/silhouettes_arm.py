@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure
@@ -25,7 +26,6 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body, scaled
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from kinefit.tracking.tracker import Tracker
 
 UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them

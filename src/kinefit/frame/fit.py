@@ -103,11 +103,7 @@ class FrameFit:
     def _judged(self, scene: Scene, H: NDArray, matched: Sequence[Matched], iterations: int) -> Fitted:
         posterior, alone = inverse(H), np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
-        try:
-            filtered = inverse(alone)
-        except np.linalg.LinAlgError:  # measurements so large that nothing else counts
-            filtered = posterior
-        return Fitted(judged(scene, posterior, matched, iterations), filtered)
+        return Fitted(judged(scene, posterior, matched, iterations), inverse(alone))
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

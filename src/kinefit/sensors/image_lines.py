@@ -131,7 +131,8 @@ class ImageLineMatched(Matched):
         m = self.measurement
         points, values = m.points_of(scene.body), m.across(scene)
         seen = np.isfinite(values).all(axis=1)
-        square = np.bincount(m.line[seen], np.square(values[seen]).sum(axis=1), minlength=int(m.line.max(initial=-1)) + 1)
+        lines = int(m.line.max(initial=-1)) + 1
+        square = np.bincount(m.line[seen], np.square(values[seen]).sum(axis=1), minlength=lines)
         factor = np.where(seen, self.loss.factor(square[m.line] / m.of.sigma**2), 0.0)
         measured = scene.rig[m.camera].project(scene.positions(points)) + values
         names = tuple(f"{m.titles[k]}: {name}" for k, name in zip(m.line, m.names))

@@ -83,8 +83,9 @@ def other_noise(
                 J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
                 weighted = J * w[:, None]
                 information[f] += J.T @ weighted
-                single = m.of_points or isinstance(rows, DofRows)
-                names = np.arange(len(rows)) if single else rows.segment
+                names = np.arange(len(rows))
+                if not m.of_points and isinstance(rows, Rows):
+                    names = rows.segment
                 counts.setdefault(m.sensor, []).append(len(np.unique(names)))
                 mine = channels.setdefault(m.sensor, {})
                 for c in np.unique(names):

@@ -137,7 +137,10 @@ def inverse(matrix: NDArray) -> NDArray:
     """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
     out = np.empty_like(matrix)
     if not _kernels_linear.invert(np.array(matrix), *dense_pattern(len(matrix)), out):
-        out = np.linalg.inv(matrix)
+        try:
+            out = np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:  # numbers so far apart that some count for nothing beside others
+            out = np.linalg.pinv(matrix, hermitian=True)
     return 0.5 * (out + out.T)
 
 

@@ -20,7 +20,8 @@ from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import Progress, Subject, fit_subject
-from kinefit.subject.parameters import OwnUnknowns, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.parameters import Parameters, PointOffsets, SegmentScales
+from kinefit.subject.sensor_parameters import OwnUnknowns
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
