@@ -1,0 +1,2 @@
+"""Real."""
+def run(quick): pass
