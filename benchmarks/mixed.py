@@ -23,7 +23,7 @@ SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
 GROUPS = (*SIMULATED, "misfit", "real")
-DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 2, 1.5
+DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 2, 1.2
 
 
 def main() -> None:
@@ -47,6 +47,7 @@ def main() -> None:
         begin = time.perf_counter()
         outcomes = track_draws(draws, round(RATE * (QUICK_SECONDS if told.quick else SECONDS)), runs)
         print(f"# {draws} draws, {len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
+        mixed_figures.table(outcomes)
         for group in simulated:
             print(f"\n# {group}", flush=True)
             SIMULATED[group](outcomes)

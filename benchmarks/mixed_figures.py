@@ -32,6 +32,23 @@ NOISE = 0.3  # [m/s²] that no smoothing need improve
 _LAG = "tracking with a fixed lag is not part of kinefit"
 
 
+def table(told: Told) -> None:
+    """Print errors, stated deviations and time of every run, and what failed in which way."""
+    for run, draws in told.items():
+        kept = [one for one in draws if isinstance(one, Outcome)]
+        reasons = sorted({one for one in draws if isinstance(one, str)})
+        text = f"# {' '.join(run)}: {len(kept)} of {len(draws)} draws"
+        if kept:
+            known = lambda array: array[np.isfinite(array)]
+            sigma = 1e3 * _mean([_mean(known(o.sigma)) for o in kept])
+            text += (
+                f", joints {1e3 * _mean([o.distance.mean() for o in kept]):.1f} mm (median draw "
+                f"{1e3 * np.median([o.distance.mean() for o in kept]):.1f}), sigma {sigma:.1f} mm, angles "
+                f"{_mean([np.degrees(np.abs(o.turn).mean()) for o in kept]):.1f} deg, {_mean([o.seconds for o in kept]):.1f} s"
+            )
+        print("; ".join([text, *reasons]), flush=True)
+
+
 def sensors(told: Told) -> None:
     """Print what each sensor adds."""
     for less, more in PAIRS:
@@ -80,8 +97,8 @@ def intervals(told: Told) -> None:
         figure(f"inside_{what}_highest_cell", single[-1][0] if single else None, "%", "<= 99.5", whole)
         for run in told:
             own = [runs[run] for (_, kind), runs in cells.items() if kind == what and run in runs]
-            value = 100 * share(np.concatenate(own)) if own else np.nan
-            print(f"# {what} {' '.join(run)}: {value:.1f} % inside")
+            if own:
+                print(f"# {what} {' '.join(run)}: {100 * share(np.concatenate(own)):.1f} % inside")
     figure("runs_that_failed", float(len(missing)), "runs", "== 0")
     if missing:
         print(f"# {whole}")
@@ -182,12 +199,13 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 
 
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
-    """Runs that some groups of figures need; quickly, outliers and lost sensors for two mixes only."""
+    """Runs that some groups of figures need; quickly, outliers and lost sensors for two mixes, one run of others alone."""
+    slow = ("depth_alone", "silhouettes_alone") if quick else ()
     out: list[Run] = []
     if "sensors" in groups:
         out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
     if "smoothing" in groups or "intervals" in groups:
-        out += [(mix, condition) for mix in MIXES for condition in CONDITIONS[:2]]
+        out += [(mix, condition) for mix in MIXES for condition in CONDITIONS[: 1 if mix in slow else 2]]
     if "intervals" in groups:
         out += [(m, c) for m in (("cameras", "all") if quick else MIXES) for c in CONDITIONS[2:]]
     return list(dict.fromkeys(out))

@@ -6,7 +6,7 @@ not. Detector points and markers stand 8 mm from the catalogue's places. Motion:
 built-in exercise), put onto that body by `retarget`; those who travel farther than 1.5 m do it on a treadmill. Sensors:
 four cameras of 1088x1920 px with MediaPipe's points (3 px of noise, 2 px of drift over half a second, 10 % outliers,
 10 % missing) and masks at a quarter of that size, whose outline errs by 4 px over about 40 px of its length; a
-time-of-flight camera of 240x180 px in a room; 45 markers with 1 mm of noise and 2 % gaps. The calibration that the
+time-of-flight camera of 160x120 px in a room, which it saw empty for ten images before; 45 markers with 1 mm of noise and 2 % gaps. The calibration that the
 takes name is wrong by 0.1 degree and 3 mm in every camera.
 """
 
@@ -30,7 +30,7 @@ from kinefit.bodies.anny import AnnyModel, load_anny
 from kinefit.exporters.marker_files import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import Markers
+from kinefit.observations import DepthVideo, Markers
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import scaled
 from kinefit.simulation import (
@@ -51,7 +51,7 @@ RATE, SECONDS, TRAVEL = 30.0, 3.0, 1.5  # [Hz], [s], [m]
 DETECTOR, MARKER_SET, CAMERAS = "MEDIAPIPE_33", "HANIM_45", ("cam01", "cam02", "cam03", "cam04")
 MASK_SCALE = 0.25
 CALIBRATION = (np.radians(0.1), 0.003)  # [rad, m] one standard deviation about and along each axis
-SENSOR = DepthSensor("depth", (240, 180), 205.0, 0.5, 5.5, (0.004, 0.0008, 0.0), oblique=0.5, samples=2, holes=0.01)
+SENSOR = DepthSensor("depth", (160, 120), 137.0, 0.5, 5.5, (0.004, 0.0008, 0.0), oblique=0.5, samples=3, holes=0.01)
 WRISTS_ANKLES = ("l_ulnar_styloid", "r_ulnar_styloid", "l_lateral_malleolus", "r_lateral_malleolus")
 TWENTY = (
     *WRISTS_ANKLES, "l_asis", "r_asis", "l_psis", "r_psis", "suprasternale", "cervicale", "l_tragion", "r_tragion",
@@ -59,6 +59,7 @@ TWENTY = (
     "l_femoral_lateral_epicondyle", "r_femoral_lateral_epicondyle", "l_metatarsal_phalanx_1", "r_metatarsal_phalanx_1",
 )  # fmt: skip
 EXERCISE = "squat and wave"
+EMPTY, AWAY = 10, 50.0  # images of the empty room; [m] below it, where the person is meanwhile
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,8 @@ class Recording:
     told : Rig, as the takes have it.
     keypoints : (4, F, 33, 3) [px] and visibility
     masks : (4, F, h, w) uint8, 255 on the person
-    depth : (F, 180, 240) [mm] uint16
+    depth : (F, 120, 160) [mm] uint16
+    empty : (10, 120, 160) [mm] uint16, the room without the person
     markers : Markers
     """
 
@@ -82,6 +84,7 @@ class Recording:
     keypoints: NDArray
     masks: NDArray
     depth: NDArray
+    empty: NDArray
     markers: Markers
 
 
@@ -159,9 +162,12 @@ def record(draw: int, frames: int = round(RATE * SECONDS)) -> Recording:
     bare = Scene(truth, truth.body.skin)  # type: ignore[arg-type]
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
     around = replace(bare, room=room(truth, front))
-    video = simulate_depth(truth, front, SENSOR, seed=draw, scene=around)
-    depth = np.array([np.round(video.frame(i).depth * 1000.0) for i in range(len(truth))], np.uint16)
-    return Recording(truth, both, told, detected(truth, both, draw), masks, depth, _markers(truth, random))
+    depth = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
+    T = np.array(truth.Ts_world_root)
+    T[:, 1, 3] -= AWAY
+    gone = replace(around, motion=replace(truth, Ts_world_root=T))
+    empty = _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
+    return Recording(truth, both, told, detected(truth, both, draw), masks, depth, empty, _markers(truth, random))
 
 
 def detected(truth: Motion, rig: Rig, draw: int, outliers: float = 0.1) -> NDArray:
@@ -180,6 +186,7 @@ def write(recording: Recording, folder: Path) -> None:
         np.save(folder / f"mediapipe_{name}.npy", points)
         _images(folder / f"masks_{name}", masks)
     _images(folder / "depth", recording.depth)
+    _images(folder / "empty", recording.empty)
     every = recording.markers
     for count, names in ((4, WRISTS_ANKLES), (20, TWENTY), (45, every.names)):
         chosen = every.positions[:, [every.names.index(n) for n in names]]
@@ -210,7 +217,7 @@ def take_text(folder: Path, parts: Sequence[str]) -> str:
         text += f'[[silhouette]]\ncamera = "{name}"\nfile = "{folder}/masks_{name}"\nframe = "video"\nrate = {RATE}\n'
     if "depth" in parts:
         text += f'[[depth]]\nname = "depth"\nfile = "{folder}/depth"\nunit = 0.001\nrate = {RATE}\n'
-        text += f"range = [{SENSOR.near}, {SENSOR.far}]\n"
+        text += f'range = [{SENSOR.near}, {SENSOR.far}]\nbackground = "{folder}/empty"\n'
     for part in parts:
         if part.startswith("markers "):
             text += f'[[markers]]\nfile = "{folder}/markers_{part.removeprefix("markers ")}.trc"\n'
@@ -221,6 +228,11 @@ def _error(random: np.random.Generator) -> NDArray:
     """(4, 4) a small error of a camera's pose."""
     turn, shift = CALIBRATION
     return se3.transform(se3.exp_so3(random.normal(0.0, turn, 3)), random.normal(0.0, shift, 3))
+
+
+def _counts(video: DepthVideo, count: int) -> NDArray:
+    """(count, H, W) [mm] uint16 the first images of a recording."""
+    return np.array([np.round(video.frame(i).depth * 1000.0) for i in range(count)], np.uint16)
 
 
 def _mask(scene: Scene, frame: int, camera: Camera, random: np.random.Generator) -> NDArray:
