@@ -166,7 +166,7 @@ def _added(runs: Iterable[NDArray]) -> NDArray:
 def _of(told: Told, run: Run) -> tuple[list[Outcome], str]:
     """Outcomes of a run, and why it is not measured; "" where all draws are."""
     if run not in told:
-        return [], "not among the runs of --quick"
+        return [], "not among the takes that the command line asks for"
     failed = [one for one in told[run] if isinstance(one, str)]
     reason = f"{len(failed)} of {len(told[run])} draws: {failed[0]}" if failed else ""
     return [] if failed else [one for one in told[run] if isinstance(one, Outcome)], reason
