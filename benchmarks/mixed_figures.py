@@ -44,7 +44,8 @@ def table(told: Told) -> None:
             text += (
                 f", joints {1e3 * _mean([o.distance.mean() for o in kept]):.1f} mm (median draw "
                 f"{1e3 * np.median([o.distance.mean() for o in kept]):.1f}), sigma {sigma:.1f} mm, angles "
-                f"{_mean([np.degrees(np.abs(o.turn).mean()) for o in kept]):.1f} deg, {_mean([o.seconds for o in kept]):.1f} s"
+                f"{_mean([np.degrees(np.abs(o.turn).mean()) for o in kept]):.1f} deg, "
+                f"{_mean([o.seconds for o in kept]):.1f} s"
             )
         print("; ".join([text, *reasons]), flush=True)
 
@@ -58,7 +59,9 @@ def sensors(told: Told) -> None:
             low, ratio, high = _interval(lambda rows: rows[:, 1].mean() / rows[:, 0].mean(), pairs)
             if len(pairs):
                 means = 1e3 * pairs.mean(axis=0)
-                print(f"# {less} {means[0]:.1f} mm, {more} {means[1]:.1f} mm: ratio {ratio:.3f} ({low:.3f} to {high:.3f})")
+                print(
+                    f"# {less} {means[0]:.1f} mm, {more} {means[1]:.1f} mm: ratio {ratio:.3f} ({low:.3f} to {high:.3f})"
+                )
             figure(f"sensor_{what}_{less}_to_{more}", high if len(pairs) else None, "x", "<= 1.02", reason)
     outcomes, reason = _of(told, ("all", "smoothed"))
     distance = [1e3 * o.distance.mean() for o in outcomes]
@@ -199,7 +202,7 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 
 
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
-    """Runs that some groups of figures need; quickly, outliers and lost sensors for two mixes, one run of others alone."""
+    """Runs that some groups of figures need; quickly, few of them with outliers, lost sensors and slow mixes."""
     slow = ("depth_alone", "silhouettes_alone") if quick else ()
     out: list[Run] = []
     if "sensors" in groups:

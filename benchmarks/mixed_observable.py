@@ -1,8 +1,8 @@
 """What a mix of sensors can observe of a known motion, apart from any tracker (for `benchmarks.mixed`).
 
-At every tenth frame the true body's measurements are linearised about the truth: keypoints (8 px), markers (10 mm), nodes
-of the true skin that the depth camera sees (3 cm along their normals, as neighbours err alike) and those on the outline
-in a camera with a mask (3 cm). With the catalogue's spread of the angles as prior, a joint centre's coordinate is
+At every tenth frame the true body's measurements are linearised about the truth: keypoints (8 px), markers (10 mm),
+nodes of the true skin that the depth camera sees (3 cm along their normals, as neighbours err alike) and those on the
+occluding contour in a camera with a mask (3 cm). With the catalogue's spread of the angles as prior, a joint centre's coordinate is
 observable where its standard deviation is below 5 cm, an angle where its variance is below half of the prior's. The
 lengths of the body count as known.
 """

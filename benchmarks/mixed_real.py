@@ -27,9 +27,7 @@ TRIAL, QUICK, SWAPS = "video_balancing_4cam", 30, 32
 SETS = {"openpose": "BODY_25B", "mediapipe": "MEDIAPIPE_33"}
 
 
-def take_text(
-    folder: Path, detector: str, silhouettes: bool, cameras: Sequence[str] = CAMERAS, frames: int = 0
-) -> str:
+def take_text(folder: Path, detector: str, silhouettes: bool, cameras: Sequence[str] = CAMERAS, frames: int = 0) -> str:
     """The trial by keypoints of some cameras, with or without their masks; its first frames only, where so many."""
     text = '[take]\nname = "balancing"\nup = "z"\n' + (f"frames = [0, {frames}]\n" if frames else "")
     text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
@@ -59,7 +57,9 @@ def residuals(motion: Motion, rig: Rig, keypoints: Sequence[Keypoints], people: 
     for seen, chosen in zip(keypoints, people):
         points = motion.body.keypoints(seen.keypoint_set)
         columns = [seen.names.index(name) for name in points.names]
-        other = [seen.names.index(mirror_name(name) if mirror_name(name) in seen.names else name) for name in points.names]
+        other = [
+            seen.names.index(mirror_name(name) if mirror_name(name) in seen.names else name) for name in points.names
+        ]
         fitted = rig[seen.camera].project(motion.positions(points))
         measured = seen.points[np.arange(len(seen)), np.maximum(chosen, 0)][: len(motion)]
         off = [np.linalg.norm(measured[:, c] - fitted, axis=-1) for c in (columns, other)]
@@ -79,7 +79,8 @@ def run(quick: bool = False) -> None:
     """Print the figures; quickly, of 30 frames and one camera held out."""
     folder, frames = data(TRIAL), QUICK if quick else 0
     goals = [("real_residual_openpose", "x", "<= 1.05"), ("real_residual_mediapipe", "x", "<= 1.05"),
-             ("real_iou", "", ">= 0.90"), ("real_held_out", "x", "<= 1"), ("real_swaps", "frames", f">= {SWAPS}")]  # fmt: skip
+             ("real_iou", "", ">= 0.90"), ("real_held_out", "x", "<= 1"),
+             ("real_swaps", "frames", f">= {SWAPS}")]  # fmt: skip
     if folder is None:
         for name, unit, goal in goals:
             figure(name, None, unit, goal, "the real trial is absent")
@@ -113,7 +114,9 @@ def both(folder: Path, detector: str, frames: int, quick: bool) -> dict[str, flo
         return out | {"real_swaps": float(counts[1].get("cam02", 0))}
     shares = [overlaps(motion, rig, masked.silhouettes) for motion in (alone, beside)]
     for motion, share in zip(("keypoints alone", "with silhouettes"), shares):
-        print(f"# IoU {motion}: {share.mean():.3f}, by camera {np.round(share.mean(axis=0), 3)}, worst {share.min():.3f}")
+        print(
+            f"# IoU {motion}: {share.mean():.3f}, by camera {np.round(share.mean(axis=0), 3)}, worst {share.min():.3f}"
+        )
     held: list[list[float]] = []
     for k, camera in enumerate(CAMERAS[: 1 if quick else None]):
         others = [name for name in CAMERAS if name != camera]

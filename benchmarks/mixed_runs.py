@@ -3,8 +3,8 @@
 Every draw is recorded once; its takes (one for each mix of sensors and each condition) name some of its files. What
 `kinefit.track_take` makes of a take is kept as errors and standard deviations; what it raises is kept as text.
 
-Conditions: "smoothed" (the default), "frames" (`smooth=False`), "outliers" (20 % of keypoints and markers elsewhere, 20 %
-of the depth pixels at any depth, a disk of 12 cm added to or cut from the outline in 20 % of the masks) and "lost" (one
+Conditions: "smoothed" (the default), "frames" (`smooth=False`), "outliers" (20 % of keypoints and markers elsewhere,
+20 % of the depth pixels at any depth, a disk of 65 px radius added to or cut from the contour in 20 % of the masks) and "lost" (one
 of the mix's sensors sees nothing for 30 frames; the next one in the next draw).
 """
 
@@ -87,7 +87,8 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
     few = lambda array: np.asarray(array, np.float32)
     return Outcome(
         few(shift), few(motion.joint_std), few(turn), few(motion.dof_std[:, 6:]),
-        acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen, seconds,
+        acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
+        seconds,
     )  # fmt: skip
 
 

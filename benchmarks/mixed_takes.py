@@ -2,12 +2,12 @@
 
 Person: the skin of an Anny body of random stature, sex, weight and strength, on the humanoid's skeleton with lengths
 nearest to that body's and another 2 % off; so joint centres and angles mean the same in truth and fit, the surface does
-not. Detector points and markers stand 8 mm from the catalogue's places. Motion: 3 s of a recorded motion at 30 Hz (or the
-built-in exercise), put onto that body by `retarget`; those who travel farther than 1.5 m do it on a treadmill. Sensors:
-four cameras of 1088x1920 px with MediaPipe's points (3 px of noise, 2 px of drift over half a second, 10 % outliers,
-10 % missing) and masks at a quarter of that size, whose outline errs by 4 px over about 40 px of its length; a
-time-of-flight camera of 160x120 px in a room, which it saw empty for ten images before; 45 markers with 1 mm of noise and 2 % gaps. The calibration that the
-takes name is wrong by 0.1 degree and 3 mm in every camera.
+not. Detector points and markers stand 8 mm from the catalogue's places. Motion: 3 s of a recorded motion at 30 Hz (or
+the built-in exercise), put onto that body by `retarget`; those who travel farther than 1.5 m do it on a treadmill.
+Sensors: four cameras of 1088x1920 px with MediaPipe's points (3 px of noise, 2 px of drift over half a second, 10 %
+outliers, 10 % missing) and masks at a quarter of that size, whose contour errs by 4 px over about 40 px of its length;
+a time-of-flight camera of 160x120 px in a room, which it saw empty for ten images before; 45 markers with 1 mm of noise
+and 2 % gaps. The calibration that the takes name is wrong by 0.1 degree and 3 mm in every camera.
 """
 
 from __future__ import annotations
@@ -198,8 +198,8 @@ def take_text(folder: Path, parts: Sequence[str]) -> str:
 
     Parameters
     ----------
-    parts : of "keypoints" and "masks" (of the first two cameras), "first keypoints" (of the first frame) and "all masks"
-        (of four), "depth", "markers 4", "markers 20", "markers 45".
+    parts : of "keypoints" and "masks" (of the first two cameras), "first keypoints" (of the first frame) and
+        "all masks" (of four), "depth", "markers 4", "markers 20", "markers 45".
     """
     few, every = CAMERAS[:2], CAMERAS
     given = {"keypoints": few, "first keypoints": every}
