@@ -1,9 +1,9 @@
 """A depth camera that the calibration has 2 degrees turned and 3 cm moved against the videos (for `benchmarks.mixed`).
 
 Simulated takes of two cameras with keypoints and the depth camera, as everywhere else in `benchmarks.mixed`, but for
-the pose of the depth camera in the calibration file. `kinefit check` is asked for what is wrong, and with `--refine` for a
-better calibration. Found means that it exits with a fault (`--strict`) and its text names the sensor. What is left is
-the depth camera's pose relative to the first camera, against the true one.
+the pose of the depth camera in the calibration file. `kinefit check` is asked for what is wrong, and with `--refine`
+for a better calibration. Found means that it exits with a fault (`--strict`) and its text names the sensor. What is
+left is the depth camera's pose relative to the first camera, against the true one.
 """
 
 from __future__ import annotations

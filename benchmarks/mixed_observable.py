@@ -2,9 +2,9 @@
 
 At every tenth frame the true body's measurements are linearised about the truth: keypoints (8 px), markers (10 mm),
 nodes of the true skin that the depth camera sees (3 cm along their normals, as neighbours err alike) and those on the
-occluding contour in a camera with a mask (3 cm). With the catalogue's spread of the angles as prior, a joint centre's coordinate is
-observable where its standard deviation is below 5 cm, an angle where its variance is below half of the prior's. The
-lengths of the body count as known.
+occluding contour in a camera with a mask (3 cm). With the catalogue's spread of the angles as prior, a joint centre's
+coordinate is observable where its standard deviation is below 5 cm, an angle where its variance is below half of the
+prior's. The lengths of the body count as known.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 Every draw is recorded once; its takes (one for each mix of sensors and each condition) name some of its files. What
 `kinefit.track_take` makes of a take is kept as errors and standard deviations; what it raises is kept as text.
 
-Conditions: "smoothed" (the default), "frames" (`smooth=False`), "outliers" (20 % of keypoints and markers elsewhere,
-20 % of the depth pixels at any depth, a disk of 65 px radius added to or cut from the contour in 20 % of the masks) and "lost" (one
-of the mix's sensors sees nothing for 30 frames; the next one in the next draw).
+Conditions: "smoothed" (the default), "frames" (`smooth=False`), "outliers" (20 % of keypoints and markers elsewhere, 20
+% of the depth pixels at any depth, a disk of 65 px radius added to or cut from the contour in 20 % of the masks) and
+"lost" (one of the mix's sensors sees nothing for 30 frames; the next one in the next draw).
 """
 
 from __future__ import annotations
