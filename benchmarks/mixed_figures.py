@@ -202,13 +202,13 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 
 
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
-    """Runs that some groups of figures need; quickly, few of them with outliers, lost sensors and slow mixes."""
-    slow = ("depth_alone", "silhouettes_alone") if quick else ()
+    """Runs that some groups of figures need; quickly, without depth alone (a minute a take) and with few conditions."""
+    mixes = [mix for mix in MIXES if not quick or mix != "depth_alone"]
     out: list[Run] = []
     if "sensors" in groups:
         out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
     if "smoothing" in groups or "intervals" in groups:
-        out += [(mix, condition) for mix in MIXES for condition in CONDITIONS[: 1 if mix in slow else 2]]
+        out += [(mix, condition) for mix in mixes for condition in CONDITIONS[:2]]
     if "intervals" in groups:
-        out += [(m, c) for m in (("cameras", "all") if quick else MIXES) for c in CONDITIONS[2:]]
+        out += [(m, c) for m in (("cameras", "all") if quick else mixes) for c in CONDITIONS[2:]]
     return list(dict.fromkeys(out))

