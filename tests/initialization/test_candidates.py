@@ -135,6 +135,11 @@ def test_a_limb_that_is_where_it_is_does_not_leap(search):
         assert least == GAIN and off(state, 0).max() < 0.1
 
 
+def test_a_trunk_that_is_sought_is_no_limb(search):
+    for state, least in find_limbs(search, TRUTH, segments("thorax"), tries=10):
+        assert search.score.of(state) > search.score.of(TRUTH) + least
+
+
 # Cameras made up for a cloud
 
 

