@@ -28,6 +28,7 @@ from kinefit.tracking.run import run
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
 _POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
+_MATCHES = 3  # rounds of matching and solving
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 Start = tuple[int, BodyState]
@@ -172,7 +173,7 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
         pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
     states = [tracked.results[k].state for k in chosen]
-    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss)
+    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss, rounds=_MATCHES)
     told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
     person = _wearing(person, replace(person.subject, body=found.body), shape=told)
