@@ -106,5 +106,6 @@ def test_another_shape_moves_joints_as_refitting_does(scene):
 
 def test_nothing_seen_leaves_finite_bars(scene):
     subject, channels, weight, state = scene
-    out = covariance((subject, channels, np.zeros_like(weight), state), noise_of(channels, drift=3.0), subject.covariance)
+    unseen = subject, channels, np.zeros_like(weight), state
+    out = covariance(unseen, noise_of(channels, drift=3.0), subject.covariance)
     assert np.all(np.isfinite(out.dofs)) and np.all(np.isfinite(out.joints)) and out.joints.min() >= 0
