@@ -175,7 +175,7 @@ def test_coarse_to_fine_finds_what_the_finest_level_does_not():
     truth = BodyState(at(body).T_world_root, body.tree.usual)
     seen = silhouettes(body, truth, rig, 0.0)
     swing = np.where(np.arange(len(body.tree.usual)) % 2, 1.0, -1.0)
-    far = np.clip(truth.angles + np.radians(30.0) * swing, body.tree.lower, body.tree.upper)
+    far = np.clip(truth.angles + np.radians(40.0) * swing, body.tree.lower, body.tree.upper)
     start = BodyState(truth.T_world_root, far)
     accuracy = {f"silhouette {name}": 1.0 for name in rig.names}
     alone = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=LEVELS[-1:])

@@ -29,6 +29,7 @@ from kinefit.tracking.run import run
 BODY = load_body("humanoid")
 TREE = BODY.tree
 ARM = slice(TREE.coordinate("arm_flex_r"), TREE.coordinate("arm_rot_r") + 1)
+DEFAULT = TrackSettings()
 
 
 def turns_of(angles):
@@ -148,10 +149,10 @@ def channels_of(truth, rig, keypoints, sigma):
 
 def followed(truth, channels):
     """The frames of channels as tracked."""
-    return run(Recording(truth.times, truth.rate, channels.rig), truth.body, channels, TrackSettings())
+    return run(Recording(truth.times, truth.rate, channels.rig), truth.body, channels, DEFAULT)
 
 
-def smoothed_of(truth, channels, tracked, settings=TrackSettings(), count=None, **options):
+def smoothed_of(truth, channels, tracked, settings=DEFAULT, count=None, **options):
     """Smoothed frames, and what is told of them."""
     results = tracked.results[:count]
     scene_of = tracked.tracker.scene_of
