@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
+from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part
 from kinefit.subject.lasting import Seen
@@ -103,7 +103,7 @@ class MatchedFrames:
         same = kept is not None and kept[0] is scene.state
         if same and kept is not None and _alike(kept[1], world, sensor):
             return kept[2]
-        rows = check_rows(matched.rows(scene), sensor, world.body)
+        rows = rows_at(matched, scene)
         if not same:
             self._latest[key] = scene.state, world, rows
         return rows
@@ -117,7 +117,7 @@ class MatchedFrames:
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
     """Names of the points that a match counts, where it has those of one detector or marker system only."""
-    told = matched.leftovers(scene) if matched.of_points else []
+    told = leftovers_at(matched, scene) if matched.of_points else []
     return told[0].names if len(told) == 1 and told[0].rms is None else None
 
 
