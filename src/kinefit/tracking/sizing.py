@@ -184,12 +184,13 @@ def _parameters(person: Person, measurements: list[Measurement]) -> list[Paramet
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
     surfaces = any(not m.settled for m in measurements)
-    if surfaces or r.markers:
+    cameras = len({k.camera for k in r.keypoints})
+    if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
     sets = {name: std for name, std in r.marker_sets if std is not None}
-    if len({k.camera for k in r.keypoints}) >= 2:  # else the markers' own fit has found them
+    if cameras >= 2:  # else the markers' own fit has found them
         out += [PointOffsets(body, name, std) for name, std in sets.items()]
     unknown = [s for s in r.sensors if s.unknowns]
     return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]

@@ -95,7 +95,7 @@ def _motion(
     others = None
     if any(tracked.measurements):
         others = OtherSensors(
-            times, tuple(tracked.measurements), tracker.scene_of, tracker.apart, settings.near,
+            times, tuple(tracked.measurements), tracker.scene_of, tracker.apart, settings,
             dict.fromkeys({m.sensor for several in tracked.measurements for m in several}, 1.0),
         )  # fmt: skip
     matched: tuple[tuple[Matched, ...], ...] | None = None
