@@ -56,10 +56,10 @@ class MatchedFrames:
     """Frames with their correspondences: the problem that the solver sees."""
 
     def __init__(
-        self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], velocities: Sequence[NDArray] | None,
-        theta: NDArray, states: Sequence[BodyState], reach: float,
+        self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], times: Sequence[float] | None,
+        velocities: Sequence[NDArray] | None, theta: NDArray, states: Sequence[BodyState], reach: float,
     ) -> None:  # fmt: skip
-        self._worlds, self._steps, self._velocities = worlds, steps, velocities
+        self._worlds, self._steps, self._times, self._velocities = worlds, steps, times, velocities
         self._matched: list[list[Matched]] = []
         self._latest: dict[tuple[int, int], tuple[BodyState, World, list[AnyRows]]] = {}
         world = worlds.at(theta)
@@ -111,8 +111,9 @@ class MatchedFrames:
     def _scene(self, world: World, frame: int, state: BodyState) -> Scene:
         several = self._steps[frame]
         velocity = None if self._velocities is None else self._velocities[frame]
+        time = several[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
-        return scene.at(state, time=several[0].time, velocity=velocity, measurements=several)
+        return scene.at(state, time=time, velocity=velocity, measurements=several)
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
