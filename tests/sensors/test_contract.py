@@ -264,7 +264,8 @@ def test_a_subject_fit_takes_any_fake(name):
     unknown = [OwnUnknowns.of([sensor]) if sensor.unknowns else SegmentScales(BODY)]
     speed = [RATE / 2 * results[i - 1].state.difference(results[i + 1].state) for i in used]
     measured = [[m.compact() for m in results[i].measurements] for i in used]
-    found = fit_subject(BODY, a_rig(), measured, [results[i].state for i in used], unknown, velocities=speed, times=[i / RATE for i in used])
+    states, times = [results[i].state for i in used], [results[i].time for i in used]
+    found = fit_subject(BODY, a_rig(), measured, states, unknown, velocities=speed, times=times)
     assert len(found.states) == len(used) and np.isfinite(found.cost) and set(found.excess) >= {"mocap"}
     if name in FOUND:
         what, true, within = FOUND[name]
