@@ -96,7 +96,7 @@ def evidence_of(scene: Scene, matched: Sequence[Matched]) -> Evidence:
     """What matches say of each segment at a scene's state."""
     told = Evidence.none(len(scene.body.tree.segments))
     for m in matched:
-        told = told + m.evidence(scene)
+        told = told + m.evidence(scene.at_time(m.time))
     return told
 
 

@@ -65,7 +65,10 @@ class Scene:
         return out
 
     def at_time(self, time: float) -> Scene:
-        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own."""
+        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own.
+
+        Velocities hold for about a frame: a clock that is farther off must be set right beforehand.
+        """
         if self.velocity is None or not abs(time - self.time) > 1e-9:
             return self
         return self.at(self.state.retract((time - self.time) * self.velocity), time=time)

@@ -113,7 +113,7 @@ def lasting(
     J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
     Jq = J[:, :, :n].reshape(-1, n)
     each = np.repeat(weight, 2)
-    H = (Jq * each[:, None]).T @ J.reshape(len(each), -1)
+    H = (Jq * each[:, None]).T @ J.reshape(len(each), J.shape[2])
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
     alone = inverse(H[:, :n] + other_information + prior)
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq

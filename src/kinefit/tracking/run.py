@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement
+from kinefit.sensors.base import Leftover, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
@@ -61,7 +62,7 @@ def run(
     sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
     tracker = Tracker(
         body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis, on_body=recording.on_body,
-        settings=settings, sensors=recording.sensors, values=values,
+        settings=settings, sensors=deepcopy(recording.sensors), values=values,
     )  # fmt: skip
     for name, depth in recording.backgrounds.items():
         tracker.know_background(name, depth)
@@ -81,8 +82,9 @@ def run(
         found = tracker.update(frames, time)
         if found is None:
             return None
-        scene = tracker.scene_of(found.state, time).at(found.state, measurements=found.measurements)
-        left[i] = [rest for m in found.matched for rest in m.leftovers(scene)]
+        moving = {"measurements": found.measurements, "velocity": tracker.speed}
+        scene = tracker.scene_of(found.state, time).at(found.state, **moving)
+        left[i] = [rest for m in found.matched for rest in leftovers_at(m, scene)]
         pixels_only = tuple(m for m in found.matched if isinstance(m, KeypointMatched))
         kept[i] = tuple(m.compact() for m in found.measurements if not isinstance(m, KeypointMeasurement))
         return replace(found, matched=pixels_only, measurements=())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import KinefitError, ObservationError, TrackingError
+from kinefit.frame.results import FrameResult
 from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
@@ -173,11 +174,20 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
         pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
     states = [tracked.results[k].state for k in chosen]
-    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss, rounds=_MATCHES)
+    found = joint.fit_subject(
+        body, r.rig, steps, states, parameters, loss=settings.loss, times=[tracked.results[k].time for k in chosen],
+        velocities=[_velocity(tracked.results, k) for k in chosen], rounds=_MATCHES,
+    )  # fmt: skip
     told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
     person = _wearing(person, replace(person.subject, body=found.body), shape=told)
     return replace(person, start=begin, values=found.values, joint=found)
+
+
+def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
+    """(n,) [m/s, rad/s] of one of several results, from those beside it."""
+    a, b = results[max(k - 1, 0)], results[min(k + 1, len(results) - 1)]
+    return a.state.difference(b.state) / max(b.time - a.time, 1e-6)
 
 
 def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:

@@ -11,7 +11,7 @@ from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover, Matched
+from kinefit.sensors.base import Leftover, Matched, leftovers_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.sensor_noise import other_noise
@@ -107,9 +107,10 @@ def _motion(
         results, take, weight = done.results, done.take, done.weight
         provenance["smoothing"] = done.provenance
         others, matched = take.others, None if take.linear is None else take.linear.matched
-        leftovers = [
-            [rest for m in r.matched for rest in m.leftovers(tracker.scene_of(r.state, r.time))] for r in results
-        ]
+        leftovers = []
+        for f, r in enumerate(results):
+            scene = tracker.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+            leftovers.append([rest for m in r.matched for rest in leftovers_at(m, scene)])
     else:
         take = pixels_of_track(body, channels, results, rate, settings)
         factor = take.factors(channels.sigma, take.fitted(take.roots, take.angles))
