@@ -95,6 +95,10 @@ def test_gradient_and_curvature_of_the_motion_prior(turn):
             np.testing.assert_allclose(H[a, 3, b, 5], expected, rtol=1e-5, atol=1e-4)
 
 
+def nothing_enters(W):
+    return np.zeros((3 * W.shape[1],) * 2)
+
+
 @pytest.mark.parametrize("T", [1, 2, 3, 4, 7])
 def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
     p = prior()
@@ -106,14 +110,14 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
     b = random.normal(size=(T, N))
     x[:, :N] = b
     packed = system.C, TREE.chain, TREE.depth, system.band, *blocks(BODY)
-    assert _kernels_band.factor_band(*packed, 0.3, W, below, x)
+    assert _kernels_band.factor_band(*packed, 0.3, nothing_enters(W), W, below, x)
     _kernels_band.back_substitute(W, below, x)
     expected = np.linalg.solve(H + 0.3 * np.eye(T * N), b.ravel()).reshape(T, N)
     np.testing.assert_allclose(x[:, :N], expected, atol=1e-11)
 
     share = np.tile(np.concatenate([np.zeros(6), p.posture_share - 1.0 / TREE.spread**2]), T)
     V = np.linalg.inv(H + np.diag(share)).reshape(T, N, T, N)
-    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system))
+    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, (TREE.chain, TREE.depth)))
     for t in range(T):
         np.testing.assert_allclose(found.frames[t], V[t, :, t], atol=1e-9)
         if t + 1 < T:
@@ -136,7 +140,7 @@ def test_a_matrix_that_is_not_positive_is_told():
     system.C[1, 7, TREE.depth[7]] = -1e9
     W, below, x = _workspace(T, N)
     packed = system.C, TREE.chain, TREE.depth, system.band, *blocks(BODY)
-    assert not _kernels_band.factor_band(*packed, 0.0, W, below, x)
+    assert not _kernels_band.factor_band(*packed, 0.0, nothing_enters(W), W, below, x)
 
 
 def test_first_steps_are_those_of_a_motion_that_goes_on_for_ever():
