@@ -1,8 +1,19 @@
-"""A live session becomes a motion: the same as from a recording, with steps dropped, cameras missing, sensors in turn."""
+"""A live session becomes a motion: as from a recording, with steps dropped, cameras missing, sensors in turn."""
 
 import numpy as np
 import pytest
-from tests.tracking.movements import BODY, RATE, SET, STILL, a_motion, a_rig, a_tracker, depth_frame, keypoint_frame, off
+from tests.tracking.movements import (
+    BODY,
+    RATE,
+    SET,
+    STILL,
+    a_motion,
+    a_rig,
+    a_tracker,
+    depth_frame,
+    keypoint_frame,
+    off,
+)
 
 from kinefit import BodyState, Recording, track
 from kinefit.errors import ObservationError

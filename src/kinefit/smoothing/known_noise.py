@@ -55,6 +55,16 @@ class KnownNoise:
         acceleration = np.maximum(np.array([found[name] for name in names]), 1e-3)
         return cls(acceleration, told.get("pixel_sigma", {}), told.get("sigma_factor", {}))
 
+    def as_told(self, body: Body) -> dict[str, Any]:
+        """The same by name, as `of_take` reads it."""
+        names = ("root_shift", "root_turn", *body.tree.coordinates)
+        values = [self.acceleration[0], *self.acceleration[5:]]
+        return {
+            "acceleration": {name: round(float(v), 2) for name, v in zip(names, values)},
+            "pixel_sigma": {source: dict(of) for source, of in self.pixel_sigma.items()},
+            "sigma_factor": dict(self.scale),
+        }  # fmt: skip
+
 
 def known_sigma(channels: Channels, noise: KnownNoise) -> NDArray:
     """(N,) [px] standard deviations of keypoints, as they are known or else as stated."""

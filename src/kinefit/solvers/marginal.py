@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.solvers import _kernels_smoothing
+from kinefit.solvers import _kernels_band, _kernels_smoothing
 from kinefit.solvers.equations import inverse
 
 
@@ -119,6 +119,13 @@ def _unpacked(band: NDArray, first: NDArray, width: NDArray) -> NDArray:
 
 
 def _schur(A: NDArray, b: NDArray, n: int) -> tuple[NDArray, NDArray]:
-    fall = A[n:, :n] @ inverse(A[:n, :n] + 1e-12 * np.trace(A) / len(A) * np.eye(n))
-    left = A[n:, n:] - fall @ A[:n, n:]
-    return 0.5 * (left + left.T), b[n:] - fall @ b[:n]
+    """What is left of A (4 n, 4 n), b (4 n,) without the first n unknowns."""
+    p = 4 * -(-n // 4)
+    alone = np.zeros((p, p))
+    alone[:n, :n] = inverse(A[:n, :n] + 1e-12 * np.trace(A) / len(A) * np.eye(n))
+    below, fall, taken = np.zeros((3 * p, p)), np.empty((3 * p, p)), np.empty((3 * p, 3 * n))
+    below[: 3 * n, :n] = A[n:, :n]
+    _kernels_band.product(below, alone, fall)
+    _kernels_band.product(fall, np.ascontiguousarray(below[: 3 * n].T), taken)
+    left = A[n:, n:] - taken[: 3 * n]
+    return 0.5 * (left + left.T), b[n:] - fall[: 3 * n, :n] @ b[:n]

@@ -222,9 +222,7 @@ def smooth(
                 start = start_of(entering, tree.n_dofs, W.shape[1], held[:3])
         tried, fresh = tried + 1, False
         delta[:, : tree.n_dofs] = now.g
-        if not _kernels_band.factor_band(
-            now.C, chain, depth, now.band, first, width, damping, start, W, below, delta
-        ):
+        if not _kernels_band.factor_band(now.C, chain, depth, now.band, first, width, damping, start, W, below, delta):
             damping, growth = 100.0 * damping, 2.0
             continue
         _kernels_band.back_substitute(W, below, delta)
@@ -248,7 +246,12 @@ def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _system(
-    body: Body, roots: NDArray, angles: NDArray, equations: MakeEquations, prior: MotionPrior, depth: NDArray,
+    body: Body,
+    roots: NDArray,
+    angles: NDArray,
+    equations: MakeEquations,
+    prior: MotionPrior,
+    depth: NDArray,
     entering: Entering | None = None,
 ) -> _System:
     T, n = len(roots), body.tree.n_dofs
@@ -269,15 +272,17 @@ def _system(
     return _System(C, band, g, total, changes, entering)
 
 
-def posterior(body: Body, smoothed: Smoothed, since: int = 0) -> Posterior:
+def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | None = None) -> Posterior:
     """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
 
     Limits are left out, as they are of a frame's covariance. Frames before `since` are left out: they stand as NaN.
+    `share` (D,) is the prior's `posture_share`, where it is known already.
     """
     s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
     T, n = s.g.shape
     C = s.C.copy()
-    C[:, np.arange(6, n), depth[6:]] += prior.posture_share - 1.0 / np.square(prior.spread)
+    share = prior.posture_share if share is None else share
+    C[:, np.arange(6, n), depth[6:]] += share - 1.0 / np.square(prior.spread)
     W, below, nothing = _workspace(T, n)
     p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), depth].mean())
     start = start_of(s.entering, n, p, covariance=True)
@@ -287,11 +292,14 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0) -> Posterior:
     past, _ = prior.rows(max(T - 1, 0))
     variance = np.zeros((max(T - 1, 0), n))
     ahead = np.zeros((4 * p, 4 * p))  # covariance of frames t .. t + 3
+    fall, cross, both, own = np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((4 * p, p)), np.empty((p, p))
     for t in range(T - 1, since - 1, -1):
         ahead[p:, p:] = ahead[: 3 * p, : 3 * p].copy()
-        fall = below[t] @ W[t].T
-        cross = -ahead[p:, p:] @ fall
-        own = W[t] @ W[t].T - fall.T @ cross
+        _kernels_band.product(below[t], np.ascontiguousarray(W[t].T), fall)
+        _kernels_band.product(np.ascontiguousarray(ahead[p:, p:]), fall, cross)
+        cross *= -1.0
+        both[:p], both[p:] = W[t].T, cross
+        _kernels_band.product(np.concatenate([W[t], -fall.T], axis=1), both, own)
         ahead[:p, :p], ahead[p:, :p], ahead[:p, p:] = 0.5 * (own + own.T), cross, cross.T
         frames[t] = ahead[:n, :n]
         if t + 1 < T:

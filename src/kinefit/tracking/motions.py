@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, Measurement
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.fixed_lag import FixedLag
+from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.lag_frame import Followed
 from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.uncertainty import with_lasting_errors
+from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.keypoints import Subject
 
 
@@ -48,7 +54,8 @@ class TrackedFrames:
 
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
-    up: str = "z", name: str = "motion", told: Mapping[str, Any] | None = None,
+    lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", name: str = "motion",
+    told: Mapping[str, Any] | None = None,
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 
@@ -59,6 +66,8 @@ def motion_of(
     settings : TrackSettings
     smooth : fit all frames together with a motion prior
     contacts : hold the soles still where they rest on a level floor, when smoothing
+    lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
+    noise : that is known beforehand, for a lag
     up, name : of the motion
     told : what else there is to tell, for `Motion.provenance`
     """
@@ -79,24 +88,26 @@ def motion_of(
         results, take, weight = done.results, done.take, done.weight
         provenance["smoothing"] = done.provenance
         others, matched = take.others, None if take.linear is None else take.linear.matched
-        leftovers = [
-            [rest for m in r.matched for rest in m.leftovers(frames.scene_of(r.state, r.time))] for r in results
-        ]
+        leftovers = _leftovers(results, frames.scene_of)
     else:
+        if lag is not None:
+            results, provenance["fixed lag"] = _behind(frames, body, settings, lag, noise)
+            leftovers = _leftovers(results, frames.scene_of)
         take = pixels_of_track(body, channels, results, rate, settings)
         factor = take.factors(channels.sigma, take.fitted(take.roots, take.angles))
         weight = take.confidence / np.square(channels.sigma) * factor
         if others is not None:
-            matched = others.linearised(body, take.roots, take.angles).matched
+            kept = tuple(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)) for r in results)
+            matched = others.linearised(body, take.roots, take.angles).matched if lag is None else kept
     noise_of_others = None
     if others is not None and matched is not None:
         noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
         provenance["sensor noise"] = noise_of_others.as_told()
-    results, noise = with_lasting_errors(results, subject, take, weight, rate, noise_of_others)
+    results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others)
     if channels.sources:
-        provenance["detector noise"] = noise.as_told(channels.sources)
+        provenance["detector noise"] = detectors.as_told(channels.sources)
     provenance["length_std_m"] = subject.length_std
-    provenance["estimate"] = "smoothed" if smooth else "filtered"
+    provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
     return Motion(
         body=body,
         rate=rate,
@@ -112,6 +123,25 @@ def motion_of(
         name=name,
         provenance=provenance,
     )
+
+
+def _behind(
+    frames: TrackedFrames, body: Body, settings: TrackSettings, lag: float, noise: KnownNoise | None
+) -> tuple[list[FrameResult], dict[str, Any]]:
+    """All frames as a live session has them a lag [s] behind, with angles that go on; and what there is to tell."""
+    behind = FixedLag(Followed(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
+    out: list[FrameResult] = []
+    for result, measurements in zip(frames.results, frames.measurements):
+        out += behind.add(result, measurements, ahead=1)
+    out += behind.finish()
+    angles = unwrap(body.tree, np.stack([r.state.angles for r in out]))
+    out = [replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles)]
+    return out, {"seconds": round(behind.seconds, 4), **behind.noise.as_told(body)}
+
+
+def _leftovers(results: Sequence[FrameResult], scene_of: SceneOf) -> list[list[Leftover]]:
+    """What every sensor leaves over of results."""
+    return [[rest for m in r.matched for rest in m.leftovers(scene_of(r.state, r.time))] for r in results]
 
 
 def residuals_of(leftovers: Sequence[Sequence[Leftover]], results: Sequence[FrameResult]) -> dict[str, Residuals]:

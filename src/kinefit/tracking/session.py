@@ -42,8 +42,9 @@ class KeptFrame:
     def of(cls, result: FrameResult, scene: Scene) -> KeptFrame:
         """Of a result as a tracker gives it; the scene is at its state."""
         scene = scene.at(result.state, measurements=result.measurements)
+        pixels = tuple(m for m in result.matched if isinstance(m, KeypointMatched))
         return cls(
-            replace(result, matched=tuple(m for m in result.matched if isinstance(m, KeypointMatched)), measurements=()),
+            replace(result, matched=pixels, measurements=()),
             tuple(m.compact() for m in result.measurements if not isinstance(m, KeypointMeasurement)),
             tuple(rest for m in result.matched for rest in m.leftovers(scene)),
         )  # fmt: skip
@@ -164,9 +165,7 @@ def _together(
 ) -> KeypointMatched:
     """Matches of one time in another layout."""
     channels = layout.channels
-    measurement = KeypointMeasurement(
-        several[0].measurement.of, layout, channels.uv[f], channels.confidence[f], time
-    )
+    measurement = KeypointMeasurement(several[0].measurement.of, layout, channels.uv[f], channels.confidence[f], time)
     swapped, hidden = np.zeros(len(channels.column), bool), []
     for m in several:
         column = columns[id(m.measurement.layout)]

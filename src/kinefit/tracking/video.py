@@ -6,6 +6,8 @@ from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.fixed_lag import lag_frames
+from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import Progress, Subject
 from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.motions import TrackedFrames, motion_of
@@ -17,7 +19,8 @@ from kinefit.tracking.sizing import fitted_to_person
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
     height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
-    contacts: bool = False, shape_frames: int = 25, progress: Progress | None = None,
+    contacts: bool = False, lag: float | None = None, noise: KnownNoise | None = None, shape_frames: int = 25,
+    progress: Progress | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of one person from whatever sensors saw, with no pose given.
 
@@ -41,13 +44,19 @@ def track(
         Fit all frames together in the end; without it each frame knows only of those before it.
     contacts : bool
         Hold the soles still where they rest on a level floor, when smoothing.
+    lag : float [s]
+        Instead of smoothing the whole take: each frame as a live session has it so much later (`FixedLag`).
+    noise : KnownNoise
+        With a lag: process noise and the sensors' noise, as another take told them (`KnownNoise.of_take`); default:
+        the settings' accelerations.
     shape_frames : int, how many frames bone lengths are found from.
     progress : called with (what, done, total).
 
     Raises
     ------
     ObservationError
-        Contacts without smoothing, which would be ignored; a height that cannot be.
+        Contacts without smoothing, or with a lag, which would be ignored; noise without a lag; a lag of less than a
+        frame or as long as the take; a height that cannot be.
     TrackingError
         Nobody can be found, or no frame shows enough of the person.
     TrackingInterrupted
@@ -56,6 +65,14 @@ def track(
     if contacts and not smooth:
         remedy = "Leave smooth as it is: contacts need the whole take."
         raise ObservationError("contacts without smoothing", remedy=remedy)
+    if lag is not None and (contacts or not smooth):
+        what = "contacts, which need the whole take" if contacts else "no smoothing at all"
+        raise ObservationError(f"a lag of {lag:g} s together with {what}", remedy="Choose one of both.")
+    if noise is not None and lag is None:
+        raise ObservationError("known noise without a lag", remedy="Leave it out: a whole take tells its own.")
+    if lag is not None and lag_frames(lag, recording.rate) >= len(recording):
+        problem = f"a lag of {lag:g} s for {len(recording)} frames at {recording.rate:g} Hz"
+        raise ObservationError(problem, remedy="Smooth the whole take instead: leave the lag out.")
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     settings = settings or TrackSettings()
@@ -74,8 +91,8 @@ def track(
     )  # fmt: skip
     told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     motion = motion_of(
-        frames, person.subject, settings, smooth=smooth and tracked.complete, contacts=contacts, up=recording.up,
-        name=recording.name, told=told,
+        frames, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
+        lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
     )  # fmt: skip
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))
