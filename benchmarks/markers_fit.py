@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
 from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
 from kinefit.cli._fit_markers import wearing
@@ -38,7 +38,7 @@ OPENSIM = {
     "hip": "hip", "knee": "walker_knee", "ankle": "ankle", "shoulder": "acromial", "elbow": "elbow",
     "wrist": "radius_hand",
 }  # fmt: skip
-REPEATS = 3
+REPEATS = amount(3, 1)
 
 
 def run() -> None:
@@ -132,7 +132,8 @@ def opensim() -> None:
             "reference": str(run / "IK" / "results" / "ik_output_run.mot"),
         }  # fmt: skip
         (own / "take.json").write_text(json.dumps(take), encoding="utf-8")
-        peer = run_peer("opensim_takes", own)
+        left_out = {"reason": LEFT_OUT if quick() else "--no-peers"}
+        peer = run_peer("opensim_takes", own) if peers() else left_out
         print(f"# {peer}", flush=True)
         reason = peer.get("reason", "")
         points = np.load(own / "centres.npz")["centres"] if not reason else None
@@ -224,7 +225,7 @@ def long_take() -> None:
         figure("markers_fit_60s", None, "s", "<= 30", "the recording is absent")
         return
     take = read_markers(folder / "mocaprecovery" / "data__85_12.c3d")
-    x = np.concatenate([take.positions, take.positions[::-1]])[:7200]
+    x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
     markers = replace(take, positions=x, residual=None)
     fitted([replace(markers, positions=x[:200])])  # compiled
     start = time.process_time()  # one core; the clock on the wall says the same on a machine that does nothing else
