@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -139,7 +140,7 @@ def tracked(body: Body, rig: Rig, pictures: Pictures, start: BodyState) -> dict[
         follow = Tracker(body, rig, rate=RATE, accuracy=accuracy, settings=SETTINGS)
         follow.start_at(start)
         for k, i in enumerate(steps):
-            result = follow.update(pictures(i), k / RATE)
+            result = follow.update([replace(frame, time=k / RATE) for frame in pictures(i)])  # also backwards
             assert result is not None
             out[i] = result.state
     return out
