@@ -1,6 +1,6 @@
 """What a subject fit may find: parameters of a world, each kind of them a few lines.
 
-A kind of parameter is a prior and a function from values to a world. Nothing is told of derivatives, and no sensor
+A kind of parameter is a prior and a function from values to a world. Derivatives are differences, and no sensor
 knows of parameters: the solver compares the rows of the same correspondences in worlds that differ a little.
 """
 

@@ -97,5 +97,5 @@ def test_no_list_of_objects_no_file_and_another_time(tmp_path):
         read_lines(tmp_path / "none.csv", ("a",))
     with pytest.raises(KinefitError, match="its images are from 0 to 0.1 s"):
         load(tmp_path, head="rate = 30\nframes = [10, 20]")
-    with pytest.raises(TakeError, match="nothing tells the rate"):
+    with pytest.raises(TakeError, match="nothing states the rate"):
         load(tmp_path, head="")
