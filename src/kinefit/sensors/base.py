@@ -48,7 +48,7 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What a measurement tells of the body where nothing is known of its pose.
+    """What a measurement shows of the body where nothing is known of its pose.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class Matched(ABC):
 
     @property
     def key(self) -> bytes:
-        """The same for matches that make the same rows: what tells a fit that nothing discrete changes any more."""
+        """The same for matches that make the same rows: what shows a fit that nothing discrete changes any more."""
         return b""
 
     @abstractmethod
@@ -156,7 +156,7 @@ class Measurement(ABC):
         """Correspondences at a scene's state, within a distance [m]."""
 
     def hints(self, scene: Scene) -> Hints:
-        """What it tells where no pose is known."""
+        """What it shows where no pose is known."""
         return Hints()
 
     def depth_image(self) -> DepthSeen | None:
@@ -251,7 +251,7 @@ def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:
 
 
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
-    """Residuals (N,) of points on segments (N,), told segment by segment."""
+    """Residuals (N,) of points on segments (N,), segment by segment."""
     count = np.bincount(segment, minlength=len(body.tree.segments))
     median, rms = np.full(len(count), np.nan), np.full(len(count), np.nan)
     for s in np.flatnonzero(count):

@@ -1,4 +1,4 @@
-"""The body fitted to the person of a recording: first by what tells it from nothing, then by all sensors together."""
+"""The body fitted to the person of a recording: first by what needs no pose, then by all sensors together."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Person:
     channels : the person's keypoints on this body
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
-    told : what there is to tell of it, for `Motion.provenance`
+    told : what there is to report of it, for `Motion.provenance`
     joint : what the fit of all sensors together found
     """
 
@@ -68,7 +68,7 @@ def fitted_to_person(
     Raises
     ------
     ObservationError
-        A trial, which tells lengths from keypoints, for a recording without keypoints of two cameras.
+        A trial, which knows lengths from keypoints, for a recording without keypoints of two cameras.
     KinefitError
         What the fits raise.
     """
@@ -84,7 +84,7 @@ def fitted_to_person(
         problem = f"the keypoints are of one camera only, {name}"
         raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
     if trial is not None and (cameras < 2 or not size):
-        problem = "a trial of the same person tells lengths by keypoints, and this recording has none of two cameras"
+        problem = "a trial of the same person gives lengths by keypoints, and this recording has none of two cameras"
         raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
     if subject is not None:
@@ -191,12 +191,12 @@ def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
 
 
 def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:
-    """What the sensors that took part can tell, beyond what the first fit found."""
+    """What the sensors that took part can estimate, beyond what the first fit found."""
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
     surfaces = any(not m.settled for m in measurements)
     cameras = len({k.camera for k in r.keypoints})
-    if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
+    if surfaces and cameras < 2:  # a surface of simple shapes determines lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
