@@ -291,7 +291,7 @@ class Rig:
     @cached_property
     def packed(self) -> NDArray:
         """(C, 29) the cameras for kernels."""
-        return _read_only(np.array([camera.packed for camera in self.cameras]).reshape(len(self.cameras), -1))
+        return _read_only(np.array([camera.packed for camera in self.cameras]).reshape(len(self.cameras), 29))
 
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""

@@ -98,12 +98,14 @@ class Matched(ABC):
     sensor, time : name of the sensor, and when [s] it measured; those of the measurement where they are not set
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
+    lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
     """
 
     sensor: str = ""
     time: float = np.nan
     of_points: bool = True
     shows_surface: bool = False
+    lasts: float = 0.0
 
     @property
     def key(self) -> bytes:
