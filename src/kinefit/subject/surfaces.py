@@ -64,6 +64,13 @@ class CylinderShape:
         return tuple(f"{name} {kind}" for name in self._groups[0] for kind in _KINDS)
 
     @property
+    def touches(self) -> tuple[frozenset[int], ...]:
+        """Of each parameter the segments that it changes."""
+        names, of = self._groups
+        on = [frozenset(s.segment for s, g in zip(self.body.surfaces, of) if g == k) for k in range(len(names))]
+        return tuple(segments for segments in on for _ in _KINDS)
+
+    @property
     def mean(self) -> NDArray:
         """(6 C,) zero."""
         return np.zeros(len(self.names))
@@ -100,7 +107,7 @@ def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
 
 @dataclass(frozen=True, eq=False)
 class AnnyShape:
-    """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a usual shape.
+    """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a mean shape.
 
     It makes the body anew, so it goes before all other parameters; lengths beside the shape's are `SegmentScales` after
     it, and the body that is fitted is one of the model's.

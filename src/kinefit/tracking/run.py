@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 from kinefit.bodies import Body
@@ -10,10 +11,11 @@ from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
+from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.recording import Recording
+from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
@@ -36,7 +38,7 @@ class Tracked:
     results: list[FrameResult]
     steps: list[int]
     measurements: list[tuple[Measurement, ...]]
-    leftovers: list[list[Leftover]]
+    leftovers: list[tuple[Leftover, ...]]
     tracker: Tracker
     complete: bool
 
@@ -61,7 +63,7 @@ def run(
     sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
     tracker = Tracker(
         body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis, on_body=recording.on_body,
-        settings=settings, sensors=recording.sensors, values=values,
+        settings=settings, sensors=deepcopy(recording.sensors), values=values,
     )  # fmt: skip
     for name, depth in recording.backgrounds.items():
         tracker.know_background(name, depth)
@@ -71,7 +73,7 @@ def run(
         tracker.start_at(state)
     results: dict[int, FrameResult] = {}
     kept: dict[int, tuple[Measurement, ...]] = {}
-    left: dict[int, list[Leftover]] = {}
+    left: dict[int, tuple[Leftover, ...]] = {}
 
     def step(tracker: Tracker, i: int, time: float) -> FrameResult | None:
         frames = list(recording.steps(i))
@@ -81,11 +83,10 @@ def run(
         found = tracker.update(frames, time)
         if found is None:
             return None
-        scene = tracker.scene_of(found.state, time).at(found.state, measurements=found.measurements)
-        left[i] = [rest for m in found.matched for rest in m.leftovers(scene)]
-        pixels_only = tuple(m for m in found.matched if isinstance(m, KeypointMatched))
-        kept[i] = tuple(m.compact() for m in found.measurements if not isinstance(m, KeypointMeasurement))
-        return replace(found, matched=pixels_only, measurements=())
+        moving = {"measurements": found.measurements, "velocity": tracker.speed}
+        one = KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving))
+        left[i], kept[i] = one.leftovers, one.measurements
+        return one.result
 
     stopped = False
     try:
