@@ -5,7 +5,8 @@
     joints      joint centres [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1
-    residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight
+    residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight; of
+                depth, clouds and silhouettes one a segment: signed median, RMS and number of its residuals
 
 Every table starts with `frame` (from 0) and `time [s]`; metres and the motion's own world unless told otherwise. A
 deviation "inf" means that nothing observed it.
