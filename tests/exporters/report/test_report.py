@@ -377,7 +377,8 @@ def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
     }  # fmt: skip
     text = " ".join(methods_sentences(replace(motion, provenance=told), 3))
     for part in (
-        "kinefit 9.9", "(openpose BODY_25B)", "a stated standard deviation of 8 px", "calib.toml (SHA-256 abababababababab…)",
+        "kinefit 9.9", "(openpose BODY_25B)", "a stated standard deviation of 8 px",
+        "calib.toml (SHA-256 abababababababab…)",
         "window 500", "every keypoint (median 4.5 px) was estimated", "poor 0.5", "3 moments were",
     ):  # fmt: skip
         assert part in text, part
