@@ -65,7 +65,7 @@ BAD = {
     "upside down": (lambda t: swap(t, 'up = "z"', 'up = "-z"'), "the floor would be the ceiling", 'up = "z"'),
     "size": (
         lambda t: swap(t.with_name("calibration.toml"), "^size = .*", "size = [1088.0, 1920.0]", count=1),
-        "cam01 has another picture", 'image = "scaled"',
+        "cam01 has another image", 'image = "scaled"',
     ),
     "lengths": (
         lambda t: landmarks(t, "cam02", lambda a: a[:-7]),
