@@ -133,8 +133,8 @@ def test_provenance_says_what_was_done(mix, smooth):
     told = tracked(mix, smooth).provenance
     assert told["estimate"] == ("smoothed" if smooth else "filtered") and ("smoothing" in told) == smooth
     assert ("detector noise" in told) == ("left" in MIXES[mix])
-    others = set(MIXES[mix]) - {"left", "right"}
-    assert set(told.get("sensor noise", {})) == others
+    assert set(told.get("sensor noise", {})) == set(MIXES[mix]) & {"mocap", "few", "rope"}
+    assert ("shape" in told) == ("rope" in MIXES[mix])
 
 
 @each

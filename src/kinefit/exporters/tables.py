@@ -148,7 +148,11 @@ def _residuals(
         "segment": segments[points],
         "unit": np.full(len(frames), unit),
     }
-    for i, axis in enumerate(("u", "v") if pixels else ("x", "y", "z")):
+    if r.rms is not None and r.count is not None:
+        out[f"median across the surface [{unit}]"] = factor * r.values[frames, points, 0]
+        out[f"rms across the surface [{unit}]"] = factor * r.rms[frames, points]
+        out["measurements"] = r.count[frames, points]
+    for i, axis in enumerate(() if not r.of_points else ("u", "v") if pixels else ("x", "y", "z")):
         out[f"measured {axis} [{unit}]"] = factor * r.measured[frames, points, i]
         out[f"residual {axis} [{unit}]"] = factor * r.values[frames, points, i]
     return out | {

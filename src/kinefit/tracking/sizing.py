@@ -86,10 +86,10 @@ def fitted_to_person(
         problem = "a trial of the same person tells lengths by keypoints, and this recording has none of two cameras"
         raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
-    if subject is not None:
-        return _wearing(person, subject)
-    if not size:
-        return person
+    unknown = any(s.unknowns for s in recording.sensors)
+    if subject is not None or not size:
+        person = person if subject is None else _wearing(person, subject)
+        return _by_all(person, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         found = fit_subject(body, channels, frames=frames, height=height, trial=trial, progress=progress)
         person = _wearing(person, found)
@@ -142,7 +142,7 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
     return person if person.start is not None else replace(person, start=(step, best.state))
 
 
-def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) -> Person:
+def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, *, size: bool = True) -> Person:
     """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
 
     The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
@@ -163,7 +163,7 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
     good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
     chosen = [good[k] for k in spread(len(good), _POSES)]
-    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]])
+    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]], size)
     if not chosen or not parameters:
         return person
     layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
@@ -189,18 +189,18 @@ def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
     return a.state.difference(b.state) / max(b.time - a.time, 1e-6)
 
 
-def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:
-    """What the sensors that took part can tell, beyond what the first fit found."""
+def _parameters(person: Person, measurements: list[Measurement], size: bool) -> list[Parameters]:
+    """What the sensors that took part can tell, beyond what the first fit found; without `size` of themselves alone."""
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
-    surfaces = any(not m.settled for m in measurements)
+    surfaces = size and any(not m.settled for m in measurements)
     cameras = len({k.camera for k in r.keypoints})
     if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
     sets = {name: std for name, std in r.marker_sets if std is not None}
-    if cameras >= 2:  # else the markers' own fit has found them
+    if size and cameras >= 2:  # else the markers' own fit has found them
         out += [PointOffsets(body, name, std) for name, std in sets.items()]
     unknown = [s for s in r.sensors if s.unknowns]
     return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]
