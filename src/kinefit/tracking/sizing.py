@@ -29,6 +29,7 @@ from kinefit.tracking.run import run
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
 _POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
+_MATCHES = 3  # rounds of matching and solving
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 Start = tuple[int, BodyState]
@@ -175,7 +176,7 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, 
     states = [tracked.results[k].state for k in chosen]
     found = joint.fit_subject(
         body, r.rig, steps, states, parameters, loss=settings.loss, times=[tracked.results[k].time for k in chosen],
-        velocities=[_velocity(tracked.results, k) for k in chosen],
+        velocities=[_velocity(tracked.results, k) for k in chosen], rounds=_MATCHES,
     )  # fmt: skip
     told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
