@@ -1,4 +1,4 @@
-"""One contract of `Motion` for every mix of sensors, smoothed and not: deviations, quality, residuals, files, report."""
+"""One contract of `Motion` for every mix of sensors: deviations, quality, residuals, files, report."""
 
 from functools import cache
 
@@ -150,7 +150,8 @@ def test_a_file_keeps_everything(mix, smooth, tmp_path):
     for sensor, r in motion.residuals.items():
         other = again.residuals[sensor]
         assert other.names == r.names and other.unit == r.unit and other.of_points == r.of_points
-        for name in ("segments", "values", "weights", "measured", "swapped", *(() if r.of_points else ("rms", "count"))):
+        more = () if r.of_points else ("rms", "count")
+        for name in ("segments", "values", "weights", "measured", "swapped", *more):
             np.testing.assert_array_equal(getattr(other, name), getattr(r, name), err_msg=f"{sensor} {name}")
 
 

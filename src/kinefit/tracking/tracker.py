@@ -167,7 +167,8 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
-        before = self._time, self._recovery.clocks(), self.dropped, copy(self._prediction), self._last, self._known.copy()
+        kept = copy(self._prediction), self._last, self._known.copy()
+        before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self._others = self.sensors.learnt(), tuple(others)
         try:
             return self._updated(frames, time)
