@@ -207,7 +207,7 @@ class Tracker:
     def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:
         """What comes of a fit that begins at a state; nothing of it is remembered."""
         scene, measurements = self._scene_of(frames, state, time)
-        return self._fit.run(scene, held, measurements)
+        return self._fit.run(scene, held, measurements, None if held is None else self._known)
 
     def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
         """The tracker's body in a state."""
