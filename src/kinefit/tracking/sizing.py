@@ -61,14 +61,15 @@ class Person:
 
 def fitted_to_person(
     recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None, trial: Subject | None,
-    height: float | None, size: bool, frames: int, progress: Progress | None,
+    height: float | None, size: bool, frames: int | None, progress: Progress | None,
 ) -> Person:  # fmt: skip
     """The body in the person's size and shape; arguments as of `track`.
 
     Raises
     ------
     ObservationError
-        A trial, which tells lengths from keypoints, for a recording without keypoints of two cameras.
+        A trial or a number of frames, for lengths from keypoints, and no keypoints of two cameras; a trial or a height
+        with a body that is not sized.
     KinefitError
         What the fits raise.
     """
@@ -83,16 +84,21 @@ def fitted_to_person(
         name = recording.keypoints[0].camera
         problem = f"the keypoints are of one camera only, {name}"
         raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
-    if trial is not None and (cameras < 2 or not size):
-        problem = "a trial of the same person tells lengths by keypoints, and this recording has none of two cameras"
-        raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
+    ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
+    for what, given in ignored.items():
+        if given is not None and (subject is not None or not size):
+            known = "a subject that is known already" if subject is not None else "a body that is taken as it is"
+            raise ObservationError(f"{what} with {known}", remedy=f"Leave {what} out: it would be ignored.")
+        if given is not None and cameras < 2 and given is not height:
+            problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
+            raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
     unknown = any(s.unknowns for s in recording.sensors)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
         return _by_all(person, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        found = fit_subject(body, channels, frames=frames, height=height, trial=trial, progress=progress)
+        found = fit_subject(body, channels, frames=frames or 25, height=height, trial=trial, progress=progress)
         person = _wearing(person, found)
     elif recording.markers and recording.marker_sets[0][0]:
         person = _by_markers(person, height, progress)

@@ -12,12 +12,14 @@ from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, leftovers_at
+from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.subject.keypoints import Progress, Subject
+from kinefit.tracking.agreement import contradictions
 from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import Tracked, run
@@ -27,7 +29,7 @@ from kinefit.tracking.sizing import fitted_to_person
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
     height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
-    contacts: bool = False, shape_frames: int = 25, progress: Progress | None = None,
+    contacts: bool = False, shape_frames: int | None = None, progress: Progress | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of one person from whatever sensors saw, with no pose given.
 
@@ -51,13 +53,14 @@ def track(
         Fit all frames together in the end; without it each frame knows only of those before it.
     contacts : bool
         Hold the soles still where they rest on a level floor, when smoothing.
-    shape_frames : int, how many frames bone lengths are found from.
+    shape_frames : int, how many frames bone lengths are found from by keypoints of several cameras; default 25.
     progress : called with (what, done, total).
 
     Raises
     ------
     ObservationError
-        Contacts without smoothing, which would be ignored; a height that cannot be.
+        What would be ignored: contacts without smoothing, a height where the body is not sized, a trial or shape_frames
+        without keypoints of two cameras. A height that cannot be.
     TrackingError
         Nobody can be found, or no frame shows enough of the person.
     TrackingInterrupted
@@ -117,6 +120,14 @@ def _motion(
         weight = take.confidence / np.square(channels.sigma) * factor
         if others is not None:
             matched = others.linearised(body, take.roots, take.angles).matched
+    scenes = [
+        tracker.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+        for f, r in enumerate(results)
+    ]
+    seen = [[m for m in r.matched if isinstance(m, KeypointMatched)] for r in results]
+    if matched is not None:
+        seen = [[*mine, *more] for mine, more in zip(seen, matched)]
+    provenance["contradictions"] = contradictions(scenes, seen)
     noise_of_others = None
     if others is not None and matched is not None:
         noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
