@@ -120,7 +120,8 @@ def acts_or_is_refused(make, usual):
 
 HEAD = {
     "name": 'name = "another"', "rate": "rate = 5.0", "up": 'up = "x"', "body": 'body = "humanoid39"',
-    "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"', "frames": "frames = [0, 4]",
+    "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
+    "frames": "frames = [0, 4]",
 }  # fmt: skip
 OWN = {
     "keypoints": {
@@ -135,7 +136,8 @@ OWN = {
         "sigma": "sigma = 0.2", "unit": "unit = 0.0011", "range": "range = [0.5, 2.0]", "rate": "rate = 5.0",
         "time_offset": "time_offset = 0.2", "on_body": "on_body = true", "background": 'background = "tof"',
         "segment": 'segment = "torso"', "size": "size = [9, 9]", "intrinsics": "intrinsics = [9.0, 9.0, 9.0, 9.0]",
-        "distortion": "distortion = [0.1, 0.0, 0.0, 0.0]", "time_unit": "time_unit = 0.1", "camera": 'camera = "no such"',
+        "distortion": "distortion = [0.1, 0.0, 0.0, 0.0]", "time_unit": "time_unit = 0.2",
+        "camera": 'camera = "no such"',
     },
     "silhouettes": {
         "sigma": "sigma = 40.0", "rate": "rate = 5.0", "frame": 'frame = "video"', "low": "low = [0, 0, 0]",

@@ -202,7 +202,8 @@ def _parameters(person: Person, measurements: list[Measurement], size: bool) -> 
     out: list[Parameters] = []
     surfaces = size and any(not m.settled for m in measurements)
     cameras = len({k.camera for k in r.keypoints})
-    if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
+    landmarks = size and r.markers and not r.marker_sets[0][0]  # markers of a set have a fit of their own
+    if (surfaces or landmarks) and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
