@@ -169,6 +169,8 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, 
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
     good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
+    if not good and person.recording.markers:  # a body of another size agrees with few of them
+        good = [k for k, measured in enumerate(tracked.measurements) if measured]
     chosen = [good[k] for k in spread(len(good), _POSES)]
     parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]], size)
     if not chosen or not parameters:
