@@ -23,6 +23,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.agreement import sentences
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
@@ -60,7 +61,7 @@ MIXES = {
     "markers and a sensor of one's own": ("mocap", "rope"),
     "everything": ("left", "right", "silhouette left", "depth", "mocap", "rope"),
 }
-UNIT = {"left": "px", "right": "px"}
+SIGMA = {"left": 2.0, "right": 2.0, "mocap": 0.004, "few": 0.004}
 
 
 @cache
@@ -68,8 +69,8 @@ def tracked(mix, smooth):
     sensors = (Rope(),) if "rope" in MIXES[mix] else ()
     steps = [[SEEN[name](i) for name in MIXES[mix]] for i in range(COUNT)]
     recording = Recording.of_frames(
-        steps, a_rig(), rate=RATE, sigma={"left": 2.0, "right": 2.0, "mocap": 0.004, "few": 0.004}, sensors=sensors,
-        up="y", start=(0, a_motion().state(0)),
+        steps, a_rig(), rate=RATE, sigma={n: SIGMA[n] for n in MIXES[mix] if n in SIGMA}, sensors=sensors, up="y",
+        start=(0, a_motion().state(0)),
     )  # fmt: skip
     settings = TrackSettings(search=False, smooth_rounds=1)
     return track(recording, BODY, smooth=smooth, settings=settings, size=mix in ("keypoints", "markers alone"))
@@ -133,8 +134,8 @@ def test_provenance_says_what_was_done(mix, smooth):
     told = tracked(mix, smooth).provenance
     assert told["estimate"] == ("smoothed" if smooth else "filtered") and ("smoothing" in told) == smooth
     assert ("detector noise" in told) == ("left" in MIXES[mix])
-    others = set(MIXES[mix]) - {"left", "right"}
-    assert set(told.get("sensor noise", {})) == others
+    assert set(told.get("sensor noise", {})) == set(MIXES[mix]) & {"mocap", "few", "rope"}
+    assert ("shape" in told) == ("rope" in MIXES[mix])
 
 
 @each
@@ -180,6 +181,30 @@ def test_pictures_are_drawn(mix):
         own = motion.residuals.get(camera)
         drawn = draw_overlay(image, motion, 3, a_rig()[camera], residuals=own)
         assert drawn.shape == image.shape and drawn.any()
+
+
+@each
+@both
+def test_sensors_that_agree_contradict_nothing(mix, smooth):
+    assert tracked(mix, smooth).provenance["contradictions"] == {}
+
+
+def test_sensors_that_contradict_each_other_are_told():
+    """Markers that lie 15 cm beside what two cameras see: which, by how much, and where to."""
+    def shifted(i):
+        return marker_frame(i, NAMES, shift=np.array([0.15, 0.0, 0.0]))
+
+    steps = [[keypoint_frame(i, "left"), keypoint_frame(i, "right"), shifted(i)] for i in range(COUNT)]
+    recording = Recording.of_frames(
+        steps, a_rig(), rate=RATE, sigma={"left": 2.0, "right": 2.0, "mocap": 0.004}, up="y",
+        start=(0, a_motion().state(0)),
+    )  # fmt: skip
+    for smooth in (True, False):
+        told = track(recording, BODY, smooth=smooth, size=False).provenance["contradictions"]
+        assert told and set(told) <= {"keypoints", "mocap"}
+        gaps = [np.array(one["shift_m"]) for one in told.values()]
+        assert max(abs(g[0]) for g in gaps) > 0.05 and all(one["deviations"] > 3.0 for one in told.values())
+        assert any(next(iter(told)) in text and "mm" in text for text in sentences(told))
 
 
 @pytest.mark.parametrize("mix", ["keypoints", "markers alone", "everything"])

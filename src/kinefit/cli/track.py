@@ -60,29 +60,33 @@ def track(
     if lag is not None and (contacts or realtime):
         other = "--contacts needs the whole take" if contacts else "--realtime knows of no later frame"
         raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
+    wanted = ctx.get_parameter_source("overlays") == click.core.ParameterSource.COMMANDLINE
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
         take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, contacts=contacts,
-        lag=lag, verbose=verbose,
+        lag=lag, verbose=verbose, wanted=overlays and wanted,
     )  # fmt: skip
     ctx.exit(code)
 
 
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
-    contacts: bool = False, lag: float | None = None, verbose: bool = False,
+    contacts: bool = False, lag: float | None = None, verbose: bool = False, wanted: bool = False,
 ) -> int:
-    """Track a take and write what comes of it; returns the exit code."""
+    """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._detecting import with_detections
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
-    from kinefit.errors import TrackingError
+    from kinefit.errors import TakeError, TrackingError
     from kinefit.readers.take.file import read_take
+    from kinefit.tracking.agreement import sentences
     from kinefit.tracking.take import track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     take = read_take(path)
+    if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
+        raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
     _results.check_folder(out)
     files: dict[str, Path] = {}
     notes: list[str] = []
@@ -96,7 +100,7 @@ def run(
                     take, smooth=smooth, contacts=contacts, lag=lag,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
-                notes.extend(seen.notes)
+                notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
             motion = replace(motion, provenance=provenance(take, **motion.provenance))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.frame.prediction import belief
-from kinefit.frame.results import FrameResult, judged
+from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.frame.skin import skin_of
 from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
@@ -30,10 +30,16 @@ Held = tuple[BodyState, NDArray]
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A fitted frame: the result, and the covariance (n, n) of what was measured and predicted, without the prior."""
+    """A fitted frame: the result, and the covariance (n, n) of what was measured and predicted, without the prior.
+
+    Parameters
+    ----------
+    observed : (D,) bool, coordinates that sensors have told of, now or before
+    """
 
     result: FrameResult
     filtered: NDArray
+    observed: NDArray
 
 
 class FrameFit:
@@ -51,10 +57,13 @@ class FrameFit:
         self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
         self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
 
-    def run(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Fitted:
-        """Fit from a scene's state on, and judge."""
+    def run(
+        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None
+    ) -> Fitted:
+        """Fit from a scene's state on, and judge; `known` (D,) bool are coordinates that were observed before."""
+        known = np.zeros(len(self.body.tree.coordinates), bool) if known is None else known
         if all(m.settled for m in measurements):
-            return self._settled(scene, held, measurements)
+            return self._settled(scene, held, measurements, known)
         s, reach, iterations = self.settings, self.settings.far, 0
         while iterations < s.iterations:
             iterations += 1
@@ -65,9 +74,11 @@ class FrameFit:
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
                 break
             reach = max(reach * s.shrink, s.near)
-        return self._judged(scene, step.equations.matrix, matched, iterations)
+        return self._judged(scene, held, step.equations.matrix, matched, iterations, known)
 
-    def _settled(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> Fitted:
+    def _settled(
+        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray
+    ) -> Fitted:
         """Where a match changes in what is discrete alone: to the minimum under each, until it stays as it is."""
         matched, iterations = _match(scene, measurements, self.settings.near), 0
         for last in [False] * (_ROUNDS - 1) + [True]:
@@ -80,7 +91,7 @@ class FrameFit:
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return self._judged(scene, fit.equations.matrix, matched, iterations)
+        return self._judged(scene, held, fit.equations.matrix, matched, iterations, known)
 
     def rows(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
@@ -101,10 +112,15 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _judged(self, scene: Scene, H: NDArray, matched: Sequence[Matched], iterations: int) -> Fitted:
+    def _judged(
+        self, scene: Scene, held: Held | None, H: NDArray, matched: Sequence[Matched], iterations: int, known: NDArray
+    ) -> Fitted:  # fmt: skip
         posterior, alone = inverse(H), np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
-        return Fitted(judged(scene, posterior, matched, iterations), inverse(alone))
+        now = posterior if held is None else inverse(H - held[1] + _TRACE * np.eye(len(H)))
+        seen = np.sqrt(np.maximum(np.diag(now)[6:], 0.0)) <= BLIND * self.body.tree.spread
+        known = known | seen | ~np.isfinite(self.body.tree.spread)
+        return Fitted(judged(scene, posterior, matched, iterations, observed=known), inverse(alone), known)
 
 
 def rows_of(

@@ -82,6 +82,9 @@ def deviations(
     blind = std > BLIND * prior
     if observed is not None:
         blind[6:] |= ~observed
+        covariance = np.array(covariance)
+        never = 6 + np.flatnonzero(~observed & np.isfinite(tree.spread))
+        covariance[never, never] = np.maximum(covariance[never, never], prior[never] ** 2)
     blind[:6] &= tree.root_free
     moves = joint_moves(body, state)
     joints = np.sqrt(np.maximum(np.einsum("...i,...i->...", moves @ covariance, moves), 0.0))

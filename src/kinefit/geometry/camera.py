@@ -265,6 +265,9 @@ def _ratio(size: tuple[int, int], of: tuple[int, int]) -> tuple[float, float]:
     return size[0] / of[0], size[1] / of[1]
 
 
+_PACKED = 29  # numbers of a camera for kernels
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras in one world; `rig["cam01"]` is one of them. Markers alone need none: `Rig(())`.
@@ -291,7 +294,8 @@ class Rig:
     @cached_property
     def packed(self) -> NDArray:
         """(C, 29) the cameras for kernels."""
-        return _read_only(np.array([camera.packed for camera in self.cameras]).reshape(len(self.cameras), 29))
+        packed = np.array([camera.packed for camera in self.cameras], float)
+        return _read_only(packed.reshape(len(self.cameras), _PACKED))
 
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""

@@ -26,6 +26,7 @@ from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.keypoints import Subject
+from kinefit.tracking.agreement import contradictions
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +102,14 @@ def motion_of(
         if others is not None:
             kept = tuple(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)) for r in results)
             matched = others.linearised(body, take.roots, take.angles).matched if lag is None else kept
+    scenes = [
+        frames.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+        for f, r in enumerate(results)
+    ]
+    saw: list[list[Matched]] = [[m for m in r.matched if isinstance(m, KeypointMatched)] for r in results]
+    if matched is not None:
+        saw = [[*mine, *more] for mine, more in zip(saw, matched)]
+    provenance["contradictions"] = contradictions(scenes, saw)
     noise_of_others = None
     if others is not None and matched is not None:
         noise_of_others = other_noise(body, others, matched, take.roots, take.angles)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.errors import ObservationError
+from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
-from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, Markers
+from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, LineFrame, Markers, SilhouetteFrame
 from kinefit.sensors.base import Sensor
 
 Steps = Callable[[int], Sequence[Any]]
@@ -62,6 +62,20 @@ class Recording:
     start: tuple[int, BodyState] | None = None
     up: str = "z"
     name: str = "motion"
+
+    def __post_init__(self) -> None:
+        if not len(self.times) or not 0.0 < self.rate < np.inf:
+            problem = f"a recording of {len(self.times)} steps at {self.rate} Hz"
+            raise ObservationError(problem, remedy="Give sensors that share some time, and a positive rate.")
+        if self.up not in UP_AXES:
+            raise ObservationError(choices("vertical axis", self.up, UP_AXES))
+        if self.start is not None and not 0 <= self.start[0] < len(self.times):
+            problem = f"a start at step {self.start[0]} of {len(self.times)}"
+            raise ObservationError(problem, remedy="Start at a step of the recording.")
+        for name in (*self.on_body, *self.backgrounds):
+            self.rig.index(name)
+        if len({s.name for s in self.sensors}) < len(self.sensors):
+            raise ObservationError("two sensors of one name", remedy="Give each its own name.")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -123,7 +137,7 @@ class Recording:
         Raises
         ------
         ObservationError
-            No steps, or steps without any frame.
+            No steps, or steps without any frame; a standard deviation of no sensor.
         """
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
         known = np.flatnonzero(np.isfinite(told))
@@ -133,6 +147,11 @@ class Recording:
         if len(known) < len(told):  # evenly beyond the ends
             times = np.where(np.isfinite(told), times, times[known[0]] + (np.arange(len(told)) - known[0]) / rate)
         sigma = dict(sigma or {})
+        there = {_name(f) for seen in steps for f in seen}
+        for name in sigma:
+            if name not in there:
+                remedy = "Leave its standard deviation out, or correct its name."
+                raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = _records(steps, times, rate)
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
         accuracy = tuple(sigma.get(r.camera, 4.0) for r in records)
@@ -149,6 +168,12 @@ class Recording:
             self, times=self.times[frames], steps=lambda i: self.steps(i + first),
             keypoints=tuple(_cut(k, frames) for k in self.keypoints), people=tuple(p[frames] for p in self.people),
         )  # fmt: skip
+
+
+def _name(frame: Any) -> str:
+    """Of the sensor that a frame is of."""
+    kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
+    return kind + str(frame.sensor)
 
 
 def _cut(record: Keypoints, frames: slice) -> Keypoints:

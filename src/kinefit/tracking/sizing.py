@@ -61,14 +61,15 @@ class Person:
 
 def fitted_to_person(
     recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None, trial: Subject | None,
-    height: float | None, size: bool, frames: int, progress: Progress | None,
+    height: float | None, size: bool, frames: int | None, progress: Progress | None,
 ) -> Person:  # fmt: skip
     """The body in the person's size and shape; arguments as of `track`.
 
     Raises
     ------
     ObservationError
-        A trial, which knows lengths from keypoints, for a recording without keypoints of two cameras.
+        A trial or a number of frames, for lengths from keypoints, and no keypoints of two cameras; a trial or a height
+        with a body that is not sized.
     KinefitError
         What the fits raise.
     """
@@ -83,16 +84,21 @@ def fitted_to_person(
         name = recording.keypoints[0].camera
         problem = f"the keypoints are of one camera only, {name}"
         raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
-    if trial is not None and (cameras < 2 or not size):
-        problem = "a trial of the same person gives lengths by keypoints, and this recording has none of two cameras"
-        raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
+    ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
+    for what, given in ignored.items():
+        if given is not None and (subject is not None or not size):
+            known = "a subject that is known already" if subject is not None else "a body that is taken as it is"
+            raise ObservationError(f"{what} with {known}", remedy=f"Leave {what} out: it would be ignored.")
+        if given is not None and cameras < 2 and given is not height:
+            problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
+            raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
-    if subject is not None:
-        return _wearing(person, subject)
-    if not size:
-        return person
+    unknown = any(s.unknowns for s in recording.sensors)
+    if subject is not None or not size:
+        person = person if subject is None else _wearing(person, subject)
+        return _by_all(person, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        found = fit_subject(body, channels, frames=frames, height=height, trial=trial, progress=progress)
+        found = fit_subject(body, channels, frames=frames or 25, height=height, trial=trial, progress=progress)
         person = _wearing(person, found)
     elif recording.markers and recording.marker_sets[0][0]:
         person = _by_markers(person, height, progress)
@@ -143,7 +149,7 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
     return person if person.start is not None else replace(person, start=(step, best.state))
 
 
-def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) -> Person:
+def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, *, size: bool = True) -> Person:
     """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
 
     The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
@@ -163,8 +169,10 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
     good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
+    if not good and person.recording.markers:  # a body of another size agrees with few of them
+        good = [k for k, measured in enumerate(tracked.measurements) if measured]
     chosen = [good[k] for k in spread(len(good), _POSES)]
-    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]])
+    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]], size)
     if not chosen or not parameters:
         return person
     layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
@@ -190,18 +198,19 @@ def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
     return a.state.difference(b.state) / max(b.time - a.time, 1e-6)
 
 
-def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:
-    """What the sensors that took part can estimate, beyond what the first fit found."""
+def _parameters(person: Person, measurements: list[Measurement], size: bool) -> list[Parameters]:
+    """What the sensors that took part can tell, beyond what the first fit found; without `size` of themselves alone."""
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
-    surfaces = any(not m.settled for m in measurements)
+    surfaces = size and any(not m.settled for m in measurements)
     cameras = len({k.camera for k in r.keypoints})
-    if surfaces and cameras < 2:  # a surface of simple shapes determines lengths worse than keypoints do
+    landmarks = size and r.markers and not r.marker_sets[0][0]  # markers of a set have a fit of their own
+    if (surfaces or landmarks) and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
     sets = {name: std for name, std in r.marker_sets if std is not None}
-    if cameras >= 2:  # else the markers' own fit has found them
+    if size and cameras >= 2:  # else the markers' own fit has found them
         out += [PointOffsets(body, name, std) for name, std in sets.items()]
     unknown = [s for s in r.sensors if s.unknowns]
     return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]

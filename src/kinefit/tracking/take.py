@@ -19,6 +19,8 @@ from kinefit.subject.keypoints import Subject, fit_subject
 from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import Progress, track
 
+_USUAL = "humanoid"  # body of a take that names none
+
 
 def track_take(
     take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
@@ -49,6 +51,12 @@ def track_take(
         raise TakeError(
             "the take has no [[keypoints]], nor any other sensor", file=take.path,
             remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+        )  # fmt: skip
+    named = body if take.start is None or take.body == _USUAL else load_body(take.body)
+    if named.tree.segments != body.tree.segments:
+        raise TakeError(
+            f"the body is {take.body}, and the motion that the take starts from has another, {body.name}",
+            file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
         )  # fmt: skip
     recording, body = recording_of(take, seen, body)
     motion = track(

@@ -84,6 +84,13 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
         frames = (m.at(float(times[i])) for m in marked)
         return [*out, *(f for f in frames if f is not None)]
 
+    for sensor, at in {
+        **{v.sensor: lambda i, v=v: v.at_step(first + i, rate) for v in videos},
+        **{m.sensor: lambda i, m=m: m.at(float(times[i])) for m in marked},
+    }.items():
+        if all(at(i) is None for i in range(len(times))):
+            problem = f"{sensor} shares no time with the take's steps, {times[0]:.2f} to {times[-1]:.2f} s"
+            raise ObservationError(problem, remedy="Set its time_offset, or the take's frames.")
     recording = Recording(
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(m.markers for m in marked),
         marker_sets=tuple((m.marker_set, m.std) for m in marked), depth=_first_depth(depth, seen),

@@ -81,7 +81,7 @@ class Tracker:
 
     def _wear(self, body: Body) -> None:
         s = self.settings
-        self.body = body
+        self.body, self._known = body, np.zeros(len(body.tree.coordinates), bool)
         self._fit = FrameFit(body, s)
         self._scene = Scene(
             body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples
@@ -125,6 +125,7 @@ class Tracker:
             problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
+        self._known[:] = False
 
     def backwards(self, state: BodyState) -> Tracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
@@ -134,12 +135,14 @@ class Tracker:
         )  # fmt: skip
         out.sensors, out._direction = self.sensors.anew(), -1.0
         out.start_at(state)
+        out._known = self._known.copy()
         return out
 
     def change_body(self, body: Body) -> None:
         """Go on with another size, another surface, a part more or less (`bodies.parts`); pose and speed are kept."""
-        old, before = self.body, self._prediction
+        old, before, known = self.body, self._prediction, np.concatenate([np.ones(6), self._known])
         self._wear(body)
+        self._known = carry_dofs(known, old, body)[6:] > 0.5
         if before.state is not None:
             state = carry_state(before.state, old, body)
             std = carry_dofs(before.std, old, body, missing=np.inf)
@@ -202,12 +205,13 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
-        before = self._time, self._recovery.clocks(), self.dropped, copy(self._prediction), self._last
+        kept = copy(self._prediction), self._last, self._known.copy()
+        before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self._others = self.sensors.learnt(), tuple(others)
         try:
             return self._updated(frames, time)
         except BaseException:  # as if they had never come
-            self._time, clocks, self.dropped, self._prediction, self._last = before
+            self._time, clocks, self.dropped, self._prediction, self._last, self._known = before
             self._recovery.set_clocks(clocks)
             self.sensors.unlearn(learnt)
             raise
@@ -223,7 +227,7 @@ class Tracker:
                 self._prediction.halt()
             held = self._prediction.ahead(steps)
             scene, measurements = self._scene_of(frames, held[0], time)
-            fitted = self._fit.run(scene, held, measurements)
+            fitted = self._fit.run(scene, held, measurements, self._known)
             self._take(fitted)
             result = fitted.result
         result = self._recovery.run(self, time, frames, measurements, result)
@@ -243,7 +247,7 @@ class Tracker:
     def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:
         """What comes of a fit that begins at a state; nothing of it is remembered."""
         scene, measurements = self._scene_of(frames, state, time)
-        return self._fit.run(scene, held, measurements)
+        return self._fit.run(scene, held, measurements, None if held is None else self._known)
 
     def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
         """The tracker's body in a state."""
@@ -271,6 +275,7 @@ class Tracker:
             self._recovery.forget()
             if self._prediction.state is not None:
                 self._prediction.start(self._prediction.state)
+                self._known[:] = False
             steps = 1.0 if steps < 0 else steps
         self.dropped += max(round(steps) - 1, 0)
         return min(steps, 10.0)
@@ -279,12 +284,14 @@ class Tracker:
         """Go on from a fit that took its prediction into account."""
         state = fitted.result.state
         self._prediction.correct(state, fitted.filtered)
+        self._known = fitted.observed
         chart = off_the_limits(self.body.tree, state.angles)
         if chart is not None:
             self._prediction.change_chart(*chart)
 
     def restart(self, result: FrameResult, velocity: NDArray | None = None) -> None:
         """Go on from a result that was found without a prediction; its velocity (n,) [m, rad] a frame, or unknown."""
+        self._known = np.isfinite(result.dof_std[6:])
         if velocity is None:
             self._prediction.start(result.state, result.dof_std)
         else:

@@ -19,7 +19,7 @@ from kinefit.tracking.sizing import fitted_to_person
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
     height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
-    contacts: bool = False, lag: float | None = None, noise: KnownNoise | None = None, shape_frames: int = 25,
+    contacts: bool = False, lag: float | None = None, noise: KnownNoise | None = None, shape_frames: int | None = None,
     progress: Progress | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of one person from whatever sensors saw, with no pose given.
@@ -49,14 +49,15 @@ def track(
     noise : KnownNoise
         With a lag: process noise and the sensors' noise, as another take told them (`KnownNoise.of_take`); default:
         the settings' accelerations.
-    shape_frames : int, how many frames bone lengths are found from.
+    shape_frames : int, how many frames bone lengths are found from by keypoints of several cameras; default 25.
     progress : called with (what, done, total).
 
     Raises
     ------
     ObservationError
-        Contacts without smoothing, or with a lag, which would be ignored; noise without a lag; a lag of less than a
-        frame or as long as the take; a height that cannot be.
+        What would be ignored: contacts without smoothing or with a lag, noise without a lag, a height where the body
+        is not sized, a trial or shape_frames without keypoints of two cameras. A lag of less than a frame or as long
+        as the take; a height that cannot be.
     TrackingError
         Nobody can be found, or no frame shows enough of the person.
     TrackingInterrupted

@@ -107,7 +107,7 @@ def draw_overlay(
     out = np.array(image, order="C")
     image_frame = image_frame or ImageFrame.identity()
     residuals = motion.residuals.get(camera.name) if residuals is None else residuals
-    if residuals is not None and residuals.unit != "px":
+    if residuals is not None and (residuals.unit != "px" or not residuals.of_points):
         residuals = None
     lines = [(f"{camera.name}   {label or f'frame {frame}'}", WHITE)]
     if frame is None:

@@ -39,7 +39,7 @@ class SensorFit:
     @property
     def is_shifted(self) -> bool:
         """Whether a constant shift is much of what this camera is off by."""
-        return self.unit == "px" and bool(np.linalg.norm(self.shift) > _SHIFTED * self.median)
+        return self.unit == "px" and len(self.shift) == 2 and bool(np.linalg.norm(self.shift) > _SHIFTED * self.median)
 
 
 def sensor_fits(motion: Motion) -> tuple[SensorFit, ...]:
@@ -48,8 +48,10 @@ def sensor_fits(motion: Motion) -> tuple[SensorFit, ...]:
 
 
 def overall_median(motion: Motion, unit: str = "px") -> float:
-    """Median residual of all sensors of a unit ("px", or "m" told in mm), NaN where there is none."""
-    norms = [r.norms[np.isfinite(r.norms)] for r in motion.residuals.values() if r.unit == unit]
+    """Median residual of all points, or else surfaces, of a unit ("px", or "m" told in mm), NaN where there is none."""
+    own = [r for r in motion.residuals.values() if r.unit == unit]
+    chosen = [r for r in own if r.of_points] or own
+    norms = [r.norms[np.isfinite(r.norms)] for r in chosen]
     values = np.concatenate(norms) if norms else np.zeros(0)
     return UNITS[unit][0] * float(np.median(values)) if len(values) else np.nan
 

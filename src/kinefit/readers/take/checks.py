@@ -53,6 +53,9 @@ def _values(take: Take) -> None:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
         refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+    if take.start is not None and (take.height is not None or take.subject is not None):
+        key = "height" if take.height is not None else "subject"
+        refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
     if take.frames is not None and not take.frames[0] < take.frames[1]:
         refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
     for camera in take.cameras:

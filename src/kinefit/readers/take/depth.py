@@ -98,6 +98,9 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
         entry.file, rate=entry.rate, usual_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,
         time_offset=entry.time_offset, **given,
     )  # fmt: skip
+    if entry.size is not None and tuple(video.size) != tuple(entry.size):
+        problem = f"size = {list(entry.size)}, and the images have {video.size[0]}x{video.size[1]} px"
+        raise TakeError(problem, remedy="Leave size out: it is for raw files.")
     background = read_depth(entry.background, **given) if entry.background is not None else None
     return replace(video, background=background, on_body=entry.on_body)
 

@@ -1,0 +1,70 @@
+"""Sensors that contradict each other: which, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.rows import Rows
+from kinefit.sensors.base import Matched, rows_at
+from kinefit.sensors.scene import Scene
+
+FAR = 3.0
+"""Standard deviations, as they are stated, that half of a sensor's residuals must exceed to be a contradiction."""
+
+_LOOKS = 12  # frames that are looked at, spread over the take
+_TINY = 1e-6  # share of a direction that nothing measures
+
+
+def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]) -> dict[str, dict[str, Any]]:
+    """Sensors whose residuals are larger than they can be if they and all others are right.
+
+    Parameters
+    ----------
+    scenes : F, at the fitted states
+    matched : of each, the matches of all sensors
+
+    Returns
+    -------
+    {sensor: {"deviations": median in stated standard deviations, "median_m": float, "shift_m": [x, y, z]}}
+        The worst first; none where the fit has but one sensor, whose residuals contradict no other. `shift_m` is
+        where the sensor has its points, beside where all sensors together have them.
+    """
+    chosen = np.unique(np.linspace(0, len(scenes) - 1, min(_LOOKS, len(scenes))).astype(int)) if len(scenes) else []
+    kept: dict[str, list[Rows]] = {}
+    for f in chosen:
+        for m in matched[f]:
+            kept.setdefault(m.sensor, []).extend(r for r in rows_at(m, scenes[f]) if isinstance(r, Rows))
+    if len(kept) < 2:
+        return {}
+    told = {sensor: _told(rows) for sensor, rows in kept.items()}
+    far = {sensor: t for sensor, t in told.items() if t["deviations"] > FAR}
+    return dict(sorted(far.items(), key=lambda one: -one[1]["deviations"]))
+
+
+def sentences(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The same in words, one for each sensor."""
+    return [
+        f"{sensor} contradicts the other sensors: half of its residuals exceed {1000 * t['median_m']:.0f} mm, "
+        f"{t['deviations']:.1f} of its standard deviations; it is shifted by "
+        f"({', '.join(f'{1000 * v:+.0f}' for v in t['shift_m'])}) mm"
+        for sensor, t in found.items()
+    ]
+
+
+def _told(rows: Sequence[Rows]) -> dict[str, Any]:
+    data = np.concatenate([np.zeros((8, 0)), *(r.data for r in rows)], axis=1)
+    data = data[:, data[7] > 0.0]
+    direction, residual, weight = data[3:6], data[6], data[7]
+    if not len(residual):
+        return {"deviations": 0.0, "median_m": 0.0, "shift_m": [0.0, 0.0, 0.0]}
+    size: NDArray = np.abs(residual)
+    A = (direction * weight) @ direction.T
+    shift = np.linalg.pinv(A, rcond=_TINY, hermitian=True) @ (direction @ (weight * residual))
+    return {
+        "deviations": round(float(np.median(size * np.sqrt(weight))), 2), "median_m": round(float(np.median(size)), 4),
+        "shift_m": [round(float(v), 4) for v in shift],
+    }  # fmt: skip
