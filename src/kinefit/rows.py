@@ -94,6 +94,14 @@ class Rows:
     def __len__(self) -> int:
         return self.data.shape[1]
 
+    def weaker(self, factor: float) -> Rows:
+        """The same with standard deviations that are so many times larger."""
+        if factor == 1.0:
+            return self
+        data = np.array(self.data)
+        data[7] /= factor**2
+        return Rows(data, self.segment, self.group, self.loss)
+
     @property
     def point(self) -> NDArray:
         """(N, 3) [m] in the world."""

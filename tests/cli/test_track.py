@@ -19,7 +19,9 @@ from kinefit.cli._results import NAMES, USUAL
 from kinefit.cli._summary import bone_lengths, frame_ranges
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.tracking.video import TrackingInterrupted, track
+from kinefit.tracking.interrupted import TrackingInterrupted
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.video import track
 
 HUMANOID = (resources.files("kinefit.bodies") / "catalogue" / "humanoid.toml").read_text(encoding="utf-8")
 
@@ -298,7 +300,7 @@ def test_ctrl_c_keeps_the_frames_that_are_done(take, tmp_path):
 def test_ctrl_c_gives_a_script_the_frames_that_are_done():
     motion = cut(squat_and_wave(), 0, 12)
     rig = studio_rig(motion)
-    seen = simulate_keypoints(motion, rig)
+    recording = Recording.of_keypoints(rig, simulate_keypoints(motion, rig), up=motion.up)
 
     def stop_at(frames):
         def progress(what, done, total):
@@ -307,9 +309,9 @@ def test_ctrl_c_gives_a_script_the_frames_that_are_done():
 
         return progress
 
-    whole = track(rig, seen, motion.body, up=motion.up, smooth=False)
+    whole = track(recording, motion.body, smooth=False)
     with pytest.raises(TrackingInterrupted) as stopped:
-        track(rig, seen, motion.body, up=motion.up, progress=stop_at(5))
+        track(recording, motion.body, progress=stop_at(5))
     part = stopped.value.motion
     assert (len(part), stopped.value.total) == (5, 12)
     assert np.array_equal(part.angles, whole.angles[:5])
@@ -325,7 +327,7 @@ def test_ctrl_c_before_the_first_frame_is_only_that(monkeypatch):
 
     monkeypatch.setattr("kinefit.tracking.tracker.Tracker.update", interrupted)
     with pytest.raises(KeyboardInterrupt) as stopped:
-        track(rig, simulate_keypoints(motion, rig), motion.body, up=motion.up)
+        track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig), up=motion.up), motion.body)
     assert not isinstance(stopped.value, TrackingInterrupted)
 
 

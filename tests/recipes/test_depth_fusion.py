@@ -26,7 +26,7 @@ def test_from_a_known_start(wave):
     assert point_errors(wave.truth, motion).mean() < 0.04
     assert motion.residuals["colour"].unit == "px"
     assert np.isfinite(motion.joint_std).all() and (motion.quality > 0.5).all()
-    assert motion.provenance["fusion"] == {"dropped": 0, "late": 0}
+    assert motion.provenance["frames"] == {"dropped": 0, "late": 0}
 
 
 def test_a_step_without_frames_is_bridged(wave):

@@ -23,6 +23,7 @@ from kinefit.sensors.background import Background
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton
 
 TRUTH, SETTINGS, WALL = a_motion().state(0), TrackSettings(), 4.0
@@ -166,12 +167,32 @@ def test_a_body_is_drawn_back():
     assert apart(WRONG, TRUTH).mean() > 0.03 and apart(found(measurement, WRONG), TRUTH).mean() < 0.01
 
 
+def told(measurement):
+    """How much the rows towards the surface tell of the body, all together."""
+    rows = measurement.match(scene(), 0.03).rows(scene())[:2]
+    return sum(normal_equations(BODY, TRUTH, r).matrix.trace() for r in rows)
+
+
+def test_as_many_patches_count_as_there_are_not_pixels():
+    """Four times the pixels tell what the few told: their errors are alike within a patch."""
+    camera = a_rig()["depth"]
+    fine = replace(SENSOR, size=(320, 240), focal=288.0).camera(camera.T_camera_world, name="depth")
+    depth = np.where(np.isfinite(d := render_body(BODY, TRUTH, fine).depth), d, WALL)
+    assert told(measured(depth=depth, of=sensor(camera=fine))) == pytest.approx(told(measured()), rel=0.25)
+
+
+def test_a_sensor_of_half_the_accuracy_counts_a_quarter():
+    good, bad = (measured(of=sensor(sigma)).match(scene(), 0.1).rows(scene())[0] for sigma in (0.004, 0.008))
+    much, little = (normal_equations(BODY, TRUTH, r).matrix.trace() for r in (good, bad))
+    assert much == pytest.approx(4.0 * little, rel=0.05)
+
+
 def test_evidence_and_residuals_by_segments():
     there = scene()
     gone = there.at(turned(TRUTH, arm_add_l=-70, elbow_flex_l=60))
     match, arm = measured().match(there, 0.05), BODY.tree.segment("forearm_l")
-    told, lost = match.evidence(there), match.evidence(gone)
-    assert not told.lost.any() and told.quality[arm] > 0.9 and lost.lost[arm] and not lost.lost[0]
+    seen, lost = match.evidence(there), match.evidence(gone)
+    assert not seen.lost.any() and seen.quality[arm] > 0.9 and lost.lost[arm] and not lost.lost[0]
     aside = there.at(TRUTH.retract(np.r_[0.02 * a_rig()["depth"].T_camera_world[2, :3], np.zeros(22)]))
     for where, low, high in ((there, -0.004, 0.004), (aside, 0.008, 0.03)):
         summary = match.leftovers(where)[0]
@@ -236,6 +257,8 @@ def test_a_background_is_learnt_and_left_out():
     second = measured(depth=table, of=of)
     assert (second.depth < 0).mean() > 0.3 and second._points.shape[1] < first._points.shape[1]
     np.testing.assert_array_equal(np.abs(second.depth), np.abs(first.depth))
+    seen = render_body(BODY, TRUTH, a_rig()["depth"]).depth
+    assert (second.depth[np.isfinite(seen) & (seen < 2.5)] > 0).all() and second.hints(scene()).view is not None
     of.learn(second, scene().at(WRONG), True)  # which draws it
     of.learn(second.compact(), scene(), True)  # which has no image to be learnt from
 

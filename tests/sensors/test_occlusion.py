@@ -1,28 +1,41 @@
-"""Keypoints that are seen, before what a depth camera beside theirs has measured."""
+"""Keypoints that are seen, in front of which a depth camera beside theirs has measured something."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from kinefit.sensors.measurements import KeypointMeasurement
-from kinefit.tracking.fused_fit import FusedFit
-from tests.tracking.movements import BODY, RATE, a_motion, a_rig
+from tests.tracking.movements import BODY, a_motion, a_rig, a_tracker
 
 from kinefit.geometry.camera import Rig
+from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.occlusion import THICK, InSight, beside
+from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.keypoints import KeypointMatched, KeypointSensor
+from kinefit.sensors.occlusion import THICK, DepthSeen, beside, depth_behind, hidden_points
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import normal_equations
 
 TRUTH = a_motion().state(0)
 CAMERA = a_rig()["depth"]
 WRISTS = BODY.landmarks.select(("l_wrist", "r_wrist"))
+WRIST = BODY.positions(TRUTH, WRISTS)[1]
 SIGMA = 0.01
+SURE, FIRST = np.ones(2, bool), np.zeros(2, int)
 
 
 def drawn():
     """(H, W) [m] the body before nothing."""
     depth = render_body(BODY, TRUTH, CAMERA).depth
     return DepthFrame("depth", 0.0, np.where(np.isfinite(depth), depth, 0.0))
+
+
+def shown(frame=None):
+    """A scene of that one camera, in which it has measured that."""
+    scene = Scene(BODY, TRUTH, Rig((CAMERA,)))
+    sensor = DepthImageSensor("depth", CAMERA, SIGMA, TrackSettings(), None)
+    return scene.at(TRUTH, measurements=(sensor.prepare(frame or drawn(), scene),))
 
 
 def pushed(distance):
@@ -33,32 +46,43 @@ def pushed(distance):
     return type(TRUTH)(T, TRUTH.angles)
 
 
-WRIST = BODY.positions(TRUTH, WRISTS)[1]
+def behind(state, depth=None):
+    seen = DepthSeen(drawn().depth if depth is None else depth, CAMERA, SIGMA)
+    return depth_behind(BODY.positions(state, WRISTS), seen)
 
 
 def test_at_the_truth_points_lie_just_below_the_skin():
-    behind = InSight(BODY, WRISTS, drawn(), CAMERA, SIGMA).behind(TRUTH)
-    assert np.isfinite(behind).any()
-    assert np.nanmin(behind) > 0.0 and np.nanmax(behind) < 0.10
-    assert len(InSight(BODY, WRISTS, drawn(), CAMERA, SIGMA).rows(TRUTH)) == 0
+    deep = behind(TRUTH)
+    assert np.isfinite(deep).any()
+    assert np.nanmin(deep) > 0.0 and np.nanmax(deep) < 0.10
+    assert not list(hidden_points(shown(), WRISTS, FIRST, SURE))
 
 
 def test_a_body_too_far_back_is_drawn_up_to_what_was_measured():
-    one = WRISTS.select(("r_wrist",))
-    sight = InSight(BODY, one, drawn(), CAMERA, SIGMA)
-    away = pushed(0.4)
-    assert abs(sight.behind(away)[0] - sight.behind(TRUTH)[0] - 0.4) < 0.03
-    rows = sight.rows(away)
-    assert len(rows) == 1
-    assert rows.residual[0] == pytest.approx(-(sight.behind(away)[0] - 0.05), abs=1e-6)
+    away, right = pushed(0.4), np.array([False, True])
+    assert abs(behind(away)[1] - behind(TRUTH)[1] - 0.4) < 0.03
+    here = shown().at(away)
+    (hidden,) = hidden_points(here, WRISTS, FIRST, right)
+    rows = hidden.rows(here, WRISTS)
+    assert hidden.index.tolist() == hidden.far.tolist() == [1] and len(rows) == 1
+    sight = (WRIST - CAMERA.centre_world) / np.linalg.norm(WRIST - CAMERA.centre_world)
+    np.testing.assert_allclose(rows.direction[0], sight, atol=1e-6)
+    assert rows.residual[0] == pytest.approx(-(behind(away)[1] - 0.05), abs=1e-6)
     gradient = normal_equations(BODY, away, rows).gradient
-    assert gradient[3:6] @ (WRIST - CAMERA.centre_world) < 0 or gradient[:3] @ (WRIST - CAMERA.centre_world) < 0
+    assert gradient[:3] @ sight < 0
+    (again,) = hidden_points(here, WRISTS, FIRST, right)
+    assert again.key == hidden.key
+    nearer = here.at(pushed(0.3))  # the same match at another state: the target stays where it is
+    assert hidden.rows(nearer, WRISTS).residual[0] == pytest.approx(rows.residual[0] + 0.1, abs=1e-6)
 
 
 def test_where_nothing_was_measured_nothing_is_said():
-    empty = DepthFrame("depth", 0.0, np.zeros(CAMERA.size[::-1]))
-    sight = InSight(BODY, WRISTS, empty, CAMERA, SIGMA)
-    assert np.isnan(sight.behind(TRUTH)).all() and len(sight.rows(pushed(1.0))) == 0
+    empty = np.zeros(CAMERA.size[::-1])
+    away = pushed(1.0)
+    assert np.isnan(behind(away, empty)).all()
+    assert not list(hidden_points(shown(DepthFrame("depth", 0.0, empty)).at(away), WRISTS, FIRST, SURE))
+    assert list(hidden_points(shown().at(away), WRISTS, FIRST, SURE))
+    assert not list(hidden_points(shown().at(away, measurements=()), WRISTS, FIRST, SURE))
 
 
 def test_only_cameras_of_the_same_side_count():
@@ -70,6 +94,10 @@ def test_only_cameras_of_the_same_side_count():
     near = CAMERA.centre_world + (0.05, 0.0, 0.0)
     across = 2 * WRIST - CAMERA.centre_world
     assert beside(CAMERA, [at(near), at(across)], WRIST) == [0]
+    away = pushed(0.4)
+    for eye, count in ((near, 1), (across, 0)):
+        here = Scene(BODY, away, Rig((CAMERA, at(eye)))).at(away, measurements=shown().measurements)
+        assert len(list(hidden_points(here, WRISTS, FIRST + 1, SURE))) == count
 
 
 @pytest.mark.parametrize(("confidence", "against"), [(1.0, True), (0.5, False)])
@@ -77,20 +105,23 @@ def test_a_wrist_that_is_seen_speaks_against_a_body_that_hides_it(confidence, ag
     away = pushed(0.4)  # along the wrist's ray: its pixel stays
     uv = CAMERA.project(BODY.positions(away, WRISTS))
     frame = KeypointFrame("depth", 0.0, WRISTS.names, uv, np.full(2, confidence))
-    alone = KeypointMeasurement(frame, BODY, Rig((CAMERA,)), 4.0)
-    both = KeypointMeasurement(frame, BODY, Rig((CAMERA,)), 4.0, depth=(drawn(), CAMERA, SIGMA))
-    assert np.allclose(alone.square(away), 0.0)
-    assert np.isinf(both.square(away)[1]) == against
-    lost = both.evidence(away).lost[WRISTS.segments[1]]
-    assert lost == against and not alone.evidence(away).lost[WRISTS.segments[1]]
+    here = shown().at(away)
+    measurement = KeypointSensor(here.rig, {}, 4.0, geman_mcclure(), 0.03).prepare(frame, here)
+    alone, both = (measurement.match(s, 0.03) for s in (here.at(away, measurements=()), here))
+    assert np.allclose(alone.squares(here), 0.0)
+    assert np.isinf(both.squares(here)[1]) == against
+    assert len(both.rows(here)) == 1 + against and (both.key != alone.key) == against
+    lost = both.evidence(here).lost[WRISTS.segments[1]]
+    assert lost == against and not alone.evidence(here).lost[WRISTS.segments[1]]
     assert THICK < 0.4
 
 
-def test_the_fit_pairs_them():
-    fit = FusedFit(BODY, a_rig(), RATE, {}, TrackSettings(), {})
+def test_the_tracker_shows_keypoints_what_depth_images_saw():
     uv = CAMERA.project(BODY.positions(TRUTH, WRISTS))
-    frames = [KeypointFrame("depth", 0.0, WRISTS.names, uv, np.ones(2)), drawn()]
-    made = fit.measurements(frames, TRUTH)
-    away = pushed(0.4)
-    assert np.isinf(made[0].square(away)).any()
-    assert np.isfinite(fit.measurements(frames[:1], TRUTH)[0].square(away)).all()
+    keypoints = KeypointFrame("depth", 0.0, WRISTS.names, uv, np.ones(2))
+    for frames, count in (([keypoints, drawn()], 1), ([drawn(), keypoints], 1), ([keypoints], 0)):
+        tracker = a_tracker(start=None, settings=replace(TrackSettings(search=False), iterations=1))
+        (match,) = (
+            m for m in tracker.fitted(0.0, frames, pushed(0.4)).result.matched if isinstance(m, KeypointMatched)
+        )
+        assert len(match.hidden) == count

@@ -1,15 +1,13 @@
-"""Silhouettes as a sensor of the one tracker, and the shape of a body from them."""
+"""Silhouettes as a sensor of the one tracker."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from tests.sensors.scenes import at, posture, ring
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.surfaces import body_mesh
 from kinefit.errors import ObservationError
 from kinefit.exporters import write_motion
 from kinefit.geometry.camera import Rig
@@ -129,39 +127,6 @@ def test_a_mask_of_the_wrong_size_is_refused(body, rig):
             SilhouetteFrame("c0", 0.0, wrong)
 
 
-def test_the_shape_of_a_body_comes_from_its_silhouettes(body, rig):
-    family = CylinderFamily(body)
-    names = family.names
-    truth = np.zeros(len(names))
-    truth[names.index("thigh start a")] = truth[names.index("thigh start b")] = 0.2
-    truth[names.index("thorax end b")] = 0.15
-    truth[names.index("forearm")] = 0.05
-    real = family.at(truth)
-    states = [posture(body, i) for i in (0, 8, 16)]
-    mesh = body_mesh(real)
-    frames = [silhouettes(real, s, rig, 0.0, mesh) for s in states]
-    fit = fit_silhouettes(family, rig, frames, states, sigma=1.0, iterations=5)
-    assert fit.residual < 0.7 * fit.before
-    k = [names.index(n) for n in ("thigh start a", "thigh start b", "thorax end b", "forearm")]
-    assert np.abs(fit.values[k] - truth[k]).max() < 0.06
-    assert np.all(fit.std <= family.std + 1e-12) and np.all(fit.std[k] < 0.6 * family.std[k])
-    with pytest.raises(ObservationError):
-        fit_silhouettes(family, rig, frames, states[:2])
-
-
-def test_a_family_of_cylinders_starts_from_the_body_and_keeps_both_sides_alike(body):
-    family = CylinderFamily(body)
-    same = family.at(np.zeros(len(family.names)))
-    for a, b in zip(same.surfaces, body.surfaces):
-        np.testing.assert_allclose(a.radii, b.radii)
-        np.testing.assert_allclose(a.start, b.start)
-    wide = family.at(0.1 * np.ones(len(family.names)))
-    by = {(body.tree.segments[s.segment], i): s for i, s in enumerate(wide.surfaces)}
-    left = [s.radii for (n, _), s in by.items() if n == "forearm_l"]
-    right = [s.radii for (n, _), s in by.items() if n == "forearm_r"]
-    np.testing.assert_allclose(left, right)
-
-
 def calibration(camera):
     """A camera in the words of a calibration file."""
     T = camera.T_camera_world
@@ -200,7 +165,9 @@ def test_the_same_recording_goes_on_from_a_motion_file(body, rig, tmp_path):
     assert len(motion) == 6 and len(seen.silhouettes) == 4
     last = BodyState(motion.Ts_world_root[-1], motion.angles[-1])
     assert np.linalg.norm(joints(motion.body, last) - joints(body, truth[-1]), axis=1).mean() < 0.02
-    assert "thigh start a" in motion.provenance["shape"]
+    assert "shape" not in motion.provenance  # the body is the motion's own
+    for a, b in zip(motion.body.surfaces, body.surfaces, strict=True):
+        np.testing.assert_allclose(a.radii, b.radii)
 
 
 def test_coarse_to_fine_finds_what_the_finest_level_does_not():
@@ -208,7 +175,7 @@ def test_coarse_to_fine_finds_what_the_finest_level_does_not():
     truth = BodyState(at(body).T_world_root, body.tree.usual)
     seen = silhouettes(body, truth, rig, 0.0)
     swing = np.where(np.arange(len(body.tree.usual)) % 2, 1.0, -1.0)
-    far = np.clip(truth.angles + np.radians(30.0) * swing, body.tree.lower, body.tree.upper)
+    far = np.clip(truth.angles + np.radians(40.0) * swing, body.tree.lower, body.tree.upper)
     start = BodyState(truth.T_world_root, far)
     accuracy = {f"silhouette {name}": 1.0 for name in rig.names}
     alone = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=LEVELS[-1:])

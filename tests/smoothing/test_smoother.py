@@ -11,23 +11,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kinefit import Motion, load_body, track
+from kinefit import Motion, Recording, load_body, track
 from kinefit.bodies.charts import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
 from kinefit.multiview.observability import levers, near
 from kinefit.sensors.channels import make_channels
+from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles
 from kinefit.smoothing.process_noise import alike, limbs
-from kinefit.smoothing.smoother import parts, smooth_results
+from kinefit.smoothing.smoother import parts, smooth_results, swapped_channels
 from kinefit.smoothing.unwrap import boxes, unwrap
 from kinefit.subject.keypoints import Subject
-from kinefit.tracking.tracker import Settings, Tracker
+from kinefit.tracking.run import run
 
 BODY = load_body("humanoid")
 TREE = BODY.tree
 ARM = slice(TREE.coordinate("arm_flex_r"), TREE.coordinate("arm_rot_r") + 1)
+DEFAULT = TrackSettings()
 
 
 def turns_of(angles):
@@ -140,14 +142,29 @@ def squats():
     return truth, rig, simulate_keypoints(truth, rig, "BODY_25B", noise_px=4.0, seed=1)
 
 
+def channels_of(truth, rig, keypoints, sigma):
+    people = [np.zeros(len(k), int) for k in keypoints]
+    return make_channels(BODY, rig, keypoints, people, [sigma] * 4).with_points(truth.body)
+
+
+def followed(truth, channels):
+    """The frames of channels as tracked."""
+    return run(Recording(truth.times, truth.rate, channels.rig), truth.body, channels, DEFAULT)
+
+
+def smoothed_of(truth, channels, tracked, settings=DEFAULT, count=None, **options):
+    """Smoothed frames, and what is told of them."""
+    results = tracked.results[:count]
+    scene_of = tracked.tracker.scene_of
+    done = smooth_results(truth.body, channels, results, truth.rate, settings, scene_of, **options)
+    return done.results, done.provenance
+
+
 @pytest.fixture(scope="module")
 def tracked(squats):
     """Channels of it, and the frames as tracked."""
-    truth, rig, keypoints = squats
-    channels = make_channels(BODY, rig, keypoints, [np.zeros(len(k), int) for k in keypoints], [8.0] * 4)
-    channels = channels.with_points(truth.body)
-    tracker = Tracker(truth.body, channels, truth.rate)
-    return channels, [tracker.update(channels.uv[f], channels.confidence[f]) for f in range(len(truth))]
+    channels = channels_of(*squats, 8.0)
+    return channels, followed(squats[0], channels)
 
 
 def as_motion(truth, results) -> Motion:
@@ -162,9 +179,9 @@ def as_motion(truth, results) -> Motion:
 
 def test_smoothing_is_nearer_to_the_truth_and_tells_what_it_found(squats, tracked):
     truth, _, _ = squats
-    channels, results = tracked
-    smoothed, told = smooth_results(truth.body, channels, results, truth.rate, Settings())
-    before, after = as_motion(truth, results), as_motion(truth, smoothed)
+    channels, frames = tracked
+    smoothed, told = smoothed_of(truth, channels, frames)
+    before, after = as_motion(truth, frames.results), as_motion(truth, smoothed)
     assert joint_errors(truth, after).mean() < 0.75 * joint_errors(truth, before).mean()
     seen = np.isfinite(after.dof_std[:, 6:])
     assert np.abs(angle_errors(truth, after))[seen].mean() < 0.75 * np.abs(angle_errors(truth, before))[seen].mean()
@@ -178,23 +195,22 @@ def test_smoothing_is_nearer_to_the_truth_and_tells_what_it_found(squats, tracke
 
 def test_livelier_motion_is_given_more_acceleration(squats, tracked):
     truth, rig, _ = squats
-    channels, results = tracked
-    _, told = smooth_results(truth.body, channels, results, truth.rate, Settings())
+    _, told = smoothed_of(truth, *tracked)
     assert told["acceleration"]["knee_angle_r"] == told["acceleration"]["knee_angle_l"]
     roots, angles = np.tile(truth.Ts_world_root[0], (60, 1, 1)), np.tile(truth.angles[0], (60, 1))
     still = replace(truth, Ts_world_root=roots, angles=angles)
     subject = Subject(truth.body, np.ones(len(BODY.scale_groups)))
-    calm = track(rig, simulate_keypoints(still, rig, "BODY_25B", noise_px=4.0, seed=1), BODY, subject=subject)
+    seen = simulate_keypoints(still, rig, "BODY_25B", noise_px=4.0, seed=1)
+    calm = track(Recording.of_keypoints(rig, seen), BODY, subject=subject)
     found = calm.provenance["smoothing"]["acceleration"]
     assert found["knee_angle_r"] < 0.8 * told["acceleration"]["knee_angle_r"]
 
 
 def test_windows_agree_with_all_at_once(squats, tracked):
     truth, _, _ = squats
-    channels, results = tracked
-    settings = Settings(smooth_rounds=0)
-    whole, _ = smooth_results(truth.body, channels, results, truth.rate, settings)
-    cut, _ = smooth_results(truth.body, channels, results, truth.rate, settings, window=40, overlap=20)
+    settings = TrackSettings(smooth_rounds=0)
+    whole, _ = smoothed_of(truth, *tracked, settings)
+    cut, _ = smoothed_of(truth, *tracked, settings, window=40, overlap=20)
     moved = joint_errors(as_motion(truth, whole), as_motion(truth, cut))
     assert 0 < moved.max() < 5e-4
     for a, b in zip(whole, cut, strict=True):
@@ -208,9 +224,7 @@ def test_person_hidden_for_a_while_is_bridged(squats, tracked):
     uv = np.array(channels.uv)
     uv[25:40] = np.nan
     hidden = replace(channels, uv=uv)
-    tracker = Tracker(truth.body, hidden, truth.rate)
-    results = [tracker.update(hidden.uv[f], hidden.confidence[f]) for f in range(len(truth))]
-    smoothed, _ = smooth_results(truth.body, hidden, results, truth.rate, Settings())
+    smoothed, _ = smoothed_of(truth, hidden, followed(truth, hidden))
     after = as_motion(truth, smoothed)
     std = after.joint_std[:, TREE.segment("shank_r")].max(axis=1)
     assert std[24] < std[27] < std[32] and std[32] > std[37] > std[40]
@@ -224,12 +238,9 @@ def test_person_hidden_for_a_while_is_bridged(squats, tracked):
 def test_exchanged_sides_stay_put_right(squats):
     truth, rig, _ = squats
     keypoints = simulate_keypoints(truth, rig, "BODY_25B", noise_px=3.0, outliers=0.0, swaps=0.15, seed=2)
-    channels = make_channels(BODY, rig, keypoints, [np.zeros(len(k), int) for k in keypoints], [5.0] * 4)
-    channels = channels.with_points(truth.body)
-    tracker = Tracker(truth.body, channels, truth.rate)
-    results = [tracker.update(channels.uv[f], channels.confidence[f]) for f in range(len(truth))]
-    smoothed, _ = smooth_results(truth.body, channels, results, truth.rate, Settings())
-    swaps = np.stack([r.swapped for r in smoothed])
+    channels = channels_of(truth, rig, keypoints, 5.0)
+    smoothed, _ = smoothed_of(truth, channels, followed(truth, channels))
+    swaps = swapped_channels(channels, smoothed)
     assert 0.1 < swaps.mean() < 0.2
     assert joint_errors(truth, as_motion(truth, smoothed)).mean() < 0.02
     assert min(r.support for r in smoothed) > 0.6
@@ -238,12 +249,12 @@ def test_exchanged_sides_stay_put_right(squats):
 def test_track_smooths_unless_it_is_told_not_to(squats):
     truth, rig, keypoints = squats
     subject = Subject(truth.body, np.ones(len(BODY.scale_groups)))
-    causal = track(rig, keypoints, BODY, subject=subject, smooth=False)
+    causal = track(Recording.of_keypoints(rig, keypoints), BODY, subject=subject, smooth=False)
     assert "smoothing" not in causal.provenance
     shorter = [replace(k, points=k.points[:40], confidence=k.confidence[:40]) for k in keypoints]
-    again = track(rig, shorter, BODY, subject=subject, smooth=False)
+    again = track(Recording.of_keypoints(rig, shorter), BODY, subject=subject, smooth=False)
     np.testing.assert_array_equal(again.angles, causal.angles[:40])  # knows of no later frame
-    smooth = track(rig, keypoints, BODY, subject=subject)
+    smooth = track(Recording.of_keypoints(rig, keypoints), BODY, subject=subject)
     assert smooth.provenance["smoothing"]["rounds"] > 0
     assert joint_errors(truth, smooth).mean() < joint_errors(truth, causal).mean()
 
@@ -264,9 +275,8 @@ def test_soles_that_rest_are_held_still():
     rig = studio_rig(still)
     keypoints = simulate_keypoints(still, rig, "BODY_25B", noise_px=6.0, seed=3)
     subject = Subject(BODY, np.ones(len(BODY.scale_groups)))
-    x = [
-        track(rig, keypoints, BODY, subject=subject, contacts=c, up=truth.up).positions(points) for c in (False, True)
-    ]
+    recording = Recording.of_keypoints(rig, keypoints, up=truth.up)
+    x = [track(recording, BODY, subject=subject, contacts=c).positions(points) for c in (False, True)]
     slip = [float(np.linalg.norm(np.diff(v, axis=0), axis=2).mean()) for v in x]
     off = [float(np.linalg.norm(v - still.positions(points), axis=2).mean()) for v in x]
     assert slip[1] < 0.5 * slip[0]
@@ -275,10 +285,10 @@ def test_soles_that_rest_are_held_still():
 
 def test_one_and_two_frames_are_smoothed_too(squats, tracked):
     truth, _, _ = squats
-    channels, results = tracked
+    channels, frames = tracked
     for count in (1, 2, 3):
         few = replace(channels, uv=channels.uv[:count], confidence=channels.confidence[:count])
-        smoothed, told = smooth_results(truth.body, few, results[:count], truth.rate, Settings())
+        smoothed, told = smoothed_of(truth, few, frames, count=count)
         assert len(smoothed) == count
         states = (np.stack([getattr(r.state, n) for r in smoothed]) for n in ("T_world_root", "angles"))
         places = TREE.segment_poses(*states)

@@ -44,7 +44,8 @@ def covariance(scene, noise, Sigma=None):
     subject, channels, weight, state = scene
     p = len(subject.shape.theta)
     Sigma = np.zeros((p, p)) if Sigma is None else Sigma
-    return lasting(subject.shape.parameters, subject.shape.theta, Sigma, channels, state, weight, noise)
+    none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
+    return lasting(subject.shape.parameters, subject.shape.theta, Sigma, channels, state, weight, noise, none, none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -105,8 +106,6 @@ def test_another_shape_moves_joints_as_refitting_does(scene):
 
 def test_nothing_seen_leaves_finite_bars(scene):
     subject, channels, weight, state = scene
-    out = lasting(
-        subject.shape.parameters, subject.shape.theta, subject.covariance, channels, state, np.zeros_like(weight),
-        noise_of(channels, drift=3.0),
-    )  # fmt: skip
+    unseen = subject, channels, np.zeros_like(weight), state
+    out = covariance(unseen, noise_of(channels, drift=3.0), subject.covariance)
     assert np.all(np.isfinite(out.dofs)) and np.all(np.isfinite(out.joints)) and out.joints.min() >= 0

@@ -12,6 +12,7 @@ from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers import _kernels_band
+from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Smoothed, _system, _workspace, blocks, posterior, smooth
 
@@ -47,14 +48,25 @@ def random_states(T, turn, seed=0):
     return roots, 0.3 * random.normal(size=(T, N - 6))
 
 
-def dense(system, T):
+PATTERNS = {"tree": (TREE.chain, TREE.depth), "dense": dense_pattern(N)}
+
+
+def coupled(T, random):
+    """Equations that couple all degrees of freedom of a frame: blocks (n, n), of which the lower triangle is read."""
+    A = random.uniform(-0.3, 0.3, (T, N, N))
+    H = A @ A.transpose(0, 2, 1) + np.eye(N) * random.uniform(1, 3, (T, 1, N))
+    return lambda roots, angles: (np.tril(H) + np.triu(np.full(N, np.nan), 1), np.zeros((T, N)), np.zeros(T))
+
+
+def whole(system, T, pattern=PATTERNS["tree"]):
     """The whole matrix from packed and sparse blocks."""
+    chain, depth = pattern
     H = np.zeros((T * N, T * N))
     first, width = blocks(BODY)
     for t in range(T):
         for k in range(N):
-            for i in range(TREE.depth[k] + 1):
-                H[t * N + k, t * N + TREE.chain[k, i]] += system.C[t, k, i]
+            for i in range(depth[k] + 1):
+                H[t * N + k, t * N + chain[k, i]] += system.C[t, k, i]
             for ahead in range(min(4, T - t)):
                 for b in range(width[k]):
                     if ahead > 0 or first[k] + b <= k:
@@ -84,7 +96,7 @@ def test_gradient_and_curvature_of_the_motion_prior(turn):
             there, back = moved(delta), moved(-delta)
             np.testing.assert_allclose((there.cost - back.cost) / 4e-5, -here.g[t, i], rtol=1e-6, atol=1e-5)
             J[t, i] = (there.changes - back.changes) / 2e-5
-    H = dense(here, T).reshape(T, N, T, N)
+    H = whole(here, T).reshape(T, N, T, N)
     for a in range(T):
         for b in range(T):
             for i in some:
@@ -99,17 +111,20 @@ def nothing_enters(W):
     return np.zeros((3 * W.shape[1],) * 2)
 
 
+@pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize("T", [1, 2, 3, 4, 7])
-def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
+def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T, pattern):
     p = prior()
     random = np.random.default_rng(3)
     roots, angles = random_states(T, 0.4)
-    system = _system(BODY, roots, angles, held(random.uniform(1, 3, (T, N))), p, BODY.tree.depth)
-    H = dense(system, T)
+    make = held(random.uniform(1, 3, (T, N))) if pattern == "tree" else coupled(T, random)
+    pattern = PATTERNS[pattern]
+    system = _system(BODY, roots, angles, make, p, pattern[1])
+    H = whole(system, T, pattern)
     W, below, x = _workspace(T, N)
     b = random.normal(size=(T, N))
     x[:, :N] = b
-    packed = system.C, TREE.chain, TREE.depth, system.band, *blocks(BODY)
+    packed = system.C, *pattern, system.band, *blocks(BODY)
     assert _kernels_band.factor_band(*packed, 0.3, nothing_enters(W), W, below, x)
     _kernels_band.back_substitute(W, below, x)
     expected = np.linalg.solve(H + 0.3 * np.eye(T * N), b.ravel()).reshape(T, N)
@@ -117,7 +132,7 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T):
 
     share = np.tile(np.concatenate([np.zeros(6), p.posture_share - 1.0 / TREE.spread**2]), T)
     V = np.linalg.inv(H + np.diag(share)).reshape(T, N, T, N)
-    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, (TREE.chain, TREE.depth)))
+    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, pattern))
     for t in range(T):
         np.testing.assert_allclose(found.frames[t], V[t, :, t], atol=1e-9)
         if t + 1 < T:

@@ -4,17 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kinefit.sensors.measurements import KeypointMeasurement, MarkerMeasurement
-from kinefit.tracking.fused_fit import FusedFit
 from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphing import Morphing
 from kinefit.correspondences.morphed import on_moved_joints
-from kinefit.errors import BodyError
-from kinefit.geometry.camera import Rig
+from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
+from kinefit.rows import DofRows
+from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker
 
@@ -55,7 +56,19 @@ def off(body, found, truth):
     return np.degrees(np.abs(found.angles - truth.angles))[own]
 
 
-@pytest.mark.parametrize("sensors", ["silhouettes", "markers", "both"])
+def depth(model, state, rig, time):
+    """Depth images of a body as it is morphed, before nothing."""
+    vertices, out = model.pose(state).vertices, []
+    for camera in rig:
+        image = Canvas(camera.size).draw_for(camera, vertices, model.mesh.faces, cull=True).depth
+        out.append(DepthFrame(camera.name, time, np.where(np.isfinite(image), image, 0.0)))
+    return out
+
+
+LIMITS = {"silhouettes": 1.5, "markers": 0.3, "both": 0.3, "depth": 1.5}  # [deg]
+
+
+@pytest.mark.parametrize("sensors", LIMITS)
 def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
     """The morphing body finds the arms' angles; the same one held stiff is off."""
     model, ends = Morphing(body), {}
@@ -64,14 +77,24 @@ def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
         follow.start_at(posture(body, 0))
         for i in range(8):
             truth, frames = posture(body, i), []
-            if sensors != "markers":
+            if sensors in ("silhouettes", "both"):
                 frames += silhouettes(model, truth, rig, i / 30)
-            if sensors != "silhouettes":
+            if sensors in ("markers", "both"):
                 frames.append(markers(model, truth, i / 30))
+            if sensors == "depth":
+                frames += depth(model, truth, rig, i / 30)
             result = follow.update(frames)
         ends[name] = off(body, result.state, truth).mean()
-    assert ends["morphing"] < (1.5 if sensors == "silhouettes" else 0.3)
+    assert ends["morphing"] < LIMITS[sensors]
     assert ends["stiff"] > 2 * ends["morphing"]
+
+
+def keypoint_sensor(rig):
+    return KeypointSensor(rig, {}, 3.0, geman_mcclure(), 0.03)
+
+
+def marker_sensor():
+    return MarkerSensor("markers", 0.01, geman_mcclure(), 0.03)
 
 
 def test_keypoints_and_markers_make_rows_on_moved_joints(body, rig):
@@ -80,23 +103,25 @@ def test_keypoints_and_markers_make_rows_on_moved_joints(body, rig):
     x = model.pose(state).positions(keypoints)
     uv = rig.cameras[1].project(x)
     frame = KeypointFrame("c1", 0.0, keypoints.names, uv, np.ones(len(uv)), "COCO_17")
+    here = Scene(body, state, rig)
     for measurement in (
-        KeypointMeasurement(frame, body, rig, 3.0, model),
-        MarkerMeasurement(markers(model, state, 0.0), body, 0.01, model),
-    ):
-        np.testing.assert_allclose(measurement.square(state), 0.0, atol=1e-12)
-        (rows,) = measurement.rows(state, 0.1)
+        keypoint_sensor(rig).prepare(frame, here), marker_sensor().prepare(markers(model, state, 0.0), here)
+    ):  # fmt: skip
+        match = measurement.match(here, 0.1)
+        np.testing.assert_allclose(match.squares(here), 0.0, atol=1e-12)
+        (rows,) = match.rows(here)
+        assert isinstance(rows, DofRows)
         np.testing.assert_allclose(rows.residual, 0.0, atol=1e-9)
         step, h = np.random.default_rng(0).normal(size=body.tree.n_dofs), 1e-6
-        ends = [measurement.rows(state.retract(s * h * step), 0.1)[0] for s in (-1, 1)]
+        ends = [match.rows(here.at(state.retract(s * h * step)))[0] for s in (-1, 1)]
         slope = (ends[1].residual - ends[0].residual) / (2 * h)
         np.testing.assert_allclose(rows.jacobian @ step, -slope, atol=1e-5)
 
 
 def test_without_moving_joints_the_derivative_is_the_trees(body, rig):
     plain, state = replace(body, morphs=()), posture(body, 3)
-    model = Morphing(plain)
-    (rows,) = MarkerMeasurement(markers(model, state, 0.0), plain, 0.01).rows(state, 0.1)
+    model, here = Morphing(plain), Scene(plain, state, rig)
+    (rows,) = marker_sensor().prepare(markers(model, state, 0.0), here).match(here, 0.1).rows(here)
     J = on_moved_joints(model.pose(state), rows).jacobian
     assert not model.moves_joints and model.is_rigid
     _, screws = plain.tree.forward(state.T_world_root, state.angles)
@@ -104,10 +129,3 @@ def test_without_moving_joints_the_derivative_is_the_trees(body, rig):
     for k in range(0, len(rows), 17):
         a = np.r_[rows.direction[k], np.cross(arm[k], rows.direction[k])]
         np.testing.assert_allclose(J[k], a @ plain.tree.segment_jacobian(screws, int(rows.segment[k])), atol=1e-12)
-
-
-def test_depth_says_that_it_does_not_know_of_moving_joints(body, rig):
-    fit = FusedFit(body, Rig(rig.cameras[:1]), 30.0, {}, TrackSettings(), {})
-    image = np.full(rig.cameras[0].size[::-1], 3.0, np.float32)
-    with pytest.raises(BodyError, match="joints that move with angles.*without morphs"):
-        fit.measurements([DepthFrame("c0", 0.0, image)], posture(body, 0))

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from kinefit.tracking.fusion_take import FrameSource, fuse_take
 
-from kinefit import read_motion
+from kinefit import load_body, read_motion, track
 from kinefit.cli import main
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
@@ -15,6 +14,7 @@ from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.tracking.take import track_take
+from kinefit.tracking.take_recording import recording_of
 
 MARKERS = ("l_wrist", "r_wrist", "l_knee")
 
@@ -50,11 +50,12 @@ def folder(tmp_path_factory):
 def test_every_step_holds_what_each_sensor_saw(folder):
     take = read_take(folder / "take.toml")
     seen = load_observations(take)
-    source = FrameSource(take, seen)
-    motion = read_motion(folder / "truth" / "motion.npz")
-    sensors = [[f.sensor for f in source.at(i, motion.body)] for i in range(8)]
-    assert all(s == ["tof", "colour", "markers 0"] for s in sensors)
-    assert set(source.accuracy(take)) == {"tof", "colour", "markers 0"}
+    recording, _ = recording_of(take, seen, load_body(take.body))
+    sensors = [[f.sensor for f in recording.steps(i)] for i in range(8)]
+    assert len(recording) == 8 and all(s == ["tof", "markers"] for s in sensors)
+    assert [k.camera for k in recording.keypoints] == ["colour"] and (recording.people[0] == 0).all()
+    assert set(recording.sigma) == {"tof", "colour", "markers"}
+    assert {f.sensor for f in recording.depth.values()} == {"tof"}
 
 
 def test_a_take_of_three_kinds_of_sensors_is_fused(folder, tmp_path):
@@ -62,18 +63,21 @@ def test_a_take_of_three_kinds_of_sensors_is_fused(folder, tmp_path):
     out = tmp_path / "out"
     told = CliRunner().invoke(main, ["track", str(folder / "take.toml"), "-o", str(out), "--no-report"])
     assert told.exit_code == 0, told.output
-    assert "colour" in told.output and "markers 0" in told.output
+    assert "colour" in told.output and "markers" in told.output
     found, truth = read_motion(out / "motion.npz"), read_motion(folder / "truth" / "motion.npz")
     x, y = (m.positions(m.body.landmarks.select(("neck", *MARKERS))) for m in (found, truth))
     assert np.median(np.linalg.norm(x - y, axis=-1)) < 0.03
-    assert found.residuals["markers 0"].unit == "m" and found.residuals["colour"].unit == "px"
+    assert found.residuals["markers"].unit == "m" and found.residuals["colour"].unit == "px"
     assert (out / "overlays" / "tof.mp4").stat().st_size > 1000 and (out / "montage.png").exists()
 
 
 def test_size_and_background_can_be_left_as_they_are(folder):
     take = read_take(folder / "take.toml")
-    motion = fuse_take(take, load_observations(take), size=False)
+    recording, body = recording_of(take, load_observations(take), load_body(take.body))
+    motion = track(recording, body, size=False)
     assert len(motion) == 8 and np.isfinite(motion.angles).all()
+    np.testing.assert_array_equal(motion.body.tree.offsets, body.tree.offsets)
+    assert not {"size", "shape"} & set(motion.provenance)
 
 
 @pytest.mark.parametrize(
@@ -89,8 +93,7 @@ def test_what_is_wrong_is_named(folder, tmp_path, line, match):
     path = folder / "broken.toml"
     path.write_text(text.replace(line, broken))
     with pytest.raises(KinefitError, match=match):
-        take = read_take(path)
-        fuse_take(take, load_observations(take))
+        track_take(path)
 
 
 def test_markers_beside_keypoints_count(tmp_path):

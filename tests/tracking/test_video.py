@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kinefit import Keypoints, load_body, load_observations, read_take, track
+from kinefit import Keypoints, Recording, load_body, load_observations, read_take, track
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.evaluation import joint_errors
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
@@ -62,22 +62,24 @@ def test_bystanders_are_not_followed(data_dir, tmp_path):
         Keypoints(k.camera, k.keypoint_set, k.names, k.rate, k.points[:, ::-1], k.confidence[:, ::-1])
         for k in observations.keypoints
     ]
-    as_is = track(observations.rig, observations.keypoints, load_body("humanoid"))
-    other = track(observations.rig, shuffled, load_body("humanoid"))
+    as_is, other = (
+        track(Recording.of_keypoints(observations.rig, several), load_body("humanoid"))
+        for several in (observations.keypoints, shuffled)
+    )
     np.testing.assert_allclose(other.angles, as_is.angles, atol=1e-6)
 
 
 def test_known_motion_is_recovered(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", seed=1)
-    motion = track(rig, keypoints, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"))
     assert joint_errors(truth, motion).mean() < 0.012
 
 
 def test_exact_pixels_give_the_exact_motion(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", noise_px=0.0, outliers=0.0, missing=0.0)
-    motion = track(rig, keypoints, load_body("humanoid"), accuracy=0.5, up=truth.up)
+    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=0.5, up=truth.up), load_body("humanoid"))
     assert joint_errors(truth, motion).mean() < 0.004
 
 
@@ -90,7 +92,7 @@ def test_a_person_who_leaves_is_told_and_found_again(truth):
         points, confidence = k.points.copy(), k.confidence.copy()
         points[gone], confidence[gone] = np.nan, 0.0
         emptied.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
-    motion = track(rig, emptied, load_body("humanoid"), accuracy=3.0, up=truth.up, smooth=False)
+    motion = track(Recording.of_keypoints(rig, emptied, accuracy=3.0, up=truth.up), load_body("humanoid"), smooth=False)
     assert np.all(motion.quality[gone] == 0.0)
     assert np.all(motion.segment_quality[gone] == 0.0)
     assert not np.isfinite(motion.dof_std[gone][:, 6:]).any()
@@ -107,7 +109,7 @@ def test_a_hidden_limb_is_told_by_segment(truth):
         arm = [k.names.index(n) for n in ("RElbow", "RWrist")]
         points[20:40, :, arm], confidence[20:40, :, arm] = np.nan, 0.0
         hidden.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
-    motion = track(rig, hidden, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    motion = track(Recording.of_keypoints(rig, hidden, accuracy=3.0, up=truth.up), load_body("humanoid"))
     segment = motion.body.tree.segment
     assert np.all(motion.segment_quality[22:38, segment("forearm_r")] == 0.0)
     assert motion.segment_quality[22:38, segment("forearm_l")].min() > 0.5
@@ -116,7 +118,7 @@ def test_a_hidden_limb_is_told_by_segment(truth):
 def test_a_detector_that_exchanges_sides_is_put_right(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "BODY_25B", swaps=0.2, seed=4)
-    motion = track(rig, keypoints, load_body("humanoid"), accuracy=3.0, up=truth.up)
+    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"))
     assert sum(r.swapped.sum() for r in motion.residuals.values()) > 10
     assert joint_errors(truth, motion).mean() < 0.015
 
@@ -126,7 +128,7 @@ def test_streams_that_differ_are_refused(truth):
     keypoints = simulate_keypoints(truth, rig)
     short = simulate_keypoints(cut(truth, 0, 10), rig)
     with pytest.raises(ObservationError, match="differ"):
-        track(rig, [*keypoints[:3], short[3]], load_body("humanoid"))
+        Recording.of_keypoints(rig, [*keypoints[:3], short[3]])
 
 
 def test_nobody_is_a_typed_error(truth):
@@ -136,11 +138,11 @@ def test_nobody_is_a_typed_error(truth):
         for k in simulate_keypoints(truth, rig)
     ]
     with pytest.raises(TrackingError, match="nobody"):
-        track(rig, empty, load_body("humanoid"))
+        Recording.of_keypoints(rig, empty)
 
 
 def test_one_camera_is_told(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig)
     with pytest.raises(TrackingError, match="two cameras"):
-        track(rig.select(rig.names[:1]), keypoints[:1], load_body("humanoid"))
+        track(Recording.of_keypoints(rig.select(rig.names[:1]), keypoints[:1]), load_body("humanoid"))

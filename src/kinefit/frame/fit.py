@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.frame.prediction import belief
 from kinefit.frame.results import FrameResult, judged
-from kinefit.rows import AnyRows, ParameterRows
+from kinefit.frame.skin import skin_of
+from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -85,7 +86,7 @@ class FrameFit:
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
     ) -> list[AnyRows]:
         """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart."""
-        parts = [rows for m in matched for rows in rows_at(m, scene)]
+        parts = rows_of(scene, matched, self.settings)
         if held is not None:
             parts.append(belief(scene.state, *held))
         usual = self.body.tree.usual
@@ -104,6 +105,37 @@ class FrameFit:
         posterior, alone = inverse(H), np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
         return Fitted(judged(scene, posterior, matched, iterations), inverse(alone))
+
+
+def rows_of(
+    scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None
+) -> list[AnyRows]:
+    """Rows of all matches; those of surfaces tell no more of bones than where these lie below them (`frame.skin`).
+
+    Parameters
+    ----------
+    scale : {sensor: factor} on standard deviations
+    """
+    parts, surface = [], []
+    for m in matched:
+        for rows in rows_at(m, scene):
+            rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
+            if not m.of_points and isinstance(rows, Rows) and settings.skin_shift > 0.0:
+                surface.append(rows)
+            else:
+                parts.append(rows)
+    if surface:
+        parts.append(skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows())
+    return parts
+
+
+def weaker(rows: AnyRows, factor: float) -> AnyRows:
+    """The same rows with standard deviations that are so many times larger."""
+    if factor == 1.0:
+        return rows
+    if isinstance(rows, Rows):
+        return rows.weaker(factor)
+    return replace(rows, weight=rows.weight / factor**2)
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

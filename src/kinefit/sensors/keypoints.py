@@ -207,7 +207,7 @@ class KeypointMatched(Matched):
         out = np.where(self.weight > 0, self.weight * np.square(gap).sum(axis=1), 0.0)
         for h in self.hidden:
             out[h.far] = np.inf
-        return np.nan_to_num(out, nan=np.inf)
+        return np.where(np.isnan(out), np.inf, out)
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Of every point of every detector."""

@@ -48,6 +48,9 @@ class TrackSettings:
     collision, flesh : float [m]
         Softness of what parts that run into each other are kept apart with, and how far they may. See
         `collision_rows`.
+    skin_shift, skin_turn : float [m], [rad]
+        Standard deviations by which a segment's surface is shifted and turned about its bone: what surfaces tell of
+        joints is no better, however many points of them are seen.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
@@ -95,7 +98,9 @@ class TrackSettings:
     through: float = 3.0
     collision: float = 0.01
     flesh: float = 0.02
-    angle_acceleration: float = 60.0
+    skin_shift: float = 0.02
+    skin_turn: float = 0.1
+    angle_acceleration: float = 150.0
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
     loss: Loss = field(default_factory=geman_mcclure)

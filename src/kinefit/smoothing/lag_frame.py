@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.frame.fit import rows_of
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.multiview.observability import SHORTEST, levers
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise, known_sigma
-from kinefit.smoothing.linearised import ApartRows, SceneOf, weaker
+from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.process_noise import INLIER
 from kinefit.solvers.equations import inverse, normal_equations
 
@@ -137,11 +138,8 @@ class FrameCosts:
         return scene.at(frame.state, measurements=frame.measurements, velocity=velocity)
 
     def _rows(self, matched: Sequence[Matched], scene: Scene) -> list[AnyRows]:
-        rows = []
-        for m in matched:
-            m = self._known(m) if isinstance(m, KeypointMatched) else m
-            rows += [weaker(r, self.noise.scale.get(m.sensor, 1.0)) for r in rows_at(m, scene)]
-        return rows
+        known = [self._known(m) if isinstance(m, KeypointMatched) else m for m in matched]
+        return rows_of(scene, known, self.tracker.settings, self.noise.scale)
 
     def _known(self, m: KeypointMatched) -> KeypointMatched:
         """Keypoints with the noise that is known."""

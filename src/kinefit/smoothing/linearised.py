@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.frame.fit import rows_of
 from kinefit.rows import AnyRows, DofRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.smoothing import Equations, MakeEquations
@@ -61,7 +63,7 @@ class OtherSensors:
     measurements : T lists
     scene_of : (state, time) -> scene
     apart : scene -> rows that keep parts of the body from running into each other
-    reach : float [m] correspondence distance
+    settings : TrackSettings
     scale : {sensor: factor on its standard deviation}, as the take shows it; 1 where none is given
     """
 
@@ -69,7 +71,7 @@ class OtherSensors:
     measurements: tuple[tuple[Measurement, ...], ...]
     scene_of: SceneOf
     apart: ApartRows
-    reach: float
+    settings: TrackSettings
     scale: dict[str, float]
 
     def part(self, frames: slice) -> OtherSensors:
@@ -92,9 +94,9 @@ class OtherSensors:
         H, g, cost, rows, matches = np.zeros((T, n, n)), np.zeros((T, n)), np.zeros(T), np.zeros(T), []
         for f in range(T):
             scene = self.scene(f, roots, angles)
-            matched = tuple(matched_by(m, scene, self.reach) for m in self.measurements[f])
+            matched = tuple(matched_by(m, scene, self.settings.near) for m in self.measurements[f])
             matches.append(matched)
-            parts = [weaker(r, self.scale.get(m.sensor, 1.0)) for m in matched for r in rows_at(m, scene)]
+            parts = rows_of(scene, matched, self.settings, self.scale)
             rows[f] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)
@@ -102,17 +104,6 @@ class OtherSensors:
                 equations = normal_equations(body, scene.state, parts)
                 H[f], g[f], cost[f] = equations.matrix, equations.gradient, equations.cost
         return Linearised(H, g, cost, np.array(roots), np.array(angles), tuple(matches), rows)
-
-
-def weaker(rows: AnyRows, factor: float) -> AnyRows:
-    """The same rows with standard deviations that are so many times larger."""
-    if factor == 1.0:
-        return rows
-    if isinstance(rows, Rows):
-        data = np.array(rows.data)
-        data[7] /= factor**2
-        return replace(rows, data=data)
-    return replace(rows, weight=rows.weight / factor**2)
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
+from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.smoothing.linearised import OtherSensors, squares_of
@@ -67,7 +68,7 @@ def other_noise(
     """
     T, n = len(roots), body.tree.n_dofs
     pushes: list[list[tuple[str, NDArray]]] = []
-    information = np.zeros((T, n, n))
+    information, lasting = np.zeros((T, n, n)), np.zeros((T, n, n))
     channels: dict[str, dict[tuple[int, int], _Channel]] = {}
     normal: dict[str, tuple[NDArray, NDArray]] = {}
     shifts: list[list[tuple[str, NDArray]]] = []
@@ -75,17 +76,19 @@ def other_noise(
     for f in range(T):
         push, moved = list[tuple[str, NDArray]](), list[tuple[str, NDArray]]()
         scene = others.scene(f, roots, angles)
+        surface: list[Rows] = []
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
             for part, rows in enumerate(rows_at(m, scene)):
                 if not isinstance(rows, Rows | DofRows) or not len(rows):
                     continue
+                if not m.of_points and isinstance(rows, Rows) and others.settings.skin_shift > 0.0:
+                    surface.append(rows.weaker(scale))
+                    continue
                 J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
                 weighted = J * w[:, None]
                 information[f] += J.T @ weighted
                 names = np.arange(len(rows))
-                if not m.of_points and isinstance(rows, Rows):
-                    names = rows.segment
                 counts.setdefault(m.sensor, []).append(len(np.unique(names)))
                 mine = channels.setdefault(m.sensor, {})
                 for c in np.unique(names):
@@ -101,6 +104,10 @@ def other_noise(
                     A, b = normal.get(m.sensor, (np.zeros((3, 3)), np.zeros(3)))
                     normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
                     moved += [(m.sensor, weighted.T @ d)]
+        if surface:
+            skin = skin_of(scene, surface, others.settings.skin_shift, others.settings.skin_turn)
+            information[f] += skin.information
+            lasting[f] += skin.pushes.T @ skin.pushes
         pushes.append(push)
         shifts.append(moved)
     shift = {
@@ -110,7 +117,6 @@ def other_noise(
         name: _drift(list(mine.values()), min(n / max(float(np.mean(counts[name])), 1.0), _MOST_HIDDEN))
         for name, mine in channels.items()
     }
-    lasting = np.zeros((T, n, n))
     for f in range(T):
         for name, s in pushes[f]:
             lasting[f] += drift[name] ** 2 * np.outer(s, s)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.equations import lock
 from kinefit.solvers.whitened import Pose, columns, residuals, softening
@@ -29,7 +29,11 @@ Part = tuple[str, AnyRows]
 
 
 class Problem(Protocol):
-    """What the parameters and the frames are."""
+    """What the parameters and the frames are.
+
+    It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
+    different segments then share an evaluation.
+    """
 
     def body(self, theta: NDArray) -> Body:
         """The body with parameters (p,)."""
@@ -156,15 +160,48 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
     """
     centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
     out = [np.zeros((sum(len(rows) for _, rows in parts), len(theta))) for parts in centre]
-    for k, step in enumerate(steps):
+    on = [_segments(parts) for parts in centre]
+    touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
+    if all(segment is not None for segment in on):
+        touches = getattr(problem, "touches", touches)
+    for together in _apart(touches):
+        change = np.zeros(len(theta))
+        change[together] = steps[together]
         for sign in (-1.0, 1.0):
-            other = np.array(theta, float)
-            other[k] += sign * step
             for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-                moved = problem.parts(other, f, state)
+                moved = problem.parts(theta + sign * change, f, state)
                 _same(parts, moved)
-                out[f][:, k] -= sign * _stacked(moved) / (2.0 * step)
+                away = -sign * _stacked(moved) / 2.0
+                for k in together:
+                    touched, segment = touches[k], on[f]
+                    felt = slice(None) if touched is None or segment is None else np.isin(segment, list(touched))
+                    out[f][felt, k] += away[felt] / steps[k]
     return out
+
+
+def _segments(parts: Sequence[Part]) -> NDArray | None:
+    """(N,) the segment of every row; None where a row may be about several."""
+    if not all(isinstance(rows, Rows) for _, rows in parts):
+        return None
+    return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
+
+
+def _apart(touches: Sequence[frozenset[int] | None]) -> list[list[int]]:
+    """Parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
+    groups: list[tuple[list[int], set[int]]] = []
+    out: list[list[int]] = []
+    for k, segments in enumerate(touches):
+        if segments is None:
+            out.append([k])
+            continue
+        for members, taken in groups:
+            if not taken & segments:
+                members.append(k)
+                taken |= segments
+                break
+        else:
+            groups.append(([k], set(segments)))
+    return out + [members for members, _ in groups]
 
 
 def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:

@@ -42,6 +42,14 @@ class Worlds:
             world = self._kept[key][1]
         return world
 
+    @property
+    def touches(self) -> tuple[frozenset[int] | None, ...]:
+        """Of each parameter the segments on which alone rows can feel it; None for anywhere."""
+        out: list[frozenset[int] | None] = []
+        for one, own in self._parameters:
+            out += getattr(one, "touches", (None,) * (own.stop - own.start))
+        return tuple(out)
+
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body and rig share what was made for them."""
         key = id(world.body), id(world.rig)
@@ -66,6 +74,11 @@ class MatchedFrames:
         for f, state in enumerate(states):
             scene = self._scene(world, f, state)
             self._matched.append([matched_by(m, scene, reach) for m in steps[f]])
+
+    @property
+    def touches(self) -> tuple[frozenset[int] | None, ...]:
+        """Of each parameter the segments on which alone rows can feel it; None for anywhere."""
+        return self._worlds.touches
 
     def body(self, theta: NDArray) -> Body:
         """The body with parameters (p,)."""

@@ -194,6 +194,13 @@ class PointOffsets:
         """(3 L,)."""
         return np.full(len(self.names), _STEP)
 
+    @property
+    def touches(self) -> tuple[frozenset[int], ...]:
+        """Of each parameter the segments of the points that it shifts."""
+        lead, _, leaders = self._shared
+        on = [frozenset(int(s) for s in self.points.segments[lead == k]) for k in leaders]
+        return tuple(segments for segments in on for _ in "xyz")
+
     def shifts(self, values: NDArray) -> NDArray:
         """(K, 3) [m] of all points, mirrored where they share."""
         lead, sign, leaders = self._shared

@@ -64,6 +64,13 @@ class CylinderShape:
         return tuple(f"{name} {kind}" for name in self._groups[0] for kind in _KINDS)
 
     @property
+    def touches(self) -> tuple[frozenset[int], ...]:
+        """Of each parameter the segments that it changes."""
+        names, of = self._groups
+        on = [frozenset(s.segment for s, g in zip(self.body.surfaces, of) if g == k) for k in range(len(names))]
+        return tuple(segments for segments in on for _ in _KINDS)
+
+    @property
     def mean(self) -> NDArray:
         """(6 C,) zero."""
         return np.zeros(len(self.names))

@@ -77,7 +77,7 @@ def motion_of(
     others = None
     if any(frames.measurements):
         others = OtherSensors(
-            frames.times, tuple(frames.measurements), frames.scene_of, frames.apart, settings.near,
+            frames.times, tuple(frames.measurements), frames.scene_of, frames.apart, settings,
             dict.fromkeys({m.sensor for several in frames.measurements for m in several}, 1.0),
         )  # fmt: skip
     matched: tuple[tuple[Matched, ...], ...] | None = None

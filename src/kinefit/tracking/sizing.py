@@ -28,6 +28,7 @@ from kinefit.tracking.run import run
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
 _POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
+_MATCHES = 3  # rounds of matching and solving
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 Start = tuple[int, BodyState]
@@ -172,7 +173,7 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
         pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
     states = [tracked.results[k].state for k in chosen]
-    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss)
+    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss, rounds=_MATCHES)
     told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
     person = _wearing(person, replace(person.subject, body=found.body), shape=told)
@@ -184,12 +185,13 @@ def _parameters(person: Person, measurements: list[Measurement]) -> list[Paramet
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
     surfaces = any(not m.settled for m in measurements)
-    if surfaces or r.markers:
+    cameras = len({k.camera for k in r.keypoints})
+    if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
     sets = {name: std for name, std in r.marker_sets if std is not None}
-    if len({k.camera for k in r.keypoints}) >= 2:  # else the markers' own fit has found them
+    if cameras >= 2:  # else the markers' own fit has found them
         out += [PointOffsets(body, name, std) for name, std in sets.items()]
     unknown = [s for s in r.sensors if s.unknowns]
     return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]

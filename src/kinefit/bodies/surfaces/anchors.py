@@ -9,7 +9,7 @@ takes its anchors along, and their normals as any surface's: by the inverse tran
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -71,12 +71,15 @@ class SurfaceAnchors:
         if self._latest and self._latest[0][0] is body:
             return self._latest[0][1]
         _check_make(self.body, body)
-        places, points, normals = self._places, np.empty((len(self), 3)), np.empty((len(self), 3))
-        for k in np.unique(places.surface):
-            own, surface = places.surface == k, body.surfaces[k]
-            x, J = _mapped(surface, places.face[own], places.at[own])
-            points[own] = x + body.tree.rest[surface.segment]
-            normals[own] = np.linalg.solve(np.swapaxes(J, 1, 2), places.normal[own][..., None])[..., 0]
+        places, points, J = self._places, np.empty((len(self), 3)), np.empty((len(self), 3, 3))
+        table = _cylinders(body)
+        round_ones = table.is_cylinder[places.surface]
+        points[round_ones], J[round_ones] = table.mapped(places.surface[round_ones], places.at[round_ones])
+        for k in np.unique(places.surface[~round_ones]):
+            own = places.surface == k
+            points[own], J[own] = _mapped(body.surfaces[k], places.face[own], places.at[own])
+        points += body.tree.rest[self.segment]
+        normals = np.linalg.solve(np.swapaxes(J, 1, 2), places.normal[..., None])[..., 0]
         size = np.linalg.norm(self.normals, axis=1) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
         told = points, normals * size[:, None]
         self._latest[:] = [(body, told)]
@@ -108,6 +111,42 @@ class SurfaceAnchors:
             _, J = _mapped(body.surfaces[k], out.face[own], out.at[own])
             out.normal[own] = np.einsum("nji,nj->ni", J, self.normals[own])
         return out
+
+
+class _Cylinders(NamedTuple):
+    """A body's M surfaces as arrays; those that are no tapered cylinders hold zeros."""
+
+    is_cylinder: NDArray
+    start: NDArray
+    axes: NDArray
+    length: NDArray
+    first: NDArray
+    growth: NDArray
+
+    def mapped(self, surface: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
+        """As `_mapped`, of anchors on surfaces (N,)."""
+        first, growth, axes, length = (v[surface] for v in (self.first, self.growth, self.axes, self.length))
+        half, J = first + at[:, 2:] * growth, np.zeros((len(at), 3, 3))
+        local = np.concatenate([half * at[:, :2], length[:, None] * at[:, 2:]], axis=1)
+        J[:, 0, 0], J[:, 1, 1], J[:, 2, 2] = half[:, 0], half[:, 1], length
+        J[:, :2, 2] = growth * at[:, :2]
+        turned = np.swapaxes(axes, 1, 2)
+        return (turned @ local[..., None])[..., 0] + self.start[surface], turned @ J
+
+
+@lru_cache(maxsize=256)
+def _cylinders(body: Body) -> _Cylinders:
+    count = len(body.surfaces)
+    out = _Cylinders(
+        np.zeros(count, bool), np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.zeros((count, 2)),
+        np.zeros((count, 2)),
+    )  # fmt: skip
+    for k, s in enumerate(body.surfaces):
+        if isinstance(s, TaperedCylinder):
+            (a, b), (c, d) = s.radii
+            out.is_cylinder[k], out.start[k], out.axes[k], out.length[k] = True, s.start, s.axes, s.length
+            out.first[k], out.growth[k] = (a, b), (c - a, d - b)
+    return out
 
 
 def _mapped(surface: TaperedCylinder | MeshSurface, face: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:

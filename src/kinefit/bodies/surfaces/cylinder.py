@@ -72,11 +72,13 @@ class TaperedCylinder:
         """[m] from end to end."""
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
-    @property
+    @cached_property
     def axes(self) -> NDArray:
         """(3, 3) rows: unit directions of a, of b and of the axis, right-handed, in the segment's frame."""
         u = np.subtract(self.end, self.start) / self.length
-        return np.stack([np.array(self.side), np.cross(u, np.array(self.side)), u])
+        out = np.stack([np.array(self.side), np.cross(u, np.array(self.side)), u])
+        out.flags.writeable = False
+        return out
 
     @property
     def is_round(self) -> bool:

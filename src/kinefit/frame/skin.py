@@ -1,0 +1,132 @@
+"""How far surfaces tell where bones are: the body's surface lies only about where it is on the person's skeleton.
+
+What a surface of simple shapes is off by on a person, and soft tissue, moves every row of a segment alike, in all
+sensors that see surfaces and for as long as the take lasts. However many rows there are, they tell a segment's pose no
+better than that. With the segment's surface shifted and turned by an unknown e ~ N(0, Σ), the normal equations
+(H, g) of a segment's rows become
+
+    H' = H − H (H + Σ⁻¹)⁻¹ H,        g' = Σ⁻¹ (H + Σ⁻¹)⁻¹ g
+
+which is what remains once e is eliminated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.surfaces import body_mesh
+from kinefit.rows import DofRows, Rows
+from kinefit.sensors.scene import Scene
+from kinefit.solvers import _kernels
+
+_TINY = 1e-9  # of a segment's largest eigenvalue: below it a direction is not told
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """Normal equations of S segments' surfaces, each about its middle, with the surface's own error eliminated.
+
+    Parameters
+    ----------
+    H, g : (S, 6, 6), (S, 6) of twists (v at the middle, ω)
+    jacobian : (S, 6, n) of those twists by the degrees of freedom
+    sigma : (6,) [m, rad] standard deviations of the surface's error
+    """
+
+    H: NDArray
+    g: NDArray
+    jacobian: NDArray
+    sigma: NDArray
+
+    def rows(self) -> DofRows:
+        """The same as six rows a segment, of directions that are told."""
+        values, vectors = np.linalg.eigh(self.H)
+        told = values > _TINY * np.maximum(values[:, -1:], 1e-12)
+        s, k = np.nonzero(told)
+        v, w = vectors[s, :, k], values[s, k]
+        residual = np.einsum("ri,ri->r", v, self.g[s]) / w
+        J = np.einsum("ri,rin->rn", v, self.jacobian[s])
+        return DofRows(J, residual, w, np.full(len(w), -1))
+
+    @property
+    def information(self) -> NDArray:
+        """(n, n) Jᵀ H' J."""
+        return np.einsum("sin,sij,sjm->nm", self.jacobian, self.H, self.jacobian, optimize=True)
+
+    @property
+    def pushes(self) -> NDArray:
+        """(6 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
+        return np.einsum("sin,sij,j->sjn", self.jacobian, self.H, self.sigma, optimize=True).reshape(-1, self.n)
+
+    @property
+    def n(self) -> int:
+        """Number of degrees of freedom."""
+        return int(self.jacobian.shape[2])
+
+
+def skin_of(scene: Scene, parts: Sequence[Rows], shift: float, turn: float) -> Skin:
+    """Surface rows of all sensors at a scene's state, with the surface's error eliminated.
+
+    Parameters
+    ----------
+    parts : with their losses
+    shift, turn : [m], [rad] standard deviations of a segment's surface about its bone
+    """
+    body, tree = scene.body, scene.body.tree
+    S = len(tree.segments)
+    R = scene.frames[:, :9].reshape(S, 3, 3)
+    middle = np.einsum("sij,sj->si", R, _middles(body)) + scene.frames[:, 9:]
+    rows = Rows.concat(*parts)
+    factor = np.concatenate([_factor(p) for p in parts]) if parts else np.zeros(0)
+    data = np.array(rows.data)
+    data[:3] -= middle[rows.segment].T
+    blocks = np.zeros((S, 27))
+    order = np.argsort(rows.segment, kind="stable")
+    _kernels.accumulate(
+        np.ascontiguousarray(data[:, order]), rows.segment[order], factor[order], len(rows), 0.0, 0.0, 0.0, blocks
+    )
+    H, upper = np.zeros((S, 6, 6)), np.triu_indices(6)
+    H[:, upper[0], upper[1]] = blocks[:, :21]
+    H[:, upper[1], upper[0]] = blocks[:, :21]
+    g = blocks[:, 21:]
+    sigma = np.array([shift] * 3 + [turn] * 3)
+    inverse = np.diag(sigma**-2.0)
+    kept = np.linalg.solve(H + inverse, np.concatenate([H, g[..., None]], axis=2))
+    H = H - H @ kept[..., :6]
+    g = inverse @ kept[..., 6:]
+    return Skin(0.5 * (H + H.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma)
+
+
+def _factor(rows: Rows) -> NDArray:
+    return np.ones(len(rows)) if rows.loss is None else rows.loss.of_rows(rows.data, rows.group)[0]
+
+
+def _jacobians(scene: Scene, middle: NDArray) -> NDArray:
+    """(S, 6, n) velocity of each segment's middle and its turn by every degree of freedom."""
+    body, state = scene.body, scene.state
+    if scene.morphing is not None:
+        pose = scene.morphing.pose(state)
+        J = np.stack([pose.segment_jacobian(s) for s in range(len(middle))])
+    else:
+        _, screws = body.tree.forward(state.T_world_root, state.angles)
+        J = np.stack([body.tree.segment_jacobian(screws, s) for s in range(len(middle))])
+    arm = middle - state.T_world_root[:3, 3]
+    out = np.array(J)
+    out[:, :3] += np.cross(J[:, 3:].swapaxes(1, 2), arm[:, None, :]).swapaxes(1, 2)
+    return out
+
+
+@lru_cache(maxsize=8)
+def _middles(body: Body) -> NDArray:
+    """(S, 3) [m] middle of each segment's surface, in the root frame at rest."""
+    mesh = body_mesh(body)
+    count = np.maximum(np.bincount(mesh.segment, minlength=len(body.tree.segments)), 1)
+    return np.stack(
+        [np.bincount(mesh.segment, mesh.vertices[:, k], len(body.tree.segments)) / count for k in range(3)], axis=1
+    )
