@@ -229,3 +229,12 @@ def test_usual_noise_is_better_than_no_lag_at_all():
 def test_noise_of_a_motion_that_was_not_smoothed_is_refused():
     with pytest.raises(ObservationError, match="root_shift"):
         KnownNoise.of_take(BODY, {"estimate": "filtered"})
+
+
+def test_a_recording_with_depth_is_tracked_with_a_lag():
+    frames = [seen(i, depth=True) for i in range(10)]
+    taken = Recording.of_frames(frames, a_rig(), rate=RATE, sigma=SIGMA, start=(0, a_motion().state(0)), up="z")
+    motion = track(taken, BODY, subject=SUBJECT, settings=STILL, lag=0.1)
+    assert set(motion.residuals) == {"depth", *COLOUR} and "sensor noise" in motion.provenance
+    states = [BodyState(T, q) for T, q in zip(motion.Ts_world_root, motion.angles, strict=True)]
+    assert error(states) < 0.02
