@@ -37,7 +37,7 @@ class FixedLag:
     ----------
     tracker : Tracker, or what has its `body`, `rate`, `settings`, `scene_of` and `apart`
     lag : float [s] by which frames come later, a frame at least
-    noise : KnownNoise; default: the settings' accelerations, which are those of quick movements
+    noise : KnownNoise; default: `KnownNoise.usual`
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class FixedLag:
         self.seconds = self._lag / rate
         self.rate, self.body = rate, tracker.body
         self._most = self._lag + max(round(_BEFORE * rate), 3)
-        self.noise = noise or KnownNoise.of_settings(self.body, settings)
+        self.noise = noise or KnownNoise.usual(self.body)
         self._memory = round(settings.smooth_memory * rate)
         memory = settings.acceleration_memory, settings.smooth_memory
         tree = self.body.tree

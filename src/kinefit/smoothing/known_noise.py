@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.settings import TrackSettings
+
+_QUICK = 5.0, 30.0  # [m/s²], [rad/s²] of the root and of angles; takes of everyday movements tell 1 to 4 and 4 to 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +32,12 @@ class KnownNoise:
     scale: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of_settings(cls, body: Body, settings: TrackSettings) -> KnownNoise:
-        """The accelerations of the settings, and the sensors as stated."""
-        root, angle = settings.root_acceleration, settings.angle_acceleration
-        return cls(np.where(np.arange(body.tree.n_dofs) < 3, root, angle))
+    def usual(cls, body: Body) -> KnownNoise:
+        """Accelerations of a person who moves quickly, 5 m/s² and 30 rad/s², and the sensors as stated.
+
+        Calm movements have half of them, and are smoothed a little less than they could be.
+        """
+        return cls(np.where(np.arange(body.tree.n_dofs) < 3, *_QUICK))
 
     @classmethod
     def of_take(cls, body: Body, provenance: Mapping[str, Any]) -> KnownNoise:

@@ -24,7 +24,7 @@ from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
-from kinefit.solvers.equations import inverse
+from kinefit.solvers.equations import inverse, product
 from kinefit.solvers.shape import ShapeParameters, shape_parameters
 from kinefit.subject.keypoints import Subject
 
@@ -113,18 +113,20 @@ def lasting(
     J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
     Jq = J[:, :, :n].reshape(-1, n)
     each = np.repeat(weight, 2)
-    H = (Jq * each[:, None]).T @ J.reshape(len(each), J.shape[2])
+    H = product((Jq * each[:, None]).T, J.reshape(len(each), J.shape[2]))
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
     alone = inverse(H[:, :n] + other_information + prior)
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
-    meat = last.T @ last + other_lasting
+    pushes = [last]
     for q, shift in enumerate(noise.shift):
-        mine = np.where(channels.source == q, weight, 0.0)
-        push = np.einsum("k,kin->in", mine, J[:, :, :n]) * shift[:, None]
-        meat += push.T @ push
-    answer = -alone @ H[:, n:]
-    dofs = alone @ meat @ alone
+        mine = channels.source == q
+        pushes.append(product(weight[mine][None], J[mine, :, :n].reshape(-1, 2 * n)).reshape(2, n) * shift[:, None])
+    push = np.concatenate(pushes)
+    meat = product(push.T, push) + other_lasting
+    answer = -product(alone, H[:, n:])
+    dofs = product(product(alone, meat), alone)
     moves, stretch = parameters.joint_moves(theta, state)
-    whole = moves @ answer + stretch
-    joints = np.sum((moves @ dofs) * moves, axis=-1) + np.sum((whole @ Sigma_shape) * whole, axis=-1)
-    return Lasting(dofs + answer @ Sigma_shape @ answer.T, np.maximum(joints, 0.0))
+    whole = product(moves, answer) + stretch
+    joints = np.sum(product(moves, dofs) * moves, axis=-1) + np.sum(product(whole, Sigma_shape) * whole, axis=-1)
+    shape = product(product(answer, Sigma_shape), answer.T)
+    return Lasting(dofs + shape, np.maximum(joints, 0.0))

@@ -170,3 +170,26 @@ def eliminate(H, g, n, damping, chain, depth, S, b, both):
             v += H[n + q, i] * both[p, i]
         b[q] -= v
     return True
+
+
+@jit
+def multiply(A, B, out):
+    """out = A B; zeros of A cost nothing."""
+    for i in range(A.shape[0]):
+        line = out[i]
+        line[:] = 0.0
+        k, last = 0, A.shape[1]
+        while k < last:
+            if A[i, k] == 0.0:
+                k += 1
+            elif k + 3 < last:
+                a, b, c, d = A[i, k], A[i, k + 1], A[i, k + 2], A[i, k + 3]
+                p, q, r, s = B[k], B[k + 1], B[k + 2], B[k + 3]
+                for j in range(line.size):
+                    line[j] += a * p[j] + b * q[j] + c * r[j] + d * s[j]
+                k += 4
+            else:
+                a, p = A[i, k], B[k]
+                for j in range(line.size):
+                    line[j] += a * p[j]
+                k += 1

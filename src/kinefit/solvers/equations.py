@@ -144,6 +144,14 @@ def inverse(matrix: NDArray) -> NDArray:
     return 0.5 * (out + out.T)
 
 
+def product(A: NDArray, B: NDArray) -> NDArray:
+    """A B of small matrices (..., k), (k, m), without threads that would only get in each other's way."""
+    lines = np.ascontiguousarray(A, float).reshape(-1, A.shape[-1])
+    out = np.empty((len(lines), B.shape[1]))
+    _kernels_linear.multiply(lines, np.ascontiguousarray(B, float), out)
+    return out.reshape(*A.shape[:-1], B.shape[1])
+
+
 def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
     """(N, n) how far each row's point moves along its direction with every degree of freedom."""
     if isinstance(rows, DofRows):

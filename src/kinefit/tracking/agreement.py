@@ -33,7 +33,7 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
         The worst first; none where the fit has but one sensor, whose residuals contradict no other. `shift_m` is
         where the sensor has its points, beside where all sensors together have them.
     """
-    chosen = np.unique(np.linspace(0, len(scenes) - 1, min(_LOOKS, len(scenes))).astype(int)) if len(scenes) else []
+    chosen = np.unique(np.linspace(0, max(len(scenes) - 1, 0), min(_LOOKS, len(scenes))).astype(int))
     kept: dict[str, list[Rows]] = {}
     for f in chosen:
         for m in matched[f]:

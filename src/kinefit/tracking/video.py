@@ -48,7 +48,7 @@ def track(
         Instead of smoothing the whole take: each frame as a live session has it so much later (`FixedLag`).
     noise : KnownNoise
         With a lag: process noise and the sensors' noise, as another take told them (`KnownNoise.of_take`); default:
-        the settings' accelerations.
+        `KnownNoise.usual`.
     shape_frames : int, how many frames bone lengths are found from by keypoints of several cameras; default 25.
     progress : called with (what, done, total).
 
