@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.figures import data, quick
+from benchmarks.figures import amount, data, quick
 from kinefit import Motion, read_amc, read_bvh
 from kinefit.simulation import cut, resampled, retarget
 
@@ -32,8 +32,8 @@ MOTIONS: dict[str, tuple[str, str, str | None, float, float | None]] = {
     "zombie walk": ("motion_animateddrawings_bvh", "zombie.bvh", None, 0, 10),
 }
 
-QUICK = ("jump 002_04", "wave")
-"""Those of the quick form."""
+QUICK, LONGEST = ("jump 002_04", "walk 02_01"), amount(None, 90)
+"""Those of the quick form, and how many frames of each."""
 
 
 def library(names: list[str] | None = None) -> dict[str, Motion]:
@@ -50,6 +50,7 @@ def library(names: list[str] | None = None) -> dict[str, Motion]:
             motion = retarget(skeleton)
             whole[folder, file] = resampled(motion, RATE) if motion.rate > RATE else motion
         motion = whole[folder, file]
+        first = round(start * motion.rate)
         last = len(motion) if stop is None else min(len(motion), round(stop * motion.rate))
-        out[name] = cut(motion, round(start * motion.rate), last)
+        out[name] = cut(motion, first, last if LONGEST is None else min(last, first + LONGEST))
     return out

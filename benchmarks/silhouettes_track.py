@@ -28,8 +28,8 @@ SCALE = 0.25  # at which the body and masks are compared
 
 def take_text(folder: Path, kind: str, cameras: Sequence[str] = CAMERAS, keypoints: str = "frames = [0, 1]") -> str:
     """The trial with silhouettes of some cameras, and keypoints of its first frame."""
-    text = f'[take]\nup = "z"\nheight = 1.75\nframes = [0, {FRAMES}]\n[calibration]\nunit = "m"\n'
-    text += f'file = "{folder}/Calib_refined_static.toml"\n'
+    text = f'[take]\nup = "z"\nheight = 1.75\nframes = [0, {FRAMES}]\n'
+    text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
     for camera in cameras:
         boxed = 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
         text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}'
