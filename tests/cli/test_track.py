@@ -67,6 +67,19 @@ def test_in_real_time_nothing_is_smoothed_and_contacts_need_the_whole_take(take,
     assert refused.exit_code == 2 and "--contacts needs the whole take" in refused.stderr
 
 
+def test_a_lag_knows_a_little_of_what_comes_and_stands_alone(take, tmp_path):
+    quiet = "--no-overlays", "--no-report", "--formats", "motion", "--out", tmp_path
+    told = run("track", take, *quiet, "--lag", "0.1")
+    assert told.exit_code == 0
+    motion = kinefit.read_motion(tmp_path / "motion.npz")
+    assert motion.provenance["estimate"] == "fixed lag" and motion.provenance["fixed lag"]["seconds"] == 0.1
+    for other in ("--realtime", "--contacts"):
+        refused = run("track", take, "--lag", "0.1", other)
+        assert refused.exit_code == 2 and other in refused.stderr and "--lag SECONDS" in refused.stderr
+    long = run("track", take, *quiet, "--lag", "5")
+    assert long.exit_code == 1 and "a lag of 5 s for 60 frames" in long.stderr
+
+
 def test_an_unknown_format_is_told_before_anything_is_read():
     told = run("track", "none.toml", "--formats", "bvh,fbx")
     assert told.exit_code == 2

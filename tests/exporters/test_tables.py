@@ -79,6 +79,26 @@ def test_the_quaternion_of_the_root_does_not_change_its_sign():
     assert quaternion[:, 0].min() < -0.9
 
 
+def test_residuals_of_surfaces_are_told_by_segments(tmp_path):
+    motion = smooth_motion(20)
+    r = motion.residuals["cam 1"]
+    shape, random = r.values.shape[:2], np.random.default_rng(0)
+    values, rms = random.normal(0.0, 0.01, (*shape, 1)), random.uniform(0.01, 0.02, shape)
+    values[0, 0] = np.nan
+    surface = replace(
+        r, values=values, measured=np.full_like(values, np.nan), unit="m", rms=rms, count=np.full(shape, 7)
+    )
+    write_csv(replace(motion, residuals={"cam 0": motion.residuals["cam 0"], "depth": surface}), tmp_path)
+    table = read_csv(tmp_path / "residuals.csv")
+    mine = [k for k, sensor in enumerate(table["sensor"]) if sensor == "depth"]
+    assert len(mine) == values.size - 1
+    row = {name: column[mine[0]] for name, column in table.items()}
+    assert (row["frame"], row["point"], row["unit"], float(row["count"])) == ("0", r.names[1], "m", 7.0)
+    assert float(row["residual median [m]"]) == pytest.approx(values[0, 1, 0], rel=1e-4)
+    assert float(row["residual rms [m]"]) == pytest.approx(rms[0, 1], rel=1e-4)
+    assert row["residual u [px]"] == ""
+
+
 def test_names_with_commas_and_no_residuals(tmp_path):
     motion = smooth_motion(3)
     odd = {'cam "a", left': motion.residuals["cam 0"]}

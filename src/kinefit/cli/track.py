@@ -23,6 +23,7 @@ Examples:
   kinefit track my_take/take.toml
   kinefit track take.toml --out results --no-overlays --formats bvh,csv
   kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
+  kinefit track take.toml --lag 0.1     the same a tenth of a second later, which is far smoother
   kinefit track take.toml -v            also how well every point of every camera fits
 """
 
@@ -38,11 +39,15 @@ Examples:
 @click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
 @click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor.")
 @click.option("--realtime", is_flag=True, help="Do not smooth over the whole take.")
+@click.option(
+    "--lag", type=float, metavar="SECONDS",
+    help="Each frame from those before it and so many seconds after it, as a live session has it a little later.",
+)
 @_screen.verbose_option
 @click.pass_context
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
-    contacts: bool, realtime: bool, verbose: bool,
+    contacts: bool, realtime: bool, lag: float | None, verbose: bool,
 ) -> None:
     """Track the person of a take file and write all results.
 
@@ -52,18 +57,21 @@ def track(
     """
     if contacts and realtime:
         raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
+    if lag is not None and (contacts or realtime):
+        other = "--contacts needs the whole take" if contacts else "--realtime knows of no later frame"
+        raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
     wanted = ctx.get_parameter_source("overlays") == click.core.ParameterSource.COMMANDLINE
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
         take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, contacts=contacts,
-        verbose=verbose, wanted=overlays and wanted,
+        lag=lag, verbose=verbose, wanted=overlays and wanted,
     )  # fmt: skip
     ctx.exit(code)
 
 
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
-    contacts: bool = False, verbose: bool = False, wanted: bool = False,
+    contacts: bool = False, lag: float | None = None, verbose: bool = False, wanted: bool = False,
 ) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.cli._agreement import print_agreement
@@ -89,7 +97,7 @@ def run(
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(
-                    take, smooth=smooth, contacts=contacts,
+                    take, smooth=smooth, contacts=contacts, lag=lag,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
                 notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])

@@ -5,7 +5,8 @@
     joints      joint centres [m] with standard deviations along the world's axes
     landmarks   landmarks [m]
     quality     of the frame and of every segment, 0..1
-    residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight
+    residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight; of
+                depth, clouds and silhouettes one a segment: signed median, RMS and number of its residuals
 
 Every table starts with `frame` (from 0) and `time [s]`; metres and the motion's own world unless told otherwise. A
 deviation "inf" means that nothing observed it.
@@ -148,10 +149,10 @@ def _residuals(
         "segment": segments[points],
         "unit": np.full(len(frames), unit),
     }
-    if r.rms is not None and r.count is not None:
-        out[f"median across the surface [{unit}]"] = factor * r.values[frames, points, 0]
-        out[f"rms across the surface [{unit}]"] = factor * r.rms[frames, points]
-        out["measurements"] = r.count[frames, points]
+    if r.rms is not None and r.count is not None:  # of a segment's surface
+        out[f"residual median [{unit}]"] = factor * r.values[frames, points, 0]
+        out[f"residual rms [{unit}]"] = factor * r.rms[frames, points]
+        out["count"] = r.count[frames, points]
     for i, axis in enumerate(() if not r.of_points else ("u", "v") if pixels else ("x", "y", "z")):
         out[f"measured {axis} [{unit}]"] = factor * r.measured[frames, points, i]
         out[f"residual {axis} [{unit}]"] = factor * r.values[frames, points, i]

@@ -74,7 +74,7 @@ def deviations(
     ----------
     covariance : (n, n) posterior, the prior counted once
     observed : (D,) bool, optional
-        Coordinates that the data tell of at all; others are unknown however small their variance is.
+        Coordinates that the data observe at all; others are unknown however small their variance is.
     """
     tree = body.tree
     prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])

@@ -48,7 +48,7 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What a measurement tells of the body where nothing is known of its pose.
+    """What a measurement shows of the body where nothing is known of its pose.
 
     Parameters
     ----------
@@ -98,16 +98,18 @@ class Matched(ABC):
     sensor, time : name of the sensor, and when [s] it measured; those of the measurement where they are not set
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
+    lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
     """
 
     sensor: str = ""
     time: float = np.nan
     of_points: bool = True
     shows_surface: bool = False
+    lasts: float = 0.0
 
     @property
     def key(self) -> bytes:
-        """The same for matches that make the same rows: what tells a fit that nothing discrete changes any more."""
+        """The same for matches that make the same rows: what shows a fit that nothing discrete changes any more."""
         return b""
 
     @abstractmethod
@@ -156,7 +158,7 @@ class Measurement(ABC):
         """Correspondences at a scene's state, within a distance [m]."""
 
     def hints(self, scene: Scene) -> Hints:
-        """What it tells where no pose is known."""
+        """What it shows where no pose is known."""
         return Hints()
 
     def depth_image(self) -> DepthSeen | None:
@@ -251,7 +253,7 @@ def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:
 
 
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
-    """Residuals (N,) of points on segments (N,), told segment by segment."""
+    """Residuals (N,) of points on segments (N,), segment by segment."""
     count = np.bincount(segment, minlength=len(body.tree.segments))
     median, rms = np.full(len(count), np.nan), np.full(len(count), np.nan)
     for s in np.flatnonzero(count):

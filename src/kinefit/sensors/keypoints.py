@@ -51,7 +51,7 @@ class Layout:
 
     @cached_property
     def informs(self) -> NDArray:
-        """(S, N) 0 or 1: channels that tell where a segment is."""
+        """(S, N) 0 or 1: channels that show where a segment is."""
         return informing(self.body, self.channels)
 
     def points_of(self, body: Body) -> PointSet:
@@ -68,13 +68,13 @@ class Layout:
 
 
 class KeypointSensor(Sensor):
-    """The detectors of all cameras of a rig, as one sensor: only together they tell left from right.
+    """The detectors of all cameras of a rig, as one sensor: only together they distinguish left from right.
 
     Parameters
     ----------
     rig : Rig
     sigma : {camera: standard deviation [px] of a keypoint with confidence 1}
-    usual : float [px] that of a camera that none is given for
+    usual : float [px] default, of a camera that none is given for
     loss : Loss of a keypoint, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
     """
@@ -244,7 +244,7 @@ def projected(scene: Scene, layout: Layout) -> NDArray:
 
 
 def informing(body: Body, channels: Channels) -> NDArray:
-    """(S, N) 0 or 1: channels that tell where a segment is: those on it and those at its children's joints.
+    """(S, N) 0 or 1: channels that show where a segment is: those on it and those at its children's joints.
 
     A segment without any is known through its children.
     """

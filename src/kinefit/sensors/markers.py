@@ -17,7 +17,7 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
-_AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
+_AT_JOINT = 0.05  # [m] from a joint: such a point is evidence for the segments on both sides of it
 
 
 class MarkerSensor(Sensor):
@@ -94,6 +94,7 @@ class MarkerMatched(Matched):
 
     measurement: MarkerMeasurement
     loss: Loss
+    lasts = 1.0  # a marker system's own noise is a tenth of what markers are off by: skin, and where they were put on
 
     @property
     def sensor(self) -> str:  # type: ignore[override]

@@ -92,7 +92,7 @@ class Scene:
 
     @property
     def morphing(self) -> Morphing | None:
-        """Of a body whose joints move with its angles; None where the tree alone tells where segments are."""
+        """Of a body whose joints move with its angles; None where the tree alone places the segments."""
         if "morphing" not in self._shared:
             moving = None
             if self.body.morphs:

@@ -20,7 +20,7 @@ from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
-_FEW = 5  # frames of a channel, with fewer of which it tells nothing of what lasts
+_FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
 
 @dataclass(eq=False)
@@ -67,14 +67,14 @@ def other_noise(
     roots, angles : (T, 4, 4), (T, D) fitted
     """
     T, n = len(roots), body.tree.n_dofs
-    pushes: list[list[tuple[str, NDArray]]] = []
+    pushes: list[list[tuple[str, float, NDArray]]] = []
     information, lasting = np.zeros((T, n, n)), np.zeros((T, n, n))
     channels: dict[str, dict[tuple[int, int], _Channel]] = {}
     normal: dict[str, tuple[NDArray, NDArray]] = {}
     shifts: list[list[tuple[str, NDArray]]] = []
     counts: dict[str, list[int]] = {}
     for f in range(T):
-        push, moved = list[tuple[str, NDArray]](), list[tuple[str, NDArray]]()
+        push, moved = list[tuple[str, float, NDArray]](), list[tuple[str, NDArray]]()
         scene = others.scene(f, roots, angles)
         surface: list[Rows] = []
         for m in matched[f]:
@@ -98,7 +98,8 @@ def other_noise(
                         channel = mine.setdefault((part, int(c)), _Channel())
                         channel.values.append(float(w[of] @ rows.residual[of]) / total)
                         channel.expected.append(1.0 / total)
-                        push.append((m.sensor, weighted[of].sum(axis=0)))
+                        stated = float(np.sqrt(m.lasts * np.mean(1.0 / rows.weight[of])))
+                        push.append((m.sensor, stated, weighted[of].sum(axis=0)))
                 if isinstance(rows, Rows):
                     d = rows.direction
                     A, b = normal.get(m.sensor, (np.zeros((3, 3)), np.zeros(3)))
@@ -118,8 +119,8 @@ def other_noise(
         for name, mine in channels.items()
     }
     for f in range(T):
-        for name, s in pushes[f]:
-            lasting[f] += drift[name] ** 2 * np.outer(s, s)
+        for name, stated, s in pushes[f]:
+            lasting[f] += max(drift[name], stated) ** 2 * np.outer(s, s)
         for name, S in shifts[f]:
             moved_by = S * shift[name]
             lasting[f] += moved_by @ moved_by.T

@@ -1,4 +1,4 @@
-"""A whole take at once: every frame fitted together with a motion prior whose process noise the take itself tells."""
+"""A whole take at once: all frames fitted together with a motion prior whose process noise the take determines."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def with_lasting_errors(
     Parameters
     ----------
     results : F neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
-    subject : with the shape that the take told; without one it is taken for exact.
+    subject : with the shape that was estimated from the take; without one it is taken for exact.
     take : the pixels as they were used, and the states
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors

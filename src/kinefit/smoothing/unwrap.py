@@ -29,8 +29,23 @@ def unwrap(tree: KinematicTree, angles: NDArray) -> NDArray:
     return out
 
 
+def continued(tree: KinematicTree, before: NDArray, angles: NDArray) -> NDArray:
+    """The same pose with angles (D,) in the form that is nearest to those of the frame before it (D,)."""
+    out = np.array(angles, float)
+    ball = np.zeros(len(out), bool)
+    for d in tree.ball_joints:
+        ball[d] = True
+        forms = np.stack([out[d], twin(out[d])])
+        forms += _TURN * np.round((before[d] - forms) / _TURN)
+        far = np.abs(forms - before[d]).sum(axis=1)
+        out[d] = forms[int(far[1] < far[0])]
+    free = ~tree.prismatic & ~ball & (tree.upper - tree.lower > _TURN)
+    out[free] += _TURN * np.round((before[free] - out[free]) / _TURN)
+    return out
+
+
 def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Lower and upper ends and usual posture (T, D) in the charts of angles (T, D).
+    """Lower and upper ends and prior mean (T, D) in the charts of angles (T, D).
 
     Limits hold in one chart of a ball joint; where its angles stand in the other, or some turns on, so do these.
     """

@@ -37,6 +37,14 @@ def _add_product(out, i, sign, a, row, start, stop, B, high):
 
 
 @jit
+def product(A, B, out):
+    """out = A B of small matrices, of which lines and what is summed over divide by four; no threads in the way."""
+    out[:] = 0.0
+    for i in range(0, A.shape[0], 4):
+        _add_product(out, i, 1.0, A, i, 0, B.shape[0], B, B.shape[1])
+
+
+@jit
 def _invert_root(A, W):
     """W = L⁻ᵀ (upper triangle, zeros below) of A = L Lᵀ (lower triangle, destroyed). False if not positive."""
     n = W.shape[0]
@@ -101,13 +109,14 @@ def _forward(W, S, t, x):
 
 
 @jit
-def factor_band(C, chain, depth, band, first, width, damping, W, below, x):
+def factor_band(C, chain, depth, band, first, width, damping, start, W, below, x):
     """Factor the system, `damping` added to its diagonal, into W (T, p, p) and below (T, 3 p, p), and solve L z = x.
 
+    start (3 p, 3 p), of which the lower triangle is read, is added to the first three frames; zeros where T < 3.
     x (T, p) is solved in place on the way, while the factor is at hand. False if the system is not positive.
     """
     T, n, p = C.shape[0], C.shape[1], W.shape[1]
-    Z, ST = np.zeros((3 * p, 3 * p)), np.empty((p, 3 * p))
+    Z, ST = start.copy(), np.empty((p, 3 * p))
     for t in range(T):
         S = below[t]
         for k in range(n):

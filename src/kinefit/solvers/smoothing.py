@@ -20,6 +20,7 @@ from kinefit.errors import ObservationError
 from kinefit.solvers import _kernels_band, _kernels_smoothing
 from kinefit.solvers._kernels_linear import adapt
 from kinefit.solvers.equations import dense_pattern
+from kinefit.solvers.marginal import Entering, start_of
 
 _NEVER = 1e12  # of damping, beyond which no step is small enough
 
@@ -109,6 +110,7 @@ class _System:
     g: NDArray
     cost: float
     changes: NDArray
+    entering: Entering | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +174,7 @@ def smooth(
     *,
     bounds: tuple[NDArray, NDArray] | None = None,
     dense: bool = False,
+    entering: Entering | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-5,
 ) -> Smoothed:
@@ -186,6 +189,8 @@ def smooth(
     dense : bool
         The equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower triangle
         is read.
+    entering : Entering
+        What frames before these tell of the first three, of three or more; the first two steps then have their past.
     tolerance : stop when the predicted fall of the cost is below this share of it.
 
     Raises
@@ -197,12 +202,13 @@ def smooth(
     chain, depth = pattern = dense_pattern(tree.n_dofs) if dense else (tree.chain, tree.depth)
     lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
     roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
-    now = _system(body, roots, angles, equations, prior, depth)
+    now = _system(body, roots, angles, equations, prior, depth, entering)
     mean = float(now.C[:, np.arange(tree.n_dofs), depth].mean() + now.band[0, :, :, 0].mean())
     if not np.isfinite(now.cost) or not np.isfinite(mean):
         raise ObservationError("a take that cannot be smoothed", remedy="Are all weights and pixels finite?")
     damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
     W, below, delta = _workspace(len(roots), tree.n_dofs)
+    start = start_of(entering, tree.n_dofs, W.shape[1])
     fresh, converged, tried, any_held = True, False, 0, False
     while tried < max_iterations and not converged:
         if fresh:
@@ -212,11 +218,11 @@ def smooth(
             any_held = bool(held.any())
             if any_held:
                 _kernels_smoothing.hold(held, first, width, chain, depth, now.C, now.band, now.g)
+            if entering is not None:
+                start = start_of(entering, tree.n_dofs, W.shape[1], held[:3])
         tried, fresh = tried + 1, False
         delta[:, : tree.n_dofs] = now.g
-        if not _kernels_band.factor_band(
-            now.C, chain, depth, now.band, first, width, damping, W, below, delta
-        ):
+        if not _kernels_band.factor_band(now.C, chain, depth, now.band, first, width, damping, start, W, below, delta):
             damping, growth = 100.0 * damping, 2.0
             continue
         _kernels_band.back_substitute(W, below, delta)
@@ -225,12 +231,12 @@ def smooth(
         converged = predicted <= tolerance * now.cost + nothing or damping > _NEVER * mean
         new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
         _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
-        new = _system(body, new_roots, new_angles, equations, prior, depth)
+        new = _system(body, new_roots, new_angles, equations, prior, depth, entering)
         damping, growth = adapt(damping, growth, now.cost - new.cost, predicted)
         if new.cost < now.cost:
             fresh, now, roots, angles = True, new, new_roots, new_angles
     if any_held and not fresh:
-        now = _system(body, roots, angles, equations, prior, depth)  # with what was held
+        now = _system(body, roots, angles, equations, prior, depth, entering)  # with what was held
     return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
 
 
@@ -240,7 +246,13 @@ def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _system(
-    body: Body, roots: NDArray, angles: NDArray, equations: MakeEquations, prior: MotionPrior, depth: NDArray
+    body: Body,
+    roots: NDArray,
+    angles: NDArray,
+    equations: MakeEquations,
+    prior: MotionPrior,
+    depth: NDArray,
+    entering: Entering | None = None,
 ) -> _System:
     T, n = len(roots), body.tree.n_dofs
     C, g, cost = equations(roots, angles)
@@ -250,35 +262,44 @@ def _system(
     steps, band = np.empty((max(T - 1, 0), n)), np.zeros((4, T, n, 3))
     _kernels_smoothing.velocities(roots, angles, steps)
     past, weight = prior.rows(len(steps))
+    if entering is not None:
+        weight[:2] = 0.0  # in what enters already
+        cost[0] += entering.add(roots, angles, g)
     total = float(cost.sum()) + _kernels_smoothing.add_motion(steps, past, weight, *blocks(body), band, g)
     changes = steps.copy()
     changes[1:] -= past[1:, :1] * steps[:-1]
     changes[2:] -= past[2:, 1:] * steps[:-2]
-    return _System(C, band, g, total, changes)
+    return _System(C, band, g, total, changes, entering)
 
 
-def posterior(body: Body, smoothed: Smoothed) -> Posterior:
+def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | None = None) -> Posterior:
     """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
 
-    Limits are left out, as they are of a frame's covariance.
+    Limits are left out, as they are of a frame's covariance. Frames before `since` are left out: they stand as NaN.
+    `share` (D,) is the prior's `posture_share`, where it is known already.
     """
     s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
     T, n = s.g.shape
     C = s.C.copy()
-    C[:, np.arange(6, n), depth[6:]] += prior.posture_share - 1.0 / np.square(prior.spread)
+    share = prior.posture_share if share is None else share
+    C[:, np.arange(6, n), depth[6:]] += share - 1.0 / np.square(prior.spread)
     W, below, nothing = _workspace(T, n)
     p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), depth].mean())
-    while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, W, below, nothing):
+    start = start_of(s.entering, n, p, covariance=True)
+    while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, start, W, below, nothing):
         tiny *= 10.0
-    frames, following = np.empty((T, n, n)), np.empty((max(T - 1, 0), n, n))
+    frames, following = np.full((T, n, n), np.nan), np.full((max(T - 1, 0), n, n), np.nan)
     past, _ = prior.rows(max(T - 1, 0))
     variance = np.zeros((max(T - 1, 0), n))
     ahead = np.zeros((4 * p, 4 * p))  # covariance of frames t .. t + 3
-    for t in range(T - 1, -1, -1):
+    fall, cross, both, own = np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((4 * p, p)), np.empty((p, p))
+    for t in range(T - 1, since - 1, -1):
         ahead[p:, p:] = ahead[: 3 * p, : 3 * p].copy()
-        fall = below[t] @ W[t].T
-        cross = -ahead[p:, p:] @ fall
-        own = W[t] @ W[t].T - fall.T @ cross
+        _kernels_band.product(below[t], np.ascontiguousarray(W[t].T), fall)
+        _kernels_band.product(np.ascontiguousarray(ahead[p:, p:]), fall, cross)
+        cross *= -1.0
+        both[:p], both[p:] = W[t].T, cross
+        _kernels_band.product(np.concatenate([W[t], -fall.T], axis=1), both, own)
         ahead[:p, :p], ahead[p:, :p], ahead[:p, p:] = 0.5 * (own + own.T), cross, cross.T
         frames[t] = ahead[:n, :n]
         if t + 1 < T:

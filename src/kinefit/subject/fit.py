@@ -61,9 +61,9 @@ class Subject:
     names, mean : (p,) of the parameters.
     covariance : (p, p) posterior, with the poses unknown and lasting errors counted.
     states : K poses, refined along.
-    information : (p, p) what the sensors tell, without the prior, lasting errors counted.
+    information : (p, p) what the sensors measure, without the prior, lasting errors counted.
     prior : Prior
-    excess : {sensor: factor} by which what its frames tell together is less certain than its rows say.
+    excess : {sensor: factor} by which what its frames measure together is less certain than its rows say.
     unmeasured : directions that the prior alone holds, the least measured first.
     cost : float
     rounds : of match and solve

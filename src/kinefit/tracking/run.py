@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement, leftovers_at
+from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
+from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.recording import Recording
+from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
@@ -37,7 +38,7 @@ class Tracked:
     results: list[FrameResult]
     steps: list[int]
     measurements: list[tuple[Measurement, ...]]
-    leftovers: list[list[Leftover]]
+    leftovers: list[tuple[Leftover, ...]]
     tracker: Tracker
     complete: bool
 
@@ -72,7 +73,7 @@ def run(
         tracker.start_at(state)
     results: dict[int, FrameResult] = {}
     kept: dict[int, tuple[Measurement, ...]] = {}
-    left: dict[int, list[Leftover]] = {}
+    left: dict[int, tuple[Leftover, ...]] = {}
 
     def step(tracker: Tracker, i: int, time: float) -> FrameResult | None:
         frames = list(recording.steps(i))
@@ -83,11 +84,9 @@ def run(
         if found is None:
             return None
         moving = {"measurements": found.measurements, "velocity": tracker.speed}
-        scene = tracker.scene_of(found.state, time).at(found.state, **moving)
-        left[i] = [rest for m in found.matched for rest in leftovers_at(m, scene)]
-        pixels_only = tuple(m for m in found.matched if isinstance(m, KeypointMatched))
-        kept[i] = tuple(m.compact() for m in found.measurements if not isinstance(m, KeypointMeasurement))
-        return replace(found, matched=pixels_only, measurements=())
+        one = KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving))
+        left[i], kept[i] = one.leftovers, one.measurements
+        return one.result
 
     stopped = False
     try:

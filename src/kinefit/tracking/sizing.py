@@ -1,4 +1,4 @@
-"""The body fitted to the person of a recording: first by what tells it from nothing, then by all sensors together."""
+"""The body fitted to the person of a recording: first by what needs no pose, then by all sensors together."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Person:
     channels : the person's keypoints on this body
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
-    told : what there is to tell of it, for `Motion.provenance`
+    told : what there is to report of it, for `Motion.provenance`
     joint : what the fit of all sensors together found
     """
 

@@ -14,6 +14,7 @@ from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import Subject, fit_subject
 from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import Progress, track
@@ -23,16 +24,17 @@ _USUAL = "humanoid"  # body of a take that names none
 
 def track_take(
     take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
-    settings: TrackSettings | None = None, progress: Progress | None = None,
+    lag: float | None = None, noise: KnownNoise | None = None, settings: TrackSettings | None = None,
+    progress: Progress | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file in all that its sensors saw; `smooth` and `contacts` as in `track`.
+    """Track the person of a take file in all that its sensors saw; `smooth`, `contacts`, `lag`, `noise` as in `track`.
 
     Returns the motion and what the sensors saw (for overlays).
 
     Raises
     ------
     TakeError
-        Nothing in the take tells where the person is, or its subject's trial has another body.
+        Nothing in the take shows where the person is, or its subject's trial has another body.
     KinefitError
         What reading and tracking raise.
     """
@@ -42,7 +44,7 @@ def track_take(
     alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines or take.skin
     if take.silhouettes and not alone:
         raise TakeError(
-            "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
+            "silhouettes alone do not show where the body is to begin with", file=take.path, place="[[silhouette]]",
             remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
@@ -59,7 +61,7 @@ def track_take(
     recording, body = recording_of(take, seen, body)
     motion = track(
         recording, body, trial=trial_of(take), height=take.height, size=take.start is None, smooth=smooth,
-        contacts=contacts, settings=settings, progress=progress,
+        contacts=contacts, lag=lag, noise=noise, settings=settings, progress=progress,
     )  # fmt: skip
     return motion, seen
 

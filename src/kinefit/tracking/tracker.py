@@ -18,13 +18,17 @@ from kinefit.frame.prediction import Prediction
 from kinefit.frame.results import FrameResult
 from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.subject.keypoints import Subject
+from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recovery import Recovery
+from kinefit.tracking.session import Session, axis_of
 
 __all__ = ["FrameResult", "TrackSettings", "Tracker"]
 
@@ -44,6 +48,7 @@ class Tracker:
     settings : TrackSettings
     sensors : of one's own (`kinefit.sensors.base`); the built-in kinds need not be named.
     values : {sensor: {name: value}} of the sensors' own unknowns, as a subject fit estimated them.
+    keep : whether results and measurements are kept, without whole images, for `motion`: some kB a frame.
 
     Attributes
     ----------
@@ -55,6 +60,7 @@ class Tracker:
         self, body: Body, rig: Rig, *, rate: float = 30.0, accuracy: Mapping[str, float] | None = None,
         up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: TrackSettings | None = None,
         sensors: Sequence[Sensor] = (), values: Mapping[str, Mapping[str, float]] | None = None,
+        keep: bool = False,
     ) -> None:  # fmt: skip
         if not 0.0 < rate < np.inf:
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
@@ -70,6 +76,7 @@ class Tracker:
         self._last: FrameResult | None = None
         self._time: float | None = None
         self._direction = 1.0  # of time
+        self._session = Session(rate) if keep else None
         self._wear(body)
 
     def _wear(self, body: Body) -> None:
@@ -141,6 +148,37 @@ class Tracker:
             std = carry_dofs(before.std, old, body, missing=np.inf)
             self._prediction.go_on(state, std, carry_dofs(before.velocity, old, body))
         self._last = None
+        if self._session is not None:
+            self._session.clear()
+
+    def motion(self, *, smooth: bool = True, contacts: bool = False, name: str = "motion") -> Motion:
+        """The session so far as a motion, from the first frame in which the body was found; steps dropped are bridged.
+
+        After `change_body`, or where the clock was set back, it begins there. The body's lengths are taken for exact.
+
+        Parameters
+        ----------
+        smooth, contacts : as of `track`
+        name : of the motion
+
+        Raises
+        ------
+        ObservationError
+            A tracker that keeps nothing, or has found nothing; contacts without smoothing.
+        """
+        if self._session is None:
+            raise ObservationError("this tracker keeps no frames", remedy="Make it with keep=True.")
+        if not len(self._session):
+            remedy = "Update it until it gives a result, or give it a start with start_at."
+            raise ObservationError("a session in which the body was not found", remedy=remedy)
+        if contacts and not smooth:
+            raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
+        frames = self._session.frames(self.body, self.rig, self.scene_of, self.apart)
+        subject = Subject(self.body, np.ones(len(self.body.scale_groups)))
+        told = {"frames": {"dropped": self.dropped, "late": self.late}}
+        return motion_of(
+            frames, subject, self.settings, smooth=smooth, contacts=contacts, up=axis_of(self.up), name=name, told=told
+        )
 
     def update(
         self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = ()
@@ -202,6 +240,8 @@ class Tracker:
                 if sensor is not None:
                     with named(m.sensor):
                         sensor.learn(m, scene, not result.lost.any())
+            if self._session is not None:
+                self._session.add(result, scene)
         return result
 
     def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:

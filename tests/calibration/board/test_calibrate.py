@@ -368,7 +368,7 @@ def test_cameras_out_of_files_and_folders(tmp_path):
     assert list(camera_sources([tmp_path / "deep"])) == ["a", "b"]
     assert list(camera_sources([tmp_path / "one"])["one"]) == [1, 2]
     assert list(camera_sources([tmp_path / "videos"])) == ["cam1"]
-    with pytest.raises(FileError, match="no video and no picture"):
+    with pytest.raises(FileError, match="no video and no image"):
         camera_sources([tmp_path / "empty"])
     with pytest.raises(FileError, match="no such file"):
         camera_sources([tmp_path / "none"])
@@ -405,7 +405,7 @@ def test_wrong_board_broken_and_mixed_pictures(tmp_path):
     with pytest.raises(CalibrationError, match=r"2\.png: has 1280x300 px"):
         find_boards(camera_sources([tmp_path / "mixed"]), CHARUCO)
     (tmp_path / "mixed" / "2.png").write_bytes(b"no picture")
-    with pytest.raises(FileError, match=r"2\.png: not a picture"):
+    with pytest.raises(FileError, match=r"2\.png: not an image"):
         find_boards(camera_sources([tmp_path / "mixed"]), CHARUCO)
 
 
@@ -437,7 +437,7 @@ def test_a_board_reads_back(text):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda seen: {**seen, "cam1": CameraViews(SIZE, seen["cam1"].views[:2])}, "camera cam1: .*in 2 pictures"),
+        (lambda seen: {**seen, "cam1": CameraViews(SIZE, seen["cam1"].views[:2])}, "camera cam1: .*in 2 images"),
         (lambda seen: {**seen, "cam1": shuffled(seen["cam1"])}, "do not agree.*same times"),
     ],
 )
@@ -475,12 +475,12 @@ def test_floor_and_interiors_that_do_not_fit():
     flipped[0] = se3.transform(np.diag([1.0, -1, -1]), np.array([-0.2, -0.1, 0.0]))  # face down: its back is seen
     with pytest.raises(CalibrationError, match="in frame 0 the board's face points away from cam0, cam1"):
         calibrate_board(looked(rig, CHECKER, flipped), CHECKER, interiors=rig, floor=0)
-    with pytest.raises(CalibrationError, match="no interior of camera 'cam1'; there are: cam0"):
+    with pytest.raises(CalibrationError, match="no intrinsics of camera 'cam1'; there are: cam0"):
         calibrate_board(seen, CHECKER, interiors=rig.select(("cam0",)))
-    with pytest.raises(CalibrationError, match="cam0: its picture has 1280x720 px, its interior is of 640x360"):
+    with pytest.raises(CalibrationError, match="cam0: its image has 1280x720 px, its intrinsics are of 640x360"):
         calibrate_board(seen, CHECKER, interiors=Rig(tuple(camera.scaled((640, 360)) for camera in rig)))
     squeezed = {name: CameraViews(SIZE, tuple(bent(view) for view in views.views)) for name, views in seen.items()}
-    with pytest.raises(CalibrationError, match="no view of the board fits its interior|do not agree"):
+    with pytest.raises(CalibrationError, match="no view of the board fits its intrinsics|do not agree"):
         calibrate_board(squeezed, CHECKER, interiors=rig)
     with pytest.raises(CalibrationError, match="no camera"):
         calibrate_board({}, CHECKER)

@@ -159,8 +159,8 @@ def camera(**changes):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"matrix": np.array([[64e3, 0, 639.5], [0, 64e3, 359.5], [0, 0, 1]])}, "no usual lens"),
-        ({"matrix": np.array([[200.0, 0, 639.5], [0, 200.0, 359.5], [0, 0, 1]])}, "no usual lens"),
+        ({"matrix": np.array([[64e3, 0, 639.5], [0, 64e3, 359.5], [0, 0, 1]])}, "no common lens"),
+        ({"matrix": np.array([[200.0, 0, 639.5], [0, 200.0, 359.5], [0, 0, 1]])}, "no common lens"),
         ({"matrix": np.array([[1000.0, 0, 639.5], [0, 1300.0, 359.5], [0, 0, 1]])}, "not be square"),
         ({"matrix": np.array([[1000.0, 0, 200.0], [0, 1000.0, 359.5], [0, 0, 1]])}, "principal point"),
         ({"distortion": np.array([-1.5, 0, 0, 0])}, "folds back"),

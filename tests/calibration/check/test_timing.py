@@ -68,7 +68,7 @@ def test_a_person_who_stands_still_tells_no_offset():
     assert np.isnan(found.offsets).all()
     assert np.isinf(found.std).all()
     check = check_keypoints(RIG, still)
-    assert "cannot be told" in next(f.text for f in check.findings if f.kind == "time")
+    assert "cannot be determined" in next(f.text for f in check.findings if f.kind == "time")
     assert not check.faults
 
 

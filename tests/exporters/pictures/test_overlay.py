@@ -137,5 +137,5 @@ def test_montage_puts_pictures_side_by_side(tmp_path):
     back = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     assert back.shape == (80, 40 + 10 + 60, 3)
     assert (back[5, 5] == (255, 0, 0)).all() and (back[5, 45] == 255).all() and (back[5, 100] == (0, 0, 255)).all()
-    with pytest.raises(ExportError, match="no pictures"):
+    with pytest.raises(ExportError, match="no images"):
         write_montage({}, tmp_path / "b.png")

@@ -132,7 +132,7 @@ def test_frames_that_fit_worse_than_the_others_are_named_with_their_camera():
     motion = changed_residuals(good_motion(), "cam2", slice(33, 36), slice(None), values=20.0)
     (moment,) = doubtful_moments(motion)
     assert (moment.start, moment.stop) == (33, 36)
-    assert re.fullmatch(r"The body lies 28 px beside what cam2 saw \(usually \d\)\.", moment.what[0])
+    assert re.fullmatch(r"The body lies 28 px beside what cam2 saw \(its median is \d\)\.", moment.what[0])
 
 
 def test_what_happens_at_once_is_one_moment_and_near_ones_are_joined():
@@ -377,7 +377,8 @@ def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
     }  # fmt: skip
     text = " ".join(methods_sentences(replace(motion, provenance=told), 3))
     for part in (
-        "kinefit 9.9", "(openpose BODY_25B)", "a stated accuracy of 8 px", "calib.toml (SHA-256 abababababababab…)",
+        "kinefit 9.9", "(openpose BODY_25B)", "a stated standard deviation of 8 px",
+        "calib.toml (SHA-256 abababababababab…)",
         "window 500", "every keypoint (median 4.5 px) was estimated", "poor 0.5", "3 moments were",
     ):  # fmt: skip
         assert part in text, part

@@ -34,11 +34,11 @@ class CameraReport:
     own_rms_px : float [px]
         The same, the board being where this view has it: what lens and detector leave.
     views, used : int
-        Pictures in which the board was found, and of these the ones that the interior was found from.
+        Images in which the board was found, and of these the ones that the intrinsics were found from.
     coverage : float
-        Share of the picture (cells of an 8 x 8 grid) in which corners were seen.
+        Share of the image (cells of an 8 x 8 grid) in which corners were seen.
     focal_std_px, position_std : float [px], [m]
-        Standard deviations; 0 for what was given or defines the world, infinite where nothing tells.
+        Standard deviations; 0 for what was given or defines the world, infinite where nothing observes it.
     """
 
     rms_px: float
@@ -61,7 +61,7 @@ class BoardCalibration:
     cameras : {camera: CameraReport}
     rms_px, own_rms_px : float [px], as in `CameraReport`, over all cameras.
     shared : {(camera, camera): int}
-        Frames in which both see the board and agree; empty where only interiors were wanted.
+        Frames in which both see the board and agree; empty where only intrinsics were wanted.
     jitter : (float [m], float [rad])
         How far a view's board was from its place in the frame: what cameras out of step, or a bent board, do.
     world : str
@@ -109,7 +109,7 @@ def calibrate_board(
         Frame in which the board lies on the floor, face up: origin in its first inner corner, x along its rows, z up.
         Without, the world is the first camera's frame.
     exteriors : bool
-        False: interiors alone; the cameras need not see the board together, and stand at the origin.
+        False: intrinsics alone; the cameras need not see the board together, and stand at the origin.
 
     Raises
     ------
@@ -141,14 +141,15 @@ def calibrate_board(
 def _given(interiors: Rig, name: str, views: CameraViews) -> Camera:
     if name not in interiors:
         raise CalibrationError(
-            choices("interior of camera", name, interiors.names), remedy="Name the videos as the cameras."
+            choices("intrinsics of camera", name, interiors.names), remedy="Name the videos as the cameras."
         )
     camera = interiors[name].with_pose(np.eye(4))
     if camera.size != views.size:
         raise CalibrationError(
-            f"its picture has {views.size[0]}x{views.size[1]} px, its interior is of {camera.size[0]}x{camera.size[1]}",
+            f"its image has {views.size[0]}x{views.size[1]} px, "
+            f"its intrinsics are of {camera.size[0]}x{camera.size[1]}",
             place=f"camera {name}",
-            remedy="Calibrate the interior anew, or record as it was calibrated.",
+            remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
         )
     return camera
 
@@ -157,7 +158,7 @@ def _interiors_only(
     board: Board, seen: Mapping[str, CameraViews], cameras: dict[str, Camera], single: dict[str, Interiors]
 ) -> BoardCalibration:
     if not single:
-        raise CalibrationError("interiors are given and exteriors not wanted", remedy="Leave out one of the two.")
+        raise CalibrationError("intrinsics are given and extrinsics not wanted", remedy="Leave out one of the two.")
     reports = {
         name: CameraReport(
             one.rms_px, one.rms_px, len(seen[name].views), len(one.frames), one.coverage, one.focal_std, np.inf
@@ -174,7 +175,7 @@ def _in_world(bundle: BoardBundle, placed: Placed, floor: int | None, board: Boa
     first = bundle.rig.names[0]
     if floor is None:
         return bundle.rig, (
-            f"The world is the frame of {first} (x right, y down, z forward in its picture): its -y points up if "
+            f"The world is the frame of {first} (x right, y down, z forward in its image): its -y points up if "
             f"{first} was level. Give the frame in which the board lies on the floor to have z up."
         )
     if floor not in placed.frames:
@@ -222,7 +223,7 @@ def _advice(
             out.append(f"{camera.name}: {report.views} views; record {_ENOUGH_VIEWS} or more, turned to all sides.")
         if report.focal_std_px and report.coverage < _ENOUGH_COVERED:
             out.append(
-                f"{camera.name}: the board covered {100 * report.coverage:.0f} % of the picture; bring it near, and "
+                f"{camera.name}: the board covered {100 * report.coverage:.0f} % of the image; bring it near, and "
                 "into the corners: the distortion there is a guess."
             )
         if report.focal_std_px > _SURE * camera.matrix[0, 0]:

@@ -165,7 +165,7 @@ def _refuse(names: list[str], placed: set[str], shared: Mapping[tuple[str, str],
         raise CalibrationError(
             f"{a} and {b} see the board in {n} common frames, which do not agree on where they stand",
             place=f"cameras {group} against {', '.join(rest)}",
-            remedy="Are their frames taken at the same times, and the pictures not mirrored? Give synchronised videos.",
+            remedy="Are their frames taken at the same times, and the images not mirrored? Give synchronised videos.",
         )
     raise CalibrationError(
         f"no frame in which one of {group} and one of {', '.join(rest)} see the board",
@@ -202,9 +202,9 @@ def _place_boards(
     if len({c for c, *_ in columns}) < len(rig):
         without = [camera.name for c, camera in enumerate(rig) if c not in {c for c, *_ in columns}]
         raise CalibrationError(
-            "no view of the board fits its interior",
+            "no view of the board fits its intrinsics",
             place=f"camera {', '.join(without)}",
-            remedy="Check the given interiors and the board's size, or calibrate the interiors too.",
+            remedy="Check the given intrinsics and the board's size, or calibrate the intrinsics too.",
         )
     camera = np.concatenate([np.full(len(uv), c) for c, _, _, uv in columns])
     index = np.concatenate([np.full(len(uv), f) for _, f, _, uv in columns])

@@ -56,9 +56,9 @@ def calibrate_interiors(name: str, seen: CameraViews, board: Board) -> Interiors
     views = _spread([view for view in seen.views if len(view.ids) >= 8 or len(board.corners) < 8], seen.size)
     if len(views) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"the board is seen in {len(views)} pictures that show enough of it",
+            f"the board is seen in {len(views)} images that show enough of it",
             place=place,
-            remedy=f"Record {FEWEST_VIEWS} or better 20 views, turned by 20 to 45 degrees, over the whole picture.",
+            remedy=f"Record {FEWEST_VIEWS} or better 20 views, turned by 20 to 45 degrees, over the whole image.",
         )
     flags = _flags(views, seen.size)
     while True:

@@ -48,13 +48,13 @@ class Pictures:
         data = np.fromfile(self.files[frame], np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
         if image is None:
-            raise FileError("not a picture that can be read", file=self.files[frame], remedy="Remove or replace it.")
+            raise FileError("not an image that can be read", file=self.files[frame], remedy="Remove or replace it.")
         size = (image.shape[1], image.shape[0])
         if getattr(self, "size", size) != size:
             raise CalibrationError(
-                f"has {size[0]}x{size[1]} px, the pictures before it {self.size[0]}x{self.size[1]}",
+                f"has {size[0]}x{size[1]} px, the images before it {self.size[0]}x{self.size[1]}",
                 file=self.files[frame],
-                remedy="Calibrate pictures of one size; sort the others out.",
+                remedy="Calibrate images of one size; sort the others out.",
             )
         return image
 
@@ -95,7 +95,7 @@ def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dic
             add(path.stem, path, path)
             continue
         if not path.is_dir():
-            raise FileError("no such file or folder", file=path, remedy="Give videos, or folders of pictures.")
+            raise FileError("no such file or folder", file=path, remedy="Give videos, or folders of images.")
         inside = sorted(path.iterdir())
         videos = [file for file in inside if file.suffix.lower() in _VIDEOS]
         pictures = [file for file in inside if file.suffix.lower() in _PICTURES]
@@ -112,7 +112,7 @@ def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dic
                     add(name, dict(enumerate(listed)), path)
         if not (videos or pictures or any(folders.values())):
             raise FileError(
-                "no video and no picture in it", file=path, remedy=f"Known are {', '.join(_VIDEOS + _PICTURES)}."
+                "no video and no image in it", file=path, remedy=f"Known are {', '.join(_VIDEOS + _PICTURES)}."
             )
     return found
 
@@ -223,7 +223,7 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | _Fr
     raise CalibrationError(
         f"no board {board} is seen; {found}",
         place=place,
-        remedy=f"Check columns and rows (of {size}) and that the pictures are sharp and the board whole.",
+        remedy=f"Check columns and rows (of {size}) and that the images are sharp and the board whole.",
     )
 
 

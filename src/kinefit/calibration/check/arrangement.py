@@ -101,15 +101,15 @@ def _trials(rig: Rig, uv: NDArray) -> Iterator[tuple[Mistake, Rig, NDArray]]:
         yield mistake("poses", text), Rig(tuple(c.with_pose(change(c.T_camera_world)) for c in rig)), uv
     each = tuple(range(len(rig)))
     for axis, way in ((1, "upside down (or the world is left-handed)"), (0, "left to right (or the world is)")):
-        yield mistake("mirrored", f"all pictures are mirrored {way}"), rig, _mirrored(rig.cameras, uv, each, (axis,))
+        yield mistake("mirrored", f"all images are mirrored {way}"), rig, _mirrored(rig.cameras, uv, each, (axis,))
     for c, name in enumerate(rig.names):
         yield (
-            mistake("turned", f"{name}'s picture stands upside down", (name,)),
+            mistake("turned", f"{name}'s image stands upside down", (name,)),
             rig,
             _mirrored(rig.cameras, uv, (c,), (0, 1)),
         )
         yield (
-            mistake("mirrored", f"{name}'s picture is mirrored left to right", (name,)),
+            mistake("mirrored", f"{name}'s image is mirrored left to right", (name,)),
             rig,
             _mirrored(rig.cameras, uv, (c,), (0,)),
         )
@@ -199,7 +199,7 @@ def _another_session(views: Views, misses: NDArray) -> Finding:
     )
     return Finding(
         "fault", "session", f"The cameras do not agree on where the person is: {told}.", (),
-        "Sure that something is wrong; exchanged cameras, inverted poses and mirrored pictures were tried.",
+        "Sure that something is wrong; exchanged cameras, inverted poses and mirrored images were tried.",
         "The calibration is of another session or of other cameras, or the keypoints are of different people: name the "
         "calibration made with these cameras as they stood, or calibrate anew (kinefit calibrate people or board).",
     )  # fmt: skip
@@ -217,7 +217,7 @@ def _undo(mistake: Mistake, take_file: str) -> str:
         return "Export the calibration with poses from world to camera, x right, y down, z ahead (OpenCV's convention)."
     if mistake.kind == "turned":
         return f'Write rotation = 180 into [[camera]] {mistake.cameras[0]}; its keypoints are then frame = "video".'
-    who = f"{mistake.cameras[0]} was" if mistake.cameras else "the pictures were"
+    who = f"{mistake.cameras[0]} was" if mistake.cameras else "the images were"
     return (
         f"If {who} recorded mirrored, mirror the video back (ffmpeg -i IN -vf hflip OUT) and detect anew; if the "
         "calibration comes from a left-handed world (Unity, Unreal), export it right-handed."

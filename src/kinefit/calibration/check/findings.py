@@ -27,7 +27,7 @@ class Finding:
     confidence : str
         How sure that is, and why; empty where the text is a plain fact.
     remedy : str
-        What would mend it: the line to write, the command to run; empty where nothing need be done.
+        What would fix it: the line to write, the command to run; empty where nothing need be done.
     """
 
     severity: Severity

@@ -39,7 +39,7 @@ def frame_findings(
     if not fits:
         return [], views
     right = "calibration" if told[fits[0]] == "video" else "video"
-    text = f"The keypoints of {listed(fits)} are not in the {told[fits[0]]}'s picture, but in the {right}'s."
+    text = f"The keypoints of {listed(fits)} are not in the {told[fits[0]]}'s image, but in the {right}'s."
     sure = f"Sure: the cameras' mean error falls to {100 * least / before:.0f} %."
     remedy = f'Write frame = "{right}" into [[keypoints]] of {listed(fits)}.'
     return [Finding("fault", "frame", text, tuple(fits), sure, remedy)], best

@@ -128,7 +128,7 @@ def _fitting_picture(entry: CameraEntry, rig: Rig, findings: list[Finding]) -> C
     with_bars = f"{sizes}, with bars of {max(expected):.1f} px {where}"
     if size == turned:
         if bars > _BARS * max(size):
-            remedy = "Nothing, if it was calibrated with the bars; else calibrate on the same pictures."
+            remedy = "Nothing, if it was calibrated with the bars; else calibrate on the same images."
             say("doubt", "picture", f"has black bars of {bars} px, though its video has the calibration's size", remedy)
     elif entry.image == "letterboxed" and boxed:
         say("note", "letterboxed", f"is letterboxed against the calibration, as the take says: {with_bars}")
@@ -144,7 +144,7 @@ def _fitting_picture(entry: CameraEntry, rig: Rig, findings: list[Finding]) -> C
     elif told:
         is_boxed = "image" in told and told["image"].value == "letterboxed"
         lines = [f'{k} = "{v.value}"' if isinstance(v.value, str) else f"{k} = {v.value}" for k, v in told.items()]
-        what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another picture: {sizes}"
+        what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another image: {sizes}"
         sure = "; ".join(f"{v.sure.capitalize()}: {v.why}" for v in told.values()) + "."
         remedy = f"Write {' and '.join(lines)} into [[camera]] {name}."
         say("fault", "letterboxed" if is_boxed else "picture", f"{what}; the take does not say so", remedy, sure)
@@ -167,7 +167,7 @@ def _framed_keypoints(take: Take, rig: Rig, findings: list[Finding]) -> Take:
         differs = entry.image != "as calibrated" or entry.rotation != 0
         if source.frame is None and differs and source.format != "detect":
             text = (
-                f"It is not told in which picture the keypoints of {source.camera} are: the video's, the calibration's?"
+                f"It is not stated in which image the keypoints of {source.camera} are: the video's, the calibration's?"
             )
             remedy = 'Write frame = "video" (as taken here) or frame = "calibration" into its [[keypoints]].'
             findings.append(Finding("doubt", "frame", text, (source.camera,), remedy=remedy))

@@ -28,7 +28,7 @@ _FEET = ("Ankle", "Heel", "BigToe", "SmallToe", "ankle", "heel", "foot_index")
 def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> list[Finding]:
     """Whether `up` points up, the floor lies under the feet, and left is left: x (F, K, 3) [m] points of the person."""
     axis, person, cameras = np.array(UP_AXES[up]), up_of_person(x, names), up_of_cameras(rig)
-    ways = {"the cameras' pictures": cameras} | ({} if person is None else {"the person's head and feet": person})
+    ways = {"the cameras' images": cameras} | ({} if person is None else {"the person's head and feet": person})
     angles = {why: float(np.degrees(np.arccos(np.clip(way @ axis, -1, 1)))) for why, way in ways.items()}
     wrong = [why for why, angle in angles.items() if angle > _WRONG]
     if len(wrong) == len(angles):
@@ -42,7 +42,7 @@ def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> lis
         out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), sure, remedy)]
         axis = np.array(UP_AXES[right])
     elif wrong:
-        told = " and ".join(f"{why} tell {nearest_axis(ways[why])[0]}" for why in wrong)
+        told = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
         remedy = "Look whether the person lies, or a camera stands on its side."
         out = [Finding("doubt", "up", f'up = "{up}" is not sure: {told}.', remedy=remedy)]
     elif min(angles.values()) > _LEANING:
@@ -88,7 +88,7 @@ def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
         return []
     text = "Left and right are exchanged: the person's face and toes point backwards."
     sure = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames."
-    remedy = "The world is mirrored (a left-handed calibration, mirrored pictures), or the detector's names are."
+    remedy = "The world is mirrored (a left-handed calibration, mirrored images), or the detector's names are."
     return [Finding("fault", "mirrored", text, (), sure, remedy)]
 
 
@@ -122,7 +122,7 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     stated : float [m] as the take says.
     """
     if height is None:
-        return [Finding("note", "scale", "Too few bones are seen to tell the person's size.")]
+        return [Finding("note", "scale", "Too few bones are seen to estimate the person's size.")]
     if not _TALL[0] <= height <= _TALL[1]:
         unit = min(_UNITS, key=lambda u: abs(np.log(height / 1.75 / _UNITS[u])))
         fits = abs(np.log(height / 1.75 / _UNITS[unit])) < 0.4

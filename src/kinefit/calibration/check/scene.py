@@ -82,16 +82,16 @@ def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
     size, centre, view = np.array(camera.size), camera.matrix[:2, 2], _view(camera)
     again, out = "Calibrate its lens anew, or check the image size in the calibration.", []
     if not _VIEW[0] <= view <= (_VIEW[1] if camera.model != "fisheye" else 220.0):
-        out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is no usual lens", again))
+        out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is no common lens", again))
     if abs(np.log(fx / fy)) > _SQUARE:
         out.append(
-            (f"its pixels would not be square (fx {fx:.0f}, fy {fy:.0f} px)", "Was its picture stretched? " + again)
+            (f"its pixels would not be square (fx {fx:.0f}, fy {fy:.0f} px)", "Was its image stretched? " + again)
         )
     off = np.abs(centre - 0.5 * (size - 1)) / size
     if np.any(off > _MIDDLE):
         where = f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} px"
         out.append(
-            (f"its principal point {where} is far from the middle", "Was its picture cropped or turned? " + again)
+            (f"its principal point {where} is far from the middle", "Was its image cropped or turned? " + again)
         )
     edge = np.linspace(0.0, 1.0, 9)
     rim = np.array([(a, b) for a in edge for b in edge if a in (0, 1) or b in (0, 1)]) * (size - 1)
@@ -99,7 +99,7 @@ def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
         rays = camera.ray(rim)
     lost = ~np.isfinite(rays).all(-1)
     if lost.any():
-        share = f"{100 * lost.mean():.0f} % of the picture's rim"
+        share = f"{100 * lost.mean():.0f} % of the image's border"
         out.append(
             (f"its distortion folds back: no ray reaches {share}", "Calibrate it with boards up to the corners.")
         )
@@ -124,12 +124,12 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
             continue
         how = "stand beside each other" if angle < _BESIDE else "stand opposite each other"
         gap = f"{angle:.0f} degrees and {np.linalg.norm(centres[a] - centres[b]):.2f} m apart"
-        text = f"{listed(names)} {how} ({gap}): these two alone do not tell how far away a point is"
+        text = f"{listed(names)} {how} ({gap}): these two alone do not show how far away a point is"
         if enough:
             out.append(Finding("note", "placement", f"{text}; others do.", names))
         else:
             remedy = "Put one of them 60 to 120 degrees round the person."
-            out.append(Finding("doubt", "placement", f"{text}, and no others tell it well.", names, remedy=remedy))
+            out.append(Finding("doubt", "placement", f"{text}, and no others show it well.", names, remedy=remedy))
     if across:
         best = max(across, key=lambda v: min(v, 180 - v))
         severity: Severity = "good" if enough else "doubt"

@@ -34,11 +34,11 @@ class TimeOffsets:
     ----------
     cameras : (C,) names
     offsets : (C,) [s]
-        To be added to each camera's `time_offset` in the take: positive for a camera that began later than was told.
+        To be added to each camera's `time_offset` in the take: positive for a camera that began later than was stated.
         Their median is zero, as nobody can see what all share (of two cameras the first is taken to be right). NaN
-        where nothing tells it.
+        where nothing shows it.
     std : (C,) [s]
-        Standard error, from the scatter over time; infinite where nothing tells it.
+        Standard error, from the scatter over time; infinite where nothing shows it.
     rate : float [Hz]
     curves : {(camera, camera): (shifts (S,) [frames], cost (S,) [px])}
         How well the rays of two cameras meet when the second is taken so many frames later.

@@ -44,7 +44,7 @@ def bias_findings(
             out += _one_bias(b, accuracy.get(b.camera, _ACCURACY), take)
         if b.outliers > _OUTLIERS:
             text = f"{100 * b.outliers:.0f} % of {b.camera}'s points agree with no other camera."
-            remedy = "Look at its keypoints (the picture below): another person, a poster, or exchanged sides?"
+            remedy = "Look at its keypoints (the image below): another person, a poster, or exchanged sides?"
             out.append(Finding("doubt", "outliers", text, (b.camera,), remedy=remedy))
     sizes = [b.size for b in biases if np.isfinite(b.size)]
     if parts is not None:
@@ -79,7 +79,7 @@ def _one_bias(b: CameraBias, accuracy: float, take: str) -> list[Finding]:
     )
     words = "Sure" if significance > 2 * _SURE else "Likely" if significance >= _SURE else "Not sure"
     sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
-    how = f"{sure}; more than the keypoints' accuracy ({accuracy:g} px)." if severity == "fault" else f"{sure}."
+    how = f"{sure}; more than the keypoints' deviation ({accuracy:g} px)." if severity == "fault" else f"{sure}."
     return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, f"Run: kinefit check {take} --refine")]
 
 
@@ -144,12 +144,12 @@ def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: 
     out: list[Finding] = []
     known = np.isfinite(times.offsets) & (times.std * times.rate < _UNSURE)
     if not known.any():
-        text = "Whether the cameras are in step cannot be told: too little motion that several cameras see."
+        text = "Whether the cameras are in step cannot be determined: too little motion that several cameras see."
         return [Finding("note", "time", text, remedy="Clap, jump or swing the arms once at the start of a recording.")]
     unsure = [name for name, fine in zip(times.cameras, known, strict=True) if not fine]
     if unsure:
         verb = "is" if len(unsure) == 1 else "are"
-        text = f"Whether {listed(unsure)} {verb} in step cannot be told: too little motion."
+        text = f"Whether {listed(unsure)} {verb} in step cannot be determined: too little motion."
         out.append(Finding("note", "time", text, tuple(unsure)))
     for c in np.flatnonzero(known):
         name, late, std = times.cameras[c], times.frames[c], times.std[c] * times.rate
@@ -179,7 +179,7 @@ def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: 
 def side_findings(views: Views) -> list[Finding]:
     """Where the detector took left for right."""
     if len(views.rig) < 3:
-        return [Finding("note", "sides", "With two cameras nobody can tell which of them takes left for right.")]
+        return [Finding("note", "sides", "With two cameras it is undecided which of them takes left for right.")]
     found = {name: np.flatnonzero(views.swapped[:, c]) for c, name in enumerate(views.rig.names)}
     found = {name: frames for name, frames in found.items() if len(frames)}
     if not found:
@@ -188,7 +188,7 @@ def side_findings(views: Views) -> list[Finding]:
     most = max(found, key=lambda name: len(found[name]))
     often = len(found[most]) > 0.5 * len(views)
     remedy = (
-        f"Is the picture of {most} mirrored?" if often else "Nothing: tracking puts it right from the other cameras."
+        f"Is the image of {most} mirrored?" if often else "Nothing: tracking puts it right from the other cameras."
     )
     text = f"The detector took left for right in {listed(told)}."
     sure = "Sure: exchanged, they fit the other cameras."

@@ -43,7 +43,7 @@ def calibrate_people(
     accuracy: float = 8.0,
     progress: Progress | None = None,
 ) -> Refinement:
-    """Poses of cameras whose interiors are known, from a person who moves in front of them.
+    """Poses of cameras whose intrinsics are known, from a person who moves in front of them.
 
     Essential matrices choose the pair to start from; the other cameras are laid on its points (see `first_rig`); free
     points, then the body with its constant bone lengths, are adjusted together with all cameras.
@@ -174,7 +174,7 @@ def _on_the_floor(
     """The rig with floor, origin and scale by the rule, and the rule."""
     body = seen.motion.body
     factor = sum(generic.segment_lengths().values()) / sum(body.segment_lengths().values())
-    rule = "the scale is that of a person of usual proportions (a few per cent unsure: give a height or a length)"
+    rule = "the scale is that of a person of mean proportions (a few per cent unsure: give a height or a length)"
     if known_length is not None:
         a, b, metres = known_length
         factor, rule = metres / length_of(seen, a, b), f"{a} to {b} is {metres:g} m long"

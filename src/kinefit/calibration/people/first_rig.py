@@ -55,7 +55,7 @@ def first_rig(rig: Rig, uv: NDArray, accuracy: float) -> Rig:
             names = ", ".join(rig.names[c] for c in trials)
             raise CalibrationError(
                 f"what {names} saw agrees with no other camera", place=f"camera {rig.names[best]}",
-                remedy="Check its interiors, that it is of the same recording and in step, and sees the person.",
+                remedy="Check its intrinsics, that it is of the same recording and in step, and sees the person.",
             )
         poses[best] = trials[best][0]
     return Rig(tuple(camera.with_pose(poses[c]) for c, camera in enumerate(rig)))

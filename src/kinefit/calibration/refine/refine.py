@@ -73,7 +73,7 @@ def refine(
     Raises
     ------
     CalibrationError
-        Too little motion, or too few common views, to tell the cameras better than 10 px; cameras that fit nothing.
+        Too little motion, or too few common views, to place the cameras better than 10 px; cameras that fit nothing.
     ObservationError
         Streams that differ; a height, length or static point that cannot be.
     """

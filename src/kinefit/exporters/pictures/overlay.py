@@ -132,7 +132,7 @@ def write_montage(
         No pictures, or the file cannot be written.
     """
     if not images:
-        raise ExportError("there are no pictures to put side by side", file=path)
+        raise ExportError("there are no images to put side by side", file=path)
     row: list[NDArray] = []
     for image in images.values():
         size = (max(1, round(image.shape[1] * height / image.shape[0])), height)
@@ -140,7 +140,7 @@ def write_montage(
     suffix = ".jpg" if str(path).lower().endswith((".jpg", ".jpeg")) else ".png"
     written, data = cv2.imencode(suffix, cv2.cvtColor(np.concatenate(row[1:], axis=1), cv2.COLOR_RGB2BGR))
     if not written:
-        raise ExportError("the picture cannot be encoded", file=path, remedy="Give a name that ends in .png.")
+        raise ExportError("the image cannot be encoded", file=path, remedy="Give a name that ends in .png.")
     write_bytes(path, data.tobytes())
 
 

@@ -22,7 +22,7 @@ def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
         p.paragraph("To paste into a paper:", small=True), p.quote(text),
         p.paragraph(
             "Error bars are standard deviations. In them are the jitter and lasting errors of the keypoints, what "
-            "the cameras' pictures have shifted as a whole, and how sure the body's lengths are; not the scale of the "
+            "the cameras' images have shifted as a whole, and how sure the body's lengths are; not the scale of the "
             "calibration, nor errors that all cameras share.", small=True),
         p.folded("All settings, as JSON", p.code(json.dumps(summary(motion, date), indent=2, ensure_ascii=False))),
     ]  # fmt: skip
@@ -104,7 +104,7 @@ def _cameras(told: Mapping[str, Any], names: list[str]) -> str:
     kinds = dict.fromkeys(f"{e.get('format', '')} {e.get('set') or ''}".strip() for e in keypoints)
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
     text = f"2D keypoints {f'({listed([k for k in kinds if k])}) ' if any(kinds) else ''}of {listed(names, 12)}"
-    stated = f" with a stated accuracy of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""
+    stated = f" with a stated standard deviation of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""
     return f"{text} entered{stated}."
 
 

@@ -202,7 +202,7 @@ def _sentences(group: Sequence[_Found]) -> Iterable[str]:
         else:
             for sensor, unit, usual in dict.fromkeys(g.sensor for g in same):
                 most = max(g.amount for g in same if g.sensor[0] == sensor)
-                yield f"The body lies {most:.0f} {unit} beside what {sensor} saw (usually {usual:.0f})."
+                yield f"The body lies {most:.0f} {unit} beside what {sensor} saw (its median is {usual:.0f})."
 
 
 def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:

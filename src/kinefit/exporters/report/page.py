@@ -228,7 +228,7 @@ def picture(
     """
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or array.dtype != np.uint8 or 0 in array.shape:
-        raise ExportError(f"a picture of shape {array.shape}, {array.dtype}", remedy="Give (H, W, 3) uint8 RGB.")
+        raise ExportError(f"an image of shape {array.shape}, {array.dtype}", remedy="Give (H, W, 3) uint8 RGB.")
     shrink = min(1.0, width / max(array.shape[:2]))
     size = (max(1, round(array.shape[1] * shrink)), max(1, round(array.shape[0] * shrink)))
     if shrink < 1:
@@ -236,7 +236,7 @@ def picture(
     kind, options = ("png", []) if lossless else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, quality])
     encoded, data = cv2.imencode(f".{kind}", cv2.cvtColor(array, cv2.COLOR_RGB2BGR), options)
     if not encoded:
-        raise ExportError("a picture cannot be encoded", remedy="Give (H, W, 3) uint8 RGB.")
+        raise ExportError("an image cannot be encoded", remedy="Give (H, W, 3) uint8 RGB.")
     text = base64.b64encode(data.tobytes()).decode("ascii")
     told = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
     return Html(

@@ -144,7 +144,7 @@ def _summary(
         parts.append(p.callout("warning", f"Constant shift in {told}.", text))
     blind = never_observed(motion)
     if blind:
-        text = "No measurement tells them: what is shown follows from the usual posture and is no result."
+        text = "No measurement observes them: what is shown follows from the prior posture and is no result."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         parts.append(p.callout("bad" if most else "note", f"Not observed: {listed(blind, 8)}.", text))
     body = motion.body
@@ -161,7 +161,7 @@ def _summary(
 
 def _moments(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
     if not motion.residuals and not moments:
-        return [p.callout("note", "This motion comes without measurements, so nothing tells where it is doubtful.")]
+        return [p.callout("note", "This motion comes without measurements, so nothing shows where it is doubtful.")]
     if not moments:
         return [p.callout("good", "None: every frame is supported by its measurements and fits like the others.")]
     out = []

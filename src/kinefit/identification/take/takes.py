@@ -81,7 +81,7 @@ class TakeIdentification:
     column : (F, M) int, which column of the take each is; -1 where none
     doubts : worst first
     anchors : frames that were identified one by one
-    ghosts : number of points that are nobody's
+    ghosts : number of points that are unassigned
     """
 
     labels: tuple[str, ...]

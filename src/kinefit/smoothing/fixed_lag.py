@@ -1,0 +1,236 @@
+"""A few frames behind live: each frame's estimate is that of a window of frames solved with the motion prior.
+
+The window reaches from the newest frame back over the lag, and some more frames before, which are still linearised
+anew. What left the window stays as a quadratic cost of its first three frames (`solvers.marginal`), so that nothing of
+it is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.errors import ObservationError
+from kinefit.frame.results import FrameResult, judged
+from kinefit.sensors.base import Measurement
+from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
+from kinefit.smoothing.unwrap import boxes, continued
+from kinefit.solvers import _kernels_smoothing
+from kinefit.solvers.marginal import Entering, leave
+from kinefit.solvers.smoothing import Equations, MotionPrior, Smoothed, blocks, posterior, smooth
+
+_BEFORE = 0.3  # [s] of frames before the lag that are still linearised anew
+_TRIED = 3  # steps of a window: it begins where the last one ended
+_LEAP = np.array([0.3, 1.0])  # [m], [rad] a frame: a larger jump is a body found elsewhere, no motion
+
+
+class FixedLag:
+    """Smooths what a tracker gives, a few frames behind it.
+
+    Parameters
+    ----------
+    tracker : Tracker, or what has its `body`, `rate`, `settings`, `scene_of` and `apart`
+    lag : float [s] by which frames come later, a frame at least
+    noise : KnownNoise; default: the settings' accelerations, which are those of quick movements
+
+    Attributes
+    ----------
+    seconds : float, the lag in whole frames
+
+    Raises
+    ------
+    ObservationError
+        A lag of less than a frame.
+    """
+
+    def __init__(self, tracker: Follows, lag: float, *, noise: KnownNoise | None = None) -> None:
+        rate, settings = tracker.rate, tracker.settings
+        self._lag = lag_frames(lag, rate)
+        self.seconds = self._lag / rate
+        self.rate, self.body = rate, tracker.body
+        self._most = self._lag + max(round(_BEFORE * rate), 3)
+        self.noise = noise or KnownNoise.of_settings(self.body, settings)
+        self._memory = round(settings.smooth_memory * rate)
+        memory = settings.acceleration_memory, settings.smooth_memory
+        tree = self.body.tree
+        self._prior = MotionPrior(self.noise.acceleration, memory, 1.0 / rate, tree.usual, tree.spread)
+        self._share = self._prior.posture_share
+        self._costs = FrameCosts(tracker, self.noise)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._frames: list[LagFrame] = []
+        self._waiting = 0  # frames of the window that were not handed out yet
+        self._entering: Entering | None = None
+        self._livelier = np.ones((0, self.body.tree.n_dofs))
+        self._count = 0
+        self._told = np.full(len(self.body.tree.coordinates), -(10**9))  # the last frame that tells of each coordinate
+
+    def add(
+        self, result: FrameResult | None, measurements: Sequence[Measurement] | None = None, *, ahead: int | None = None
+    ) -> list[FrameResult]:
+        """Take the tracker's result of a new frame, and hand out those for which the lag is over, mostly one.
+
+        A gap in time of more than the window ends it: what waits is handed out, and it begins anew.
+
+        Parameters
+        ----------
+        result : as `Tracker.update` gives it; None, and the same one again, count for nothing.
+        measurements : what it was made from, all but keypoints; default: as the result has them
+        ahead : frames since the last one; default: by its time. Less than half a frame is joined to it.
+        """
+        if result is None or (self._frames and result is self._frames[-1].result):
+            return []
+        new = self._costs.frame(result, measurements)
+        if not self._frames:
+            self._append(new)
+            return self._solved()
+        last = self._frames[-1]
+        gone = (result.time - last.result.time) * self.rate
+        ahead = round(gone) if ahead is None else ahead
+        if gone < 0.0 or ahead > self._most:
+            out = self.finish()
+            self._append(new)
+            return out + self._solved()
+        if ahead == 0:
+            last.measurements += new.measurements
+            last.points, last.surfaces, last.H = last.points + new.points, last.surfaces + new.surfaces, None
+            last.result = result
+            return self._solved()
+        out = []
+        for k in range(1, ahead):
+            state = last.state.retract(k / ahead * last.state.difference(new.state))
+            time = last.result.time + k / ahead * (result.time - last.result.time)
+            nothing = replace(result, time=time, state=state, matched=(), measurements=())
+            self._append(LagFrame(nothing, (), (), (), state, real=False))
+            out += self._solved()
+        self._append(new)
+        return out + self._solved()
+
+    def finish(self) -> list[FrameResult]:
+        """All frames that wait for later ones; what comes then begins anew."""
+        out = self._handed(self._waiting) if self._waiting else []
+        self._begin()
+        return out
+
+    def _append(self, frame: LagFrame) -> None:
+        if self._frames:
+            before = self._frames[-1].state.angles
+            angles = continued(self.body.tree, before, frame.state.angles)
+            frame.state = BodyState(frame.state.T_world_root, angles)
+        self._frames.append(frame)
+        self._waiting += 1
+        self._count += 1
+        self._livelier = np.concatenate([self._livelier, np.ones((1, self._livelier.shape[1]))])
+        self._leap()
+        self._told[self._costs.told(self._frames, len(self._frames) - 1)] = self._count
+
+    def _leap(self) -> None:
+        """Where the tracker found the body elsewhere, the newest change of its steps is as large as it is."""
+        if len(self._frames) < 2:
+            return
+        recent = [f.state for f in self._frames[-4:]]
+        steps = [a.difference(b) for a, b in pairwise(recent)]
+        fast, slow = self._prior.keep
+        change = steps[-1]
+        for k, part in ((2, fast + slow), (3, -fast * slow)):
+            if len(steps) >= k:
+                change = change - part * steps[-k]
+        limit = np.where(np.arange(len(change)) < 3, *_LEAP)
+        usual = 1.0 / np.sqrt(self._prior.weight)
+        factor = np.where(np.abs(change) > limit, np.maximum(np.abs(change) / usual, 1.0), 1.0)
+        self._livelier[-2] = factor  # of the step that leads to the newest frame
+
+    def _solved(self) -> list[FrameResult]:
+        """Solve the window, and hand out what is due."""
+        due = len(self._frames) - 1 - self._lag
+        if due >= 0 and self._waiting > self._lag:
+            self._costs.match(self._frames, due)
+        self._fit()
+        if self._waiting <= self._lag:
+            return []
+        return self._handed(self._waiting - self._lag)
+
+    def _fit(self) -> None:
+        frames, tree = self._frames, self.body.tree
+        while len(frames) > self._most and len(frames) > 4:
+            self._leave()
+        made = [self._costs.quadratic(self._frames, f) for f in range(len(frames))]
+        H, g, cost = (np.array(v) for v in zip(*made))
+        roots, angles = self._states()
+        lower, upper, usual = boxes(tree, angles)
+        prior = replace(self._prior, usual=usual, liveliness=self._livelier)
+
+        def equations(new_roots: NDArray, new_angles: NDArray) -> Equations:
+            delta = np.empty(g.shape)
+            _kernels_smoothing.differences(roots, new_roots, angles, new_angles, delta)
+            moved = np.einsum("tij,tj->ti", H, delta)
+            costs = cost - 2.0 * np.einsum("ti,ti->t", g, delta) + np.einsum("ti,ti->t", moved, delta)
+            return np.array(H), g - moved, costs
+
+        self._last: Smoothed = smooth(
+            self.body, roots, angles, equations, prior, bounds=(lower, upper), dense=True, entering=self._entering,
+            max_iterations=_TRIED, tolerance=1e-4,
+        )  # fmt: skip
+        for frame, T, q in zip(frames, self._last.roots, self._last.angles):
+            frame.state = BodyState(T, q)
+
+    def _leave(self) -> None:
+        """Take the oldest frame out of the window, and keep what it tells of the next three."""
+        roots, angles = self._states(4)
+        lower, upper, usual = boxes(self.body.tree, angles)
+        H, g, _ = self._costs.quadratic(self._frames, 0)
+        weight = 1.0 / np.square(self.body.tree.spread)
+        H[np.arange(6, len(H)), np.arange(6, len(H))] += weight
+        g[6:] += weight * (usual[0] - angles[0])
+        at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
+        held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
+        past, strength = replace(self._prior, liveliness=self._livelier).rows(3)
+        share = np.concatenate([np.zeros(6), self._share - weight])
+        self._entering = leave(
+            self.body, roots, angles, H, g, share, held, past, strength, blocks(self.body), self._entering
+        )
+        del self._frames[0]
+        self._livelier = self._livelier[1:]
+
+    def _states(self, count: int | None = None) -> tuple[NDArray, NDArray]:
+        states = [f.state for f in self._frames[:count]]
+        return np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states])
+
+    def _handed(self, count: int) -> list[FrameResult]:
+        """Results of the first frames that wait."""
+        first = len(self._frames) - self._waiting
+        found = posterior(self.body, self._last, first, self._share).frames
+        out = []
+        for f in range(first, first + count):
+            frame = self._frames[f]
+            self._waiting -= 1
+            if frame.real:
+                number = self._count - len(self._frames) + f + 1
+                observed = self._told >= number - self._memory
+                matched = (*frame.points, *frame.surfaces)
+                out.append(
+                    judged(
+                        self._costs.scene(self._frames, f), found[f], matched, self._last.iterations, observed=observed
+                    )
+                )
+        return out
+
+
+def lag_frames(lag: float, rate: float) -> int:
+    """A lag [s] in frames.
+
+    Raises
+    ------
+    ObservationError
+        Less than a frame.
+    """
+    if not (np.isfinite(lag) and round(lag * rate) >= 1):
+        raise ObservationError(f"a lag of {lag:g} s", remedy=f"Give a frame at least, {1.0 / rate:.3f} s.")
+    return round(lag * rate)

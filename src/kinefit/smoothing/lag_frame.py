@@ -1,0 +1,187 @@
+"""One frame of a window that is solved again and again: what was measured, matched, as a quadratic cost of the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.frame.fit import rows_of
+from kinefit.frame.results import BLIND, FrameResult
+from kinefit.multiview.observability import SHORTEST, levers
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Matched, Measurement, matched_by
+from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.known_noise import KnownNoise, known_sigma
+from kinefit.smoothing.linearised import ApartRows, SceneOf
+from kinefit.smoothing.process_noise import INLIER
+from kinefit.solvers.equations import inverse, normal_equations
+
+
+class Follows(Protocol):
+    """What is asked of a tracker."""
+
+    @property
+    def body(self) -> Body:
+        """The body that it follows."""
+
+    @property
+    def rate(self) -> float:
+        """[Hz] of its frames."""
+
+    @property
+    def settings(self) -> TrackSettings:
+        """Its settings."""
+
+    @property
+    def scene_of(self) -> SceneOf:
+        """(state, time) -> scene."""
+
+    @property
+    def apart(self) -> ApartRows:
+        """Scene -> rows that keep parts of the body from running into each other."""
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What is asked of a tracker, of one that has done its work."""
+
+    body: Body
+    rate: float
+    settings: TrackSettings
+    scene_of: SceneOf
+    apart: ApartRows
+
+
+@dataclass(eq=False)
+class LagFrame:
+    """A frame of the window: what was measured, and where the body is by the last solution."""
+
+    result: FrameResult
+    measurements: tuple[Measurement, ...]
+    points: tuple[Matched, ...]  # matched once; linearised anew in every window
+    surfaces: tuple[Matched, ...]  # matched again before the frame is handed out
+    state: BodyState
+    real: bool = True
+    about: BodyState | None = None
+    H: NDArray | None = None  # of the surfaces, about that state
+    g: NDArray | None = None
+    cost: float = 0.0
+
+
+class FrameCosts:
+    """Makes frames of a window, and their costs.
+
+    Parameters
+    ----------
+    tracker : see `Follows`
+    noise : KnownNoise
+    """
+
+    def __init__(self, tracker: Follows, noise: KnownNoise) -> None:
+        self.tracker, self.noise, self.body = tracker, noise, tracker.body
+        self._sigma: dict[int, tuple[Any, NDArray]] = {}
+
+    def frame(self, result: FrameResult, measurements: Sequence[Measurement] | None) -> LagFrame:
+        """Of a tracker's result, and of what it was made from, all but keypoints; None: as the result has it."""
+        scene = self.tracker.scene_of(result.state, result.time)
+        if measurements is None:
+            measurements, matched = result.measurements, list(result.matched)
+        else:
+            reach = self.tracker.settings.near
+            matched = [m for m in result.matched if isinstance(m, KeypointMatched)]
+            scene = scene.at(result.state, measurements=tuple(measurements))
+            matched += [matched_by(m, scene, reach) for m in measurements]
+        loose = {m.sensor for m in measurements if not m.settled}
+        points = tuple(m for m in matched if m.sensor not in loose)
+        surfaces = tuple(m for m in matched if m.sensor in loose)
+        return LagFrame(result, tuple(measurements), points, surfaces, result.state)
+
+    def told(self, frames: Sequence[LagFrame], f: int) -> NDArray:
+        """(D,) bool: coordinates of which a frame tells on its own."""
+        frame, scene, tree = frames[f], self.scene(frames, f), self.body.tree
+        pixels = [m for m in frame.points if isinstance(m, KeypointMatched)]
+        others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
+        told = np.zeros(len(tree.coordinates), bool)
+        H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
+        for several, far in ((others, False), (pixels, True)):
+            if several:
+                H = H + normal_equations(self.body, scene.state, self._rows(several, scene)).matrix
+                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
+                told |= seen & self._far(pixels, scene) if far else seen
+        return told
+
+    def _far(self, pixels: Sequence[KeypointMatched], scene: Scene) -> NDArray:
+        """(D,) bool: coordinates that move a keypoint that is seen."""
+        out = np.zeros(len(self.body.tree.coordinates), bool)
+        for m in pixels:
+            inside = (m.weight > 0) & (m.loss.factor(m.squares(scene)) > INLIER)
+            points, state = m.measurement.layout.points_of(self.body), scene.state
+            out |= levers(self.body, points, inside[None], state.T_world_root[None], state.angles[None])[0] > SHORTEST
+        return out
+
+    def scene(self, frames: Sequence[LagFrame], f: int) -> Scene:
+        """Of a frame of the window, with its velocity there."""
+        frame, (a, b) = frames[f], (max(f - 1, 0), min(f + 1, len(frames) - 1))
+        velocity = None
+        if b > a:
+            first, last = frames[a], frames[b]
+            gone = max(last.result.time - first.result.time, 1e-6)
+            velocity = first.state.difference(last.state) / gone
+        scene = self.tracker.scene_of(frame.state, frame.result.time)
+        return scene.at(frame.state, measurements=frame.measurements, velocity=velocity)
+
+    def _rows(self, matched: Sequence[Matched], scene: Scene) -> list[AnyRows]:
+        known = [self._known(m) if isinstance(m, KeypointMatched) else m for m in matched]
+        return rows_of(scene, known, self.tracker.settings, self.noise.scale)
+
+    def _known(self, m: KeypointMatched) -> KeypointMatched:
+        """Keypoints with the noise that is known."""
+        loss = self.tracker.settings.loss
+        if not self.noise.pixel_sigma:
+            return m if m.loss is loss else _like(m, replace(m, loss=loss))
+        layout = m.measurement.layout
+        if id(layout) not in self._sigma:
+            self._sigma[id(layout)] = layout, known_sigma(layout.channels, self.noise) / layout.channels.sigma
+        return _like(m, replace(m, loss=loss, weight=m.weight / np.square(self._sigma[id(layout)][1])))
+
+    def match(self, frames: Sequence[LagFrame], f: int) -> None:
+        """Find the correspondences of a frame's surfaces anew."""
+        frame, reach = frames[f], self.tracker.settings.near
+        again = [m for m in frame.measurements if not m.settled]
+        if again:
+            scene = self.scene(frames, f)
+            frame.surfaces, frame.H = tuple(matched_by(m, scene, reach) for m in again), None
+
+    def quadratic(self, frames: Sequence[LagFrame], f: int) -> tuple[NDArray, NDArray, float]:
+        """Cost c − 2 gᵀδ + δᵀHδ of a frame's measurements about where it is now: H, g, c."""
+        frame, body, n = frames[f], self.body, self.body.tree.n_dofs
+        H, g, cost = np.zeros((n, n)), np.zeros(n), 0.0
+        if frame.points or (frame.surfaces and frame.H is None):
+            scene = self.scene(frames, f)
+        if frame.points:
+            points = normal_equations(body, scene.state, self._rows(frame.points, scene))
+            H, g, cost = points.matrix, points.gradient, points.cost
+        if frame.surfaces:
+            if frame.H is None:
+                parts = [*self._rows(frame.surfaces, scene), *self.tracker.apart(scene)]
+                made = normal_equations(body, scene.state, parts)
+                frame.about, frame.H, frame.g, frame.cost = frame.state, made.matrix, made.gradient, made.cost
+            assert frame.about is not None and frame.g is not None
+            delta = frame.about.difference(frame.state)
+            moved = frame.H @ delta
+            H, g = H + frame.H, g + frame.g - moved
+            cost += frame.cost - 2.0 * float(frame.g @ delta) + float(moved @ delta)
+        return H, g, cost
+
+
+def _like(old: Matched, new: KeypointMatched) -> KeypointMatched:
+    """With the time of another match."""
+    object.__setattr__(new, "time", old.time)
+    return new
