@@ -40,7 +40,7 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
             kept.setdefault(m.sensor, []).extend(r for r in rows_at(m, scenes[f]) if isinstance(r, Rows))
     if len(kept) < 2:
         return {}
-    told = {sensor: _told(rows) for sensor, rows in kept.items()}
+    told = {sensor: _told(rows) for sensor, rows in kept.items() if rows}
     far = {sensor: t for sensor, t in told.items() if t["deviations"] > FAR}
     return dict(sorted(far.items(), key=lambda one: -one[1]["deviations"]))
 
@@ -57,14 +57,22 @@ def sentences(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _told(rows: Sequence[Rows]) -> dict[str, Any]:
     data = np.concatenate([np.zeros((8, 0)), *(r.data for r in rows)], axis=1)
-    data = data[:, data[7] > 0.0]
+    size, square = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*(_points(r) for r in rows)))
     direction, residual, weight = data[3:6], data[6], data[7]
-    if not len(residual):
+    if not len(size):
         return {"deviations": 0.0, "median_m": 0.0, "shift_m": [0.0, 0.0, 0.0]}
-    size: NDArray = np.abs(residual)
     A = (direction * weight) @ direction.T
     shift = np.linalg.pinv(A, rcond=_TINY, hermitian=True) @ (direction @ (weight * residual))
     return {
-        "deviations": round(float(np.median(size * np.sqrt(weight))), 2), "median_m": round(float(np.median(size)), 4),
+        "deviations": round(float(np.sqrt(np.median(square))), 2), "median_m": round(float(np.median(size)), 4),
         "shift_m": [round(float(v), 4) for v in shift],
     }  # fmt: skip
+
+
+def _points(rows: Rows) -> tuple[NDArray, NDArray]:
+    """Residual [m] of each measurement in some rows, and its square in variances."""
+    felt = rows.weight > 0.0
+    ids = np.where(rows.group < 0, rows.group.max(initial=-1) + 1 + np.arange(len(rows)), rows.group)[felt]
+    own = np.unique(ids, return_inverse=True)[1]
+    residual = rows.residual[felt]
+    return np.sqrt(np.bincount(own, residual**2)), np.bincount(own, rows.weight[felt] * residual**2)
