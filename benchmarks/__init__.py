@@ -1,1 +1,8 @@
-"""Figures of kinefit, each printed by a command; peers run side by side. Nothing here may import kinefit at once."""
+"""Figures of kinefit, each printed by a command; peers run side by side. Nothing here may import kinefit at once.
+
+`python -m benchmarks` runs all areas, `python -m benchmarks --quick` a quick form of each that tells whether every
+figure can still be measured, `python -m benchmarks.AREA [PART ...] [--quick]` one area or some of its parts.
+"""
+
+AREAS = ("solver", "video", "depth", "silhouettes", "markers")
+"""Modules that run alone."""

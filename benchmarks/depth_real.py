@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
 
 _UP = (0.0, -1.0, 0.0)  # the cameras stood level; the world is the camera's frame
 _CLOSE, _ACCEPTED = 0.05, 0.10  # [m] from the visible surface: explained; a point of the body at all
@@ -28,7 +28,7 @@ def run() -> None:
                 figure(f"real_{name}_{what}", None, unit, goal, "no recording")
             continue
         distances, shares = [], []
-        for depth, camera, start, body in fitted(*images):
+        for depth, camera, start, body in fitted(images[0][: amount(None, 2)], images[1]):
             distance, share = explained(body, start.state, camera, depth)
             distances.append(distance)
             shares.append(share)

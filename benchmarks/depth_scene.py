@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import figure
+from benchmarks.figures import FAILED, amount, figure
 from benchmarks.scene_body10 import FOUND, LOST, RATE, Run, Scene, as_frame, disturbed, folder, load_scene, run_scene
 
-STARTS, SEEDS, PASSES = range(10, 300, 29), range(3), 3
+STARTS, SEEDS, PASSES = range(10, 300, amount(29, 145)), range(amount(3, 1)), 3
 NEVER = 999.0  # [s] for a part that is not found again
 _GOALS = (
     ("scene_cpu_min_ms", "ms/frame", "<= 5"),
@@ -142,6 +142,7 @@ def _speed() -> dict[str, float]:
         command = [sys.executable, "-m", "benchmarks.depth_scene", what]
         done = subprocess.run(command, env=os.environ | one, capture_output=True, text=True, timeout=600)
         if done.returncode:
+            FAILED.append(f"depth_scene {what}")
             print(f"# {what}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
             continue
         out |= json.loads(done.stdout.splitlines()[-1])

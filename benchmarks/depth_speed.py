@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import figure
+from benchmarks.figures import FAILED, LEFT_OUT, amount, figure, peers, quick
 
-MOVEMENTS = ("walk", "clap", "sit_down", "kick")  # all of the body, its arms, all its bends, one leg
+MOVEMENTS = amount(("walk", "clap", "sit_down", "kick"), ("clap",))  # all of the body, its arms, all its bends, one leg
 POINTS, COUNTS = 5000, (1000, 2000, 5000, 10000, 20000, 50000)
-PASSES, WARM = 5, 5  # passes; frames at the beginning that are not timed
-FEW = 30  # frames for the growth and the background
+PASSES, WARM = amount(5, 1), 5  # passes; frames at the beginning that are not timed
+FEW = amount(30, 10)  # frames for the growth and the background
 _GOALS = (
     ("fusion_5000_ms", "ms/frame", "<= 4"),
     ("points_slope", "power of the number of points, 5k to 50k", "<= 1.1"),
@@ -48,8 +48,11 @@ def run() -> None:
         for part in ("fusion", "slope", "background"):
             found, reasons[part] = _process([sys.executable, "-m", "benchmarks.depth_speed", part, folder])
             values |= found
+            FAILED.extend([f"depth_speed {part}"] * bool(reasons[part]))
         python = os.environ.get("KINEFIT_OPEN3D_PYTHON")
-        if not python:
+        if not peers():
+            reasons["open3d"] = LEFT_OUT if quick() else "--no-peers"
+        elif not python:
             reasons["open3d"] = "KINEFIT_OPEN3D_PYTHON names no Python with open3d"
         elif reasons["fusion"]:
             reasons["open3d"] = reasons["fusion"]

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 
-_POSES, _LIMBS, _NEAR = 16, 16, 0.1  # [m] a joint this near its true place is found
-_PEOPLE, _NEARLY, _MOST = 20, 0.15, 0.8  # of a start that tracking can go on from, this share of joints is so near [m]
+_POSES, _LIMBS, _NEAR = amount(16, 2), amount(16, 4), 0.1  # [m] a joint this near its true place is found
+_PEOPLE = amount(20, 1)
+_NEARLY, _MOST = 0.15, 0.8  # [m] of a start that tracking can go on from, this share of joints is so near
 _UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -177,7 +178,7 @@ def _size(body: Any) -> None:
     from kinefit.subject.depth import fit_surfaces
 
     camera, before, after = camera_in_front(KINECT), [], []
-    for seed in range(4):
+    for seed in range(amount(4, 1)):
         rng = np.random.default_rng(seed)
         scales = np.exp(rng.normal(0.0, 0.07) + rng.normal(0.0, 0.03, len(body.scale_groups)))
         girth = float(np.exp(rng.normal(0.05, 0.12)))

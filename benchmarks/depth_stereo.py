@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import sample
 from kinefit.correspondences import collision_rows, free_space_rows
@@ -25,7 +25,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.stereo import StereoRectifier
 from kinefit.readers.calibration.read import read_opencv_stereo
 
-PAIRS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14)
+PAIRS = amount((1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14), (1, 5, 9))
 SQUARE = 0.025  # [m]
 
 
@@ -101,7 +101,7 @@ def _head() -> None:
 
     motion = retarget(read_bvh(sorted(folder.glob("*.bvh"))[0]), rate=2)
     off, found, spent = [], [], 0.0
-    for frame in range(1, len(motion.angles), 2):
+    for frame in range(1, len(motion.angles), amount(2, 20)):
         aim = motion.Ts_world_root[frame][:3, 3]
         place = aim + (0.3, 0.2, 3.0)
         z = (aim - place) / np.linalg.norm(aim - place)
@@ -166,7 +166,7 @@ def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
         face = find_face(image, models)  # type: ignore[arg-type]
         assert face is not None
         tracker, size = SkinTracker(image, face, rate=6.0), np.array(video.size)
-        for k in range(60):  # then a board is held
+        for k in range(amount(60, 6)):  # then a board is held
             image = video.read(k)
             start = time.process_time()
             seen = tracker.update(image)

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 from benchmarks.motions import library
-from kinefit import Keypoints, Motion, load_body, track
+from kinefit import Keypoints, Motion, Recording, load_body, track
 from kinefit.evaluation import Coverage, coverage_of_groups
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.solvers.shape import mirror_points
@@ -59,7 +59,8 @@ def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str,
         if name == "camera_lost":
             middle = len(truth) // 2
             seen = without(seen, number % len(rig), middle - 15, middle + 15)
-        motion = track(rig, seen, load_body("humanoid"), accuracy=ACCURACY, up=truth.up)
+        recording = Recording.of_keypoints(rig, seen, accuracy=ACCURACY, up=truth.up)
+        motion = track(recording, load_body("humanoid"))
         for group, share in coverage_of_groups(truth, motion).items():
             told.setdefault(group, []).append((share.joints, share.angles))
     return {group: Coverage(*(mean(column) for column in zip(*shares))) for group, shares in told.items()}
@@ -74,8 +75,8 @@ def mean(shares: tuple[float, ...]) -> float:
 def run() -> None:
     """Print coverage of every scene."""
     motions = library()
-    for keypoint_set in ("BODY_25B", "MEDIAPIPE_33"):
-        for name in SCENES:
+    for keypoint_set in amount(("BODY_25B", "MEDIAPIPE_33"), ("BODY_25B",)):
+        for name in amount(tuple(SCENES), ("camera_lost",)):
             tag = f"{name}_{keypoint_set.lower()}"
             told = scene(name, keypoint_set, motions) if motions else {}
             for what in ("joints", "angles"):

@@ -5,9 +5,14 @@ from __future__ import annotations
 import math
 import os
 import sys
+import time
+import traceback
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
+from typing import TypeVar
+
+Amount = TypeVar("Amount")
 
 
 def figure(name: str, value: float | None, unit: str, goal: str, reason: str = "") -> bool:
@@ -33,17 +38,58 @@ def data(name: str) -> Path | None:
     return root / name if (root / name).exists() else None
 
 
+QUICK = "KINEFIT_BENCHMARKS_QUICK"
+"""Set in the environment where `--quick` was asked for, so that processes that a part starts know it, too."""
+
+LEFT_OUT = "left out of the quick form"
+
+
+def quick() -> bool:
+    """Whether figures are to be told from few frames: whether all parts run to their end, not how good they are."""
+    return bool(os.environ.get(QUICK))
+
+
+def amount(whole: Amount, few: Amount) -> Amount:
+    """How much of something: all of it, or little in the quick form."""
+    return few if quick() else whole
+
+
+FAILED: list[str] = []
+"""Processes of kinefit's own that a part started and that broke off: their figures are not measured, and `run_parts`
+ends with an error."""
+
+
 def run_parts(parts: Mapping[str, str]) -> None:
     """Print the figures of the parts that the command line names; of all, where it names none.
+
+    A part that does not end is told with its traceback, and the others go on; the process then ends with an error.
 
     Parameters
     ----------
     parts : {module of this package with a function `run`: what it is about}
     """
-    chosen = sys.argv[1:]
-    unknown = [name for name in chosen if name not in parts]
+    options = {word for word in sys.argv[1:] if word.startswith("--")}
+    chosen = [word for word in sys.argv[1:] if word not in options]
+    unknown = [name for name in chosen if name not in parts] + sorted(options - {"--quick", "--no-peers"})
     if unknown:
-        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}")
+        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}, and --quick, --no-peers")
+    if "--quick" in options:
+        os.environ[QUICK] = "1"
+    broken = []
     for name in chosen or parts:
         print(f"\n# {name}: {parts[name]}", flush=True)
-        import_module(f"benchmarks.{name}").run()
+        began = time.monotonic()
+        try:
+            import_module(f"benchmarks.{name}").run()
+        except Exception:
+            traceback.print_exc(file=sys.stdout)
+            broken.append(name)
+        print(f"# {name}: {time.monotonic() - began:.0f} s", flush=True)
+    broken += FAILED
+    if broken:
+        sys.exit(f"did not end: {', '.join(broken)}")
+
+
+def peers() -> bool:
+    """Whether other programs run side by side: not in the quick form, which makes no environments."""
+    return not quick() and "--no-peers" not in sys.argv

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import broken, load, shuffled
 from kinefit import Markers, fit_marker_subject, fit_markers, identify, identify_take, learn_model, load_body
 from kinefit.identification.model.model import MarkerModel
@@ -22,7 +22,7 @@ from kinefit.identification.model.model import MarkerModel
 LARGE = "nimblephysics/data__osim__WeirdFormatTests__markers.trc"
 """61 markers, most of them in clusters."""
 
-FRAMES = 20
+FRAMES = amount(20, 4)
 
 
 def run() -> None:
@@ -59,7 +59,7 @@ def whole_take() -> None:
     if taught is None or take is None:
         figure("markers_60s", None, "s", "<= 30", "the recording is absent")
         return
-    x = np.concatenate([take.positions, take.positions[::-1]])[:7200]
+    x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
     labelled = replace(take, positions=x, residual=None)
     model = learn_model(taught)
     both(model, broken(replace(labelled, positions=x[:240])).markers)  # compiled

@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure, quick
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes.sapm import sapm
 
-POSES = int(os.environ.get("POSES", 40))
-CLEAN = int(os.environ.get("CLEAN", 2000))
+POSES = int(os.environ.get("POSES", amount(40, 1)))
+CLEAN = int(os.environ.get("CLEAN", amount(2000, 20)))
 Identifier = Callable[[MarkerModel, NDArray], NDArray]
 
 
@@ -72,10 +72,11 @@ def table(model: MarkerModel) -> None:
              (0.04, 0.1, 0): 99.6,
              (0.0, 0.2, 0): 99.0, (0.04, 0.2, 0): 97.5, (0.04, 0.0, 20): 99.9}  # fmt: skip
     results = {}
-    for kind in [(d, m, e) for d in (0.0, 0.04, 0.06, 0.1) for m in (0.0, 0.1, 0.2) for e in (0, 5, 20)]:
+    kinds = [(d, m, e) for d in (0.0, 0.04, 0.06, 0.1) for m in (0.0, 0.1, 0.2) for e in (0, 5, 20)]
+    for kind in amount(kinds, list(goals)):
         named = dict(zip(("distortion", "missing", "extra"), kind))
         a = score(ours, model, POSES, **named)
-        b = score(sapm, model, max(POSES // 4, 5), **named)
+        b = score(sapm, model, max(POSES // 4, amount(5, 1)), **named)
         print(
             f"{kind[0]:10.0%} {kind[1]:7.0%} {kind[2]:5d} | {a.right:8.2%} {a.wrong:7.3%} "
             f"{a.median:7.1f} {a.slowest:7.0f} "
@@ -150,7 +151,8 @@ def run(file: Path | None = None) -> None:
     figure("markers_synthetic_clean_identify_49", 100 * large.whole, "% of frames", ">= 99.9")
     figure("markers_synthetic_clean_sapm", 100 * score(sapm, model, CLEAN).whole, "% of frames", ">= 95")
     table(model)
-    surface(model, file)
+    if not quick():
+        surface(model, file)
 
 
 if __name__ == "__main__":

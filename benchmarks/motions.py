@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.figures import data
+from benchmarks.figures import data, quick
 from kinefit import Motion, read_amc, read_bvh
 from kinefit.simulation import cut, resampled, retarget
 
@@ -32,12 +32,15 @@ MOTIONS: dict[str, tuple[str, str, str | None, float, float | None]] = {
     "zombie walk": ("motion_animateddrawings_bvh", "zombie.bvh", None, 0, 10),
 }
 
+QUICK = ("jump 002_04", "wave")
+"""Those of the quick form."""
+
 
 def library(names: list[str] | None = None) -> dict[str, Motion]:
     """The motions at 60 Hz (or their own rate where lower); those whose recording is absent are left out."""
     whole: dict[tuple[str, str], Motion] = {}
     out = {}
-    for name in names or MOTIONS:
+    for name in names or (QUICK if quick() else MOTIONS):
         folder, file, asf, start, stop = MOTIONS[name]
         root = data(folder)
         if root is None or not (root / file).exists():

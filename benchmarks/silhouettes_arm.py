@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from kinefit.subject.silhouettes import CylinderFamily, fit_silhouettes
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
+from benchmarks.silhouettes_scene import shape_from_silhouettes
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Camera, Rig
@@ -26,10 +27,13 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body, scaled
 from kinefit.sensors.settings import TrackSettings
+from kinefit.subject.parameters import SegmentScales
+from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.tracker import Tracker
 
 UNIT = 0.042  # [m] of the calibration: index finger to wrist is 4.2 of them
-FIRST, LAST, START, RATE = 40, 378, 160, 30.0
+FIRST, LAST = amount((40, 378), (150, 180))
+START, RATE, TURN = 160, 30.0, amount(30, 90)  # frame; [Hz]; [deg] between the turns that are tried
 SEEN = {"wrist": ((434, 160), (281, 369)), "tip": ((519, 375), (458, 406)), "arm": ((336, 28), (20, 382))}
 SKIN = (40, 138, 85), (235, 185, 123)  # YCrCb
 SETTINGS = TrackSettings(search=False, outline=360, far=0.08, near=0.015, patch=0.02, reach=0.08, iterations=10)
@@ -116,7 +120,7 @@ def first_pose(body: Body, rig: Rig, seen: list[SilhouetteFrame]) -> tuple[BodyS
     z = np.cross(x, y)
     levels = (Level(180, 0.12, 0.04, 1.3), Level(360, 0.06, 0.015, 1.0))
     found = []
-    for turn in np.radians(np.arange(0, 360, 30)):
+    for turn in np.radians(np.arange(0, 360, TURN)):
         T = np.eye(4)
         T[:3, 0], T[:3, 1] = np.cos(turn) * x + np.sin(turn) * z, y
         T[:3, 2] = np.cross(T[:3, 0], y)
@@ -136,7 +140,7 @@ def tracked(body: Body, rig: Rig, pictures: Pictures, start: BodyState) -> dict[
         follow = Tracker(body, rig, rate=RATE, accuracy=accuracy, settings=SETTINGS)
         follow.start_at(start)
         for k, i in enumerate(steps):
-            result = follow.update(pictures(i), k / RATE)
+            result = follow.update([replace(frame, time=k / RATE) for frame in pictures(i)])  # also backwards
             assert result is not None
             out[i] = result.state
     return out
@@ -170,9 +174,12 @@ def run() -> None:
     start, agreed = first_pose(body, rig, pictures(START))
     print(f"# first pose: overlap {agreed:.3f}")
     rough = tracked(body, rig, pictures, start)
-    chosen = range(FIRST + 20, LAST, 40)
+    chosen = range(FIRST + amount(20, 5), LAST, amount(40, 10))
     seen = [pictures(i) for i in chosen]
-    fit = fit_silhouettes(CylinderFamily(body), rig, seen, [rough[i] for i in chosen], sigma=SIGMA, settings=SETTINGS)
+    fit = shape_from_silhouettes(
+        body, rig, seen, [rough[i] for i in chosen], [SegmentScales(body), CylinderShape(body)], sigma=SIGMA,
+        settings=SETTINGS,
+    )  # fmt: skip
     states = tracked(fit.body, rig, pictures, rough[START])
     told = np.array([overlap(fit.body, states[i], rig, pictures(i)) for i in sorted(states)])
     figure("arm and hand: mean overlap with the silhouettes", told.mean(), "IoU", ">= 0.8")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import looking
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.surfaces.fourier import FourierSurface
@@ -20,8 +20,10 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker
 
 FRAMES = 120  # three degrees a frame
+SEEN = amount(FRAMES, 30)
 LENGTH = 0.3  # [m]
-OFF, TRIALS = (10, 20, 30, 40, 60), 6  # [deg] from which the car is found, and how often that is tried
+OFF = amount((10, 20, 30, 40, 60), (10, 40))  # [deg] from which the car is found ...
+TRIALS = amount(6, 1)  # ... and how often that is tried
 # Reach of a correspondence in the size of a car, not of a person.
 SETTINGS = TrackSettings(search=False, outline=640, far=0.03, near=0.005, patch=0.01, reach=0.05, iterations=12)
 
@@ -82,7 +84,7 @@ def run() -> None:
     tracker = Tracker(body, rig, rate=25.0, up=(0, 1, 0), accuracy=accuracy, settings=SETTINGS)
     tracker.start_at(placed(np.radians(-4.0)))
     turns, shifts = [], []
-    for i in range(FRAMES):
+    for i in range(SEEN):
         truth = placed(2 * np.pi * i / FRAMES)
         # drawn at twice the size, so that a pixel of a mask knows its share
         result = tracker.update([_seen(body, truth, rig, name, i) for name in rig.names])

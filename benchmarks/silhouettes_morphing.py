@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.curves import COLOURS, curves
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
 from kinefit.correspondences.morphed import morphed_outline_rows
@@ -31,6 +31,7 @@ FRAMES, SIZE, FOCAL = 200, (640, 480), 560.0
 JOINTS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "elbow_flex"))
 BOUNDS = (12.0, 8.0, 5.0, 4.0, 3.0, 3.0)  # [px] within which outlines are paired, iteration by iteration
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "morphing_arm.svg"
+SEEN, DRAWN = amount(FRAMES, 10), amount(PICTURE, None)
 
 
 def cameras() -> list[Camera]:
@@ -113,7 +114,7 @@ def louder(body: Body, factor: float) -> Body:
     return replace(body, morphs=tuple(out))
 
 
-def run(frames: int = FRAMES, picture: Path | None = PICTURE) -> None:
+def run(frames: int = SEEN, picture: Path | None = DRAWN) -> None:
     """Print every figure, and draw the curves."""
     body, views = load_body("humanoid_morphing"), cameras()
     model, rigid = Morphing(body), Morphing(replace(body, morphs=()))

@@ -1,7 +1,8 @@
-"""What the benchmarks of silhouettes have in common: a ring of cameras, bodies of many triangles, movements."""
+"""What the benchmarks of silhouettes have in common: cameras, bodies of many triangles, movements, shapes of people."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import SilhouetteFrame
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.silhouette import SilhouetteSensor
+from kinefit.subject.fit import Subject, fit_subject
+from kinefit.subject.parameters import Parameters
 
 
 def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0, away: float = 3.0) -> Rig:
@@ -33,6 +40,38 @@ def looking(name: str, eye: NDArray, at: NDArray, size: tuple[int, int], focal: 
     T[:3, 3] = -T[:3, :3] @ eye
     K = [[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]]
     return Camera(name, size, K, T_camera_world=T)
+
+
+def shape_from_silhouettes(
+    body: Body, rig: Rig, frames: Sequence[Sequence[SilhouetteFrame]], states: Sequence[BodyState],
+    parameters: Sequence[Parameters], *, sigma: float = 4.0, settings: TrackSettings | None = None,
+) -> Subject:  # fmt: skip
+    """Parameters and poses that explain silhouettes of several times; the overlap with them is printed.
+
+    Parameters
+    ----------
+    frames : K lists of silhouettes, of the cameras that saw the body at one time.
+    states : K poses near the truth.
+    sigma : float [px] standard deviation of an outline.
+    """
+    settings = settings or TrackSettings()
+    sensors = {camera.name: SilhouetteSensor(camera, sigma, settings) for camera in rig}
+
+    def seen(body: Body, states: Sequence[BodyState]) -> tuple[list[list], float]:
+        scene, steps, shares = Scene(body, states[0], rig), [], []
+        for several, state in zip(frames, states, strict=True):
+            here = scene.at(state)
+            steps.append([sensors[frame.sensor].prepare(frame, here) for frame in several])
+            shares += [measured.overlap(here) for measured in steps[-1]]
+        return steps, float(np.mean(shares))
+
+    steps, before = seen(body, states)
+    found = fit_subject(body, rig, steps, states, parameters)
+    _, after = seen(found.body, found.states)
+    told = ", ".join(f"{n} {m:.2f} +- {s:.2f}" for n, m, s in zip(found.names, found.mean, found.std))
+    print(f"# shape after {found.rounds} rounds: {told}")
+    print(f"# overlap with the silhouettes it was found from {after:.3f}, {before:.3f} before")
+    return found
 
 
 def of_meshes(body: Body, around: int, along: int) -> Body:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.figures import figure
+from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import of_meshes, ring, swaying
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.surfaces import body_mesh
@@ -25,7 +25,7 @@ from kinefit.rendering import Canvas, render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker
 
-FRAMES, WARM, ROUNDS = 45, 5, 3
+FRAMES, WARM, ROUNDS = amount(45, 15), 5, amount(3, 1)
 RED, GREEN = (200, 60, 50), (30, 90, 40)
 
 _GL = """

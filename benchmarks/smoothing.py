@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
 from benchmarks.motions import library
 from benchmarks.tracking import NOISE, TRIAL, median_residual, read_trial
-from kinefit import Motion, load_body, read_markers, track
+from kinefit import Motion, Recording, load_body, read_markers, track
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.losses import geman_mcclure
@@ -63,7 +63,7 @@ def real_trial(folder: Path) -> None:
     """Noise and residual on the real recording."""
     with tempfile.TemporaryDirectory() as where:
         trial = read_trial(folder, "openpose", Path(where))
-    causal, whole = (track(trial.rig, trial.keypoints, load_body("humanoid"), smooth=s) for s in (False, True))
+    causal, whole = (track(trial.recording, load_body("humanoid"), smooth=s) for s in (False, True))
     points, rate = rival_points(folder / RIVAL)
     rival = acceleration_noise(points, rate)
     ours, before = (acceleration_noise(joint_centres(m), m.rate) for m in (whole, causal))
@@ -79,7 +79,8 @@ def synthetic(keypoint_set: str) -> None:
     for name, truth in library().items():
         rig = studio_rig(truth)
         keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=len(joints), **NOISE)
-        motion = track(rig, keypoints, load_body("humanoid"), accuracy=NOISE["noise_px"], up="y")
+        recording = Recording.of_keypoints(rig, keypoints, accuracy=NOISE["noise_px"], up="y")
+        motion = track(recording, load_body("humanoid"))
         turns = np.where(np.isfinite(motion.dof_std[:, 6:]), np.abs(angle_errors(truth, motion)), np.nan)
         joints.append(1e3 * float(joint_errors(truth, motion).mean()))
         angles.append(float(np.nanmean(turns)))
@@ -102,7 +103,7 @@ def peak_speeds(motion: Motion) -> NDArray:
     return np.quantile(np.linalg.norm(np.diff(x, axis=0), axis=2) * motion.rate, 0.98, axis=0)
 
 
-def speed(frames: int = 500) -> None:
+def speed(frames: int = amount(500, 100)) -> None:
     """CPU time of one iteration over all frames, equations, factor and solution."""
     truth = cut(squat_and_wave(rate=60, duration=frames / 60 + 1), 0, frames)
     body, rig, random = truth.body, studio_rig(truth), np.random.default_rng(0)
@@ -118,7 +119,7 @@ def speed(frames: int = 500) -> None:
     prior = MotionPrior(acceleration, (0.2, 1.0), 1.0 / truth.rate, tree.usual, tree.spread)
     start = np.clip(truth.angles + 0.03 * random.normal(size=truth.angles.shape), tree.lower, tree.upper)
     spent = []
-    for _ in range(30):
+    for _ in range(amount(30, 3)):
         began = time.process_time()
         fit = smooth(body, truth.Ts_world_root, start, seen.equations(body), prior, bounds=(tree.lower, tree.upper))
         spent.append((time.process_time() - began) / fit.iterations)
@@ -136,5 +137,5 @@ def run() -> None:
             figure(f"smooth_{name}", None, unit, goal, "the real trial is absent")
     else:
         real_trial(folder)
-    for keypoint_set in ("BODY_25B", "MEDIAPIPE_33"):
+    for keypoint_set in amount(("BODY_25B", "MEDIAPIPE_33"), ("MEDIAPIPE_33",)):
         synthetic(keypoint_set)

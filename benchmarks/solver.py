@@ -6,7 +6,6 @@ import os
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
 
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import figure
+from benchmarks.figures import LEFT_OUT, amount, figure, peers, quick, run_parts
 from benchmarks.motions import library
 from benchmarks.peers import EXCESS, write_problem
 from benchmarks.peers.environments import run_peer
@@ -27,15 +26,15 @@ from kinefit.losses import geman_mcclure
 from kinefit.rows import Rows
 from kinefit.solvers.sequence import Planes, Sequence, fit_sequence
 
-FRAMES, NOISE, PLANES, PLANE_FRAMES = 500, 0.002, 5000, 100
+FRAMES, NOISE, PLANES, PLANE_FRAMES = amount(500, 60), 0.002, 5000, amount(100, 10)
 MOTION = "wash 02_10"
-REPEATS = 15
+REPEATS = amount(15, 2)
 
 
-def main() -> None:
+def run() -> None:
     """Print every figure of the solver."""
     body = load_body("humanoid")
-    motions = library()
+    motions = library(amount(None, [MOTION]))
     if MOTION not in motions:
         for name, unit, goal in GOALS:
             figure(name, None, unit, goal, "the recorded motions are absent")
@@ -47,10 +46,11 @@ def main() -> None:
     start = motion.state(0)
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder), motion, markers, x_world, planes)
-        peers = {}
+        beside = {}
         for peer in ("momentum", "mujoco", "mink", "pinocchio", "opensim", "momentum_planes"):
-            peers[peer] = run_peer(peer, Path(folder)) if "--no-peers" not in sys.argv else {"reason": "--no-peers"}
-            print(f"# {peer}: {peers[peer]}", flush=True)
+            reason = LEFT_OUT if quick() else "--no-peers"
+            beside[peer] = run_peer(peer, Path(folder)) if peers() else {"reason": reason}
+            print(f"# {peer}: {beside[peer]}", flush=True)
 
     def markers_fit(tolerance: float) -> Sequence:
         return fit_sequence(body, start, markers, x_world, sigma=1.0, limits=False, tolerance=tolerance)
@@ -77,9 +77,9 @@ def main() -> None:
         ("opensim", 100, ms, "solver_vs_opensim"),
         ("momentum_planes", 15, ms_planes, "solver_planes_vs_momentum"),
     ):
-        theirs = peers[peer].get("ms_per_frame_cpu")
-        figure(title, theirs / mine if theirs else None, "x faster", f">= {bound}", peers[peer].get("reason", ""))
-    costs = [p["cost"] for name, p in peers.items() if "cost" in p and name != "momentum_planes"]
+        theirs = beside[peer].get("ms_per_frame_cpu")
+        figure(title, theirs / mine if theirs else None, "x faster", f">= {bound}", beside[peer].get("reason", ""))
+    costs = [p["cost"] for name, p in beside.items() if "cost" in p and name != "momentum_planes"]
     spread = max(abs(c / plain[1] - 1) for c in costs) if costs else None
     figure("solver_same_residual", spread, "relative", "<= 1e-05", "no peer ran")
     figure("solver_planes", ms_planes, "ms/frame", "<= 0.31")
@@ -120,18 +120,19 @@ def cost_of(fit: Callable[[float], Sequence], tolerance: float) -> float:
 
 
 def surface_planes(motion: Motion, rng: np.random.Generator) -> Planes:
-    """Tangent planes at random points of the body's cylinders, with noise along their normals."""
+    """Tangent planes at random points of the body's cylinders, taken as round, with noise along their normals."""
     body = motion.body
     owners, points, normals = [], [], []
     for _ in range(PLANES):
         c = body.surfaces[rng.integers(len(body.surfaces))]
-        axis = np.array(c.end) / np.linalg.norm(c.end)
+        start, end, axis = np.array(c.start), np.array(c.end), c.axes[2]
         radial = np.cross(axis, rng.normal(size=3))
         radial /= np.linalg.norm(radial)
         tilted = radial + 0.5 * rng.normal(size=3)  # real limbs are not round: otherwise their turn would be free
         t = rng.uniform()
         owners.append(c.segment)
-        points.append(t * np.array(c.end) + ((1 - t) * c.radii[0] + t * c.radii[1]) * radial)
+        radius = (1 - t) * c.mean_radii[0] + t * c.mean_radii[1]
+        points.append((1 - t) * start + t * end + radius * radial)
         normals.append(tilted / np.linalg.norm(tilted))
     chosen = PointSet(tuple(f"p{i}" for i in range(PLANES)), np.array(owners), np.array(points))
     Ts = motion.segment_poses()[:PLANE_FRAMES, chosen.segments]
@@ -195,4 +196,4 @@ def from_rest(body: Body, motions: dict[str, Motion], rng: np.random.Generator) 
 
 
 if __name__ == "__main__":
-    main()
+    run_parts({"solver": "marker and plane rows, frame after frame, beside other solvers"})

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from benchmarks.motions import library
-from kinefit import Keypoints, Motion, Rig, load_body, load_observations, read_take, track
+from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
 from kinefit.evaluation import angle_errors, coverage, joint_errors
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.simulation import simulate_keypoints, studio_rig
@@ -53,6 +53,11 @@ class Trial:
     rig: Rig
     keypoints: tuple[Keypoints, ...]
 
+    @property
+    def recording(self) -> Recording:
+        """What a track is made of."""
+        return Recording.of_keypoints(self.rig, self.keypoints)
+
 
 def read_trial(folder: Path, detector: str, where: Path) -> Trial:
     """Write the take file into a folder and read what it names."""
@@ -76,13 +81,12 @@ def held_out(trial: Trial, whole: Motion) -> dict[str, NDArray]:
     out = {}
     for camera, record in zip(trial.rig.names, trial.keypoints, strict=True):
         others = tuple(n for n in trial.rig.names if n != camera)
-        motion = track(
-            trial.rig.select(others), [k for k in trial.keypoints if k.camera != camera], load_body("humanoid")
-        )
-        seen = whole.residuals[camera]
-        points = motion.body.keypoints(record.keypoint_set).select(seen.names)
+        seen = [k for k in trial.keypoints if k.camera != camera]
+        motion = track(Recording.of_keypoints(trial.rig.select(others), seen), load_body("humanoid"))
+        residuals = whole.residuals[camera]
+        points = motion.body.keypoints(record.keypoint_set).select(residuals.names)
         uv = trial.rig[camera].project(motion.positions(points))
-        out[camera] = seen.measured - uv
+        out[camera] = residuals.measured - uv
     return out
 
 
@@ -101,7 +105,7 @@ def free_points_held_out(trial: Trial, whole: Motion) -> float:
 def wall(trial: Trial, *, smooth: bool) -> float:
     """Seconds from keypoints to motion, once the kernels are there."""
     began = time.perf_counter()
-    track(trial.rig, trial.keypoints, load_body("humanoid"), smooth=smooth)
+    track(trial.recording, load_body("humanoid"), smooth=smooth)
     return time.perf_counter() - began
 
 
@@ -112,11 +116,11 @@ def middle(errors: NDArray) -> float:
 
 def real_trial(folder: Path, where: Path) -> None:
     """Residuals, held-out cameras, swaps, lengths and speed on the real recording."""
-    for detector in DETECTORS:
+    for detector in amount(DETECTORS, DETECTORS[-1:]):
         trial = read_trial(folder, detector, where)
-        motion = track(trial.rig, trial.keypoints, load_body("humanoid"))
-        seconds = min(wall(trial, smooth=False) for _ in range(5))
-        whole = min(wall(trial, smooth=True) for _ in range(3))
+        motion = track(trial.recording, load_body("humanoid"))
+        seconds = min(wall(trial, smooth=False) for _ in range(amount(5, 1)))
+        whole = min(wall(trial, smooth=True) for _ in range(amount(3, 1)))
         residual = median_residual(motion)
         per_camera = {name: round(float(np.nanmedian(r.norms)), 1) for name, r in motion.residuals.items()}
         swaps = {name: int(r.swapped.sum()) for name, r in motion.residuals.items()}
@@ -158,6 +162,10 @@ print("all after", time.time() - began)
 
 def start_up(take: Path, where: Path) -> None:
     """Seconds of a whole first run with an empty kernel cache, and until the first frame of a later run."""
+    if quick():
+        figure("video_first_run", None, "s", "<= 30", LEFT_OUT)
+        figure("video_later_start", None, "s", "<= 3", LEFT_OUT)
+        return
     environment = {**os.environ, "KINEFIT_CACHE": str(where / "cache")}
     texts = []
     for _ in range(3):
@@ -174,7 +182,8 @@ def synthetic(keypoint_set: str) -> None:
     for name, truth in library().items():
         rig = studio_rig(truth)
         keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=len(joints), **NOISE)
-        motion = track(rig, keypoints, load_body("humanoid"), accuracy=NOISE["noise_px"], up="y", smooth=False)
+        recording = Recording.of_keypoints(rig, keypoints, accuracy=NOISE["noise_px"], up="y")
+        motion = track(recording, load_body("humanoid"), smooth=False)
         observed = np.isfinite(motion.dof_std[:, 6:])
         turns = np.where(observed, np.abs(angle_errors(truth, motion)), np.nan)
         sure.append(float(np.nanmean(turns[motion.dof_std[:, 6:] < np.radians(10)])))
@@ -189,7 +198,8 @@ def synthetic(keypoint_set: str) -> None:
         print(f"# {keypoint_set}: angles whose own standard deviation is below 10 deg: {np.mean(sure):.2f} deg")
     absent = "the recorded motions are absent"
     tag = keypoint_set.lower()
-    figure(f"video_synthetic_motions_{tag}", float(len(joints)) or None, "motions", "== 20", absent)
+    count = None if quick() else float(len(joints)) or None
+    figure(f"video_synthetic_motions_{tag}", count, "motions", "== 20", LEFT_OUT if quick() else absent)
     figure(f"video_synthetic_joints_{tag}", float(np.mean(joints)) if joints else None, "mm", "<= 12", absent)
     figure(f"video_synthetic_angles_{tag}", float(np.mean(angles)) if angles else None, "deg", "<= 3", absent)
 
@@ -205,5 +215,5 @@ def run() -> None:
         with tempfile.TemporaryDirectory() as where:
             real_trial(folder, Path(where))
             start_up(Path(where) / "mediapipe.toml", Path(where))
-    for keypoint_set in ("BODY_25B", "MEDIAPIPE_33"):
+    for keypoint_set in amount(("BODY_25B", "MEDIAPIPE_33"), ("BODY_25B",)):
         synthetic(keypoint_set)

@@ -44,7 +44,7 @@ def main(labelled=None, points=None, out="kinefit-example"):
     found = kinefit.identify_take(model, take)
     named = found.markers(take)
     share = 100 * (found.column >= 0).mean()
-    print(f"{len(take)} frames: {share:.1f} % of the labels named, {found.ghosts} points are nobody's")
+    print(f"{len(take)} frames: {share:.1f} % of the labels named, {found.ghosts} points are unassigned")
     for doubt in found.doubts[:5]:
         print(f"look at {doubt.text}")
 

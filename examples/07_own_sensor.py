@@ -19,7 +19,7 @@ from kinefit.simulation import studio_rig
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.sensor_parameters import OwnUnknowns
 
-POST, LENGTH, SHOULDER = np.array([0.9, 1.7, 0.9]), 0.8, np.eye(4)  # [m]
+POST, LENGTH, SHOULDER, SLOW = np.array([0.9, 1.7, 0.9]), 0.8, np.eye(4), TrackSettings(angle_acceleration=60.0)
 SHOULDER[1, 3] = 1.4
 
 
@@ -62,13 +62,13 @@ def main(frames=60, noise_px=1.0, seed=0):
     arm, rig, random = load_body("arm"), studio_rig(cameras=2), np.random.default_rng(seed)
     states, observed = zip(*simulated(arm, rig, frames, noise_px, random))
     near = [BodyState(s.T_world_root, s.angles + 0.05 * random.normal(size=7)) for s in states[::3]]
-    sensors = Sensors(rig, 30.0, dict.fromkeys(rig.names, noise_px), TrackSettings(), [Rope()])
+    sensors = Sensors(rig, 30.0, dict.fromkeys(rig.names, noise_px), SLOW, [Rope()])
     steps = [sensors.measurements(f, Scene(arm, s, rig)) for f, s in zip(observed[::3], near)]
     subject = fit_subject(arm, rig, steps, near, [OwnUnknowns.of([Rope()])])
     print("the rope is {:.4f} ± {:.4f} m long;".format(*subject.value("rope length")), LENGTH, "m is the truth")
     errors, hand = {}, lambda s: Scene(arm, s, rig).position("r_dactylion")
     for name, used in (("one camera", slice(0, 1)), ("one camera and the rope", slice(0, 3, 2))):
-        tracker = Tracker(arm, rig, rate=30.0, accuracy=sensors.sigma, sensors=[Rope()], values=subject.values)
+        tracker = Tracker(arm, rig, settings=SLOW, accuracy=sensors.sigma, sensors=[Rope()], values=subject.values)
         tracker.start_at(states[0])
         gaps = [hand(tracker.update(f[used]).state) - hand(s) for f, s in zip(observed, states)]
         errors[name] = np.linalg.norm(gaps, axis=1)

@@ -71,6 +71,10 @@ class Rows:
     ) -> Rows:
         """Rows from segment (N,), point (N, 3) [m], direction (N, 3), residual (N,) [m], weight (N,) [1/m²]."""
         n = len(segment)
+        given = {"point": (n, 3), "direction": (n, 3), "residual": (n,), "weight": (n,)}
+        for (name, shape), values in zip(given.items(), (point, direction, residual, weight)):
+            if np.shape(values) != shape:
+                raise ObservationError(f"{name} of {n} rows has shape {np.shape(values)}", remedy=f"Give {shape}.")
         data = np.empty((8, n))
         data[0:3], data[3:6] = np.asarray(point).T, np.asarray(direction).T
         data[6], data[7] = residual, weight
@@ -200,6 +204,8 @@ class DofRows:
         As of `Rows`.
     loss : Loss, optional
         As of `Rows`.
+    segment : (N,) int, optional
+        The segment that each point belongs to, for evidence and residuals; None where it is of several.
     """
 
     jacobian: NDArray
@@ -207,6 +213,7 @@ class DofRows:
     weight: NDArray
     group: NDArray
     loss: Loss | None = None
+    segment: NDArray | None = None
 
     def __post_init__(self) -> None:
         number, size = (float, (None,)), np.shape(self.jacobian)[1:]

@@ -111,11 +111,11 @@ def test_what_belongs_to_refining_is_refused_without_it(take):
     assert "--refine" in told.output
 
 
-def test_refining_is_refused_before_gross_faults_are_mended(take):
+def test_refining_is_refused_before_gross_faults_are_fixed(take):
     exchange(take, "cam01", "cam03")
     told = run(take, "--refine")
     assert isinstance(told.exception, KinefitError)
-    assert "before the faults are mended" in str(told.exception)
+    assert "before the faults are fixed" in str(told.exception)
     assert take.with_name("take-check.html").exists()
     assert not take.with_name("calibration_refined.toml").exists()
 

@@ -22,7 +22,7 @@ _EPILOG = """\b
 Examples:
   kinefit demo                          four videos of a person, done in a minute
   kinefit init my_take                  a take file for a recording of your own
-  kinefit check my_take/take.toml       what is wrong with it, and what would mend it
+  kinefit check my_take/take.toml       what is wrong with it, and what would fix it
   kinefit track my_take/take.toml       angles, figures, videos and a report
   kinefit markers --help                points without names: labelled takes, joint angles
   kinefit export motion.npz --to bvh    a result in another format

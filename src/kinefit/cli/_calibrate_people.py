@@ -29,7 +29,7 @@ def people(
 ) -> None:
     """Find where the cameras stand from the people in view.
 
-    TAKE names a calibration for the interiors of its cameras; where that says they stand is not used.
+    TAKE names a calibration for the intrinsics of its cameras; where that says they stand is not used.
     """
     from statistics import median
 

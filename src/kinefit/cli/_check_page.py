@@ -42,7 +42,7 @@ def verdict(check: Check) -> str:
     told = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in count.items() if n]
     if count["fault"]:
         return (
-            f"{' and '.join(told[:2])}: mend the faults before you trust results." if len(told) > 1 else f"{told[0]}."
+            f"{' and '.join(told[:2])}: fix the faults before you trust results." if len(told) > 1 else f"{told[0]}."
         )
     return f"No fault; {told[0]}." if told and count["doubt"] else "No fault and no doubt."
 
@@ -165,7 +165,7 @@ def _times(check: Check) -> p.Section:
     }
     told = (
         "How far the rays of two cameras miss each other when one is shifted in time against the other. In "
-        "step, the valley is at 0; a flat line means too little motion to tell."
+        "step, the valley is at 0; a flat line means too little motion to decide."
     )
     return p.section(
         "Time", told, p.plot(traces, layout, height=340, label="Misses against shift in time"), anchor="time"

@@ -48,8 +48,8 @@ def fit_file(
     marker_set : str, optional
         Name of a marker set or a file of one; default: the one that shares most labels.
     height : float [m], optional, of the subject, barefoot.
-    unit : str, optional, of files that tell none or a wrong one.
-    up : str, optional, vertical axis of the world where the file does not tell it; default: found from the markers.
+    unit : str, optional, of files that state none or a wrong one.
+    up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
     limits : bool, whether joints stay within their ranges.
     formats : names of `_results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, told of progress.

@@ -80,8 +80,8 @@ def identify_file(
         Several for several subjects, whose labels then bear their names ("Anna:C7").
     out : .c3d or .trc, default beside the file: NAME-named with the same ending. A C3D of a C3D keeps its analog
         channels and parameters.
-    unit : of files that tell none or a wrong one
-    rest : whether points that are nobody's are kept, as "*1", "*2" ...
+    unit : of files that state none or a wrong one
+    rest : whether points that are unassigned are kept, as "*1", "*2" ...
 
     Returns
     -------

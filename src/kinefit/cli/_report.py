@@ -65,9 +65,9 @@ def take_pictures(
 
 
 def provenance(take: Take, **more: Any) -> dict[str, Any]:
-    """What a track of a take was made from, as `Motion.provenance` holds it: files, accuracies, versions.
+    """What a track of a take was made from, as `Motion.provenance` holds it: files, standard deviations, versions.
 
-    `more` is what else is to be told, such as smoothing={...} or tracking={...}.
+    `more` is what else is to be reported, such as smoothing={...} or tracking={...}.
     """
     out: dict[str, Any] = {
         "kinefit": metadata.version("kinefit"),

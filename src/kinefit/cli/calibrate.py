@@ -41,7 +41,7 @@ def calibrate() -> None:
     """Calibrate cameras: with a board in view, or from the people in view alone."""
 
 
-@click.command(short_help="Interiors and exteriors from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
+@click.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
 @click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_OR_FOLDER...")
 @click.option(
     "--board", "spec", required=True, metavar="SPEC",
@@ -61,7 +61,7 @@ def board(
     sources: tuple[Path, ...], spec: str, out: Path, interiors: Path | None, interiors_only: bool, floor: str | None,
     max_frames: int, overwrite: bool, verbose: bool,
 ) -> None:
-    """Interiors and exteriors from a checkerboard or ChArUco board.
+    """Intrinsics and extrinsics from a checkerboard or ChArUco board.
 
     Give a synchronised video for each camera, named as the camera, or a folder of them; or folders of pictures. Frames
     of one number are of one time. The board's square gives the scale, the board on the floor the origin and up.

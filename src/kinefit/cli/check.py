@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """\b
 Examples:
-  kinefit check take.toml                    findings, and a page with pictures
+  kinefit check take.toml                    findings, and a page with images
   kinefit check take.toml --refine           a better calibration too, beside the old one
   kinefit check take.toml --refine --take    and a copy of the take that uses it
 """
@@ -43,7 +43,7 @@ def check(
     ctx: click.Context, take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
     points: Path | None, copy: bool, strict: bool, verbose: bool,
 ) -> None:  # fmt: skip
-    """Find out what is wrong with a recording, how sure that is, and what would mend it.
+    """Find out what is wrong with a recording, how sure that is, and what would fix it.
 
     TAKE is the recording's take file. Looked at are the calibration (which camera moved, lens, unit, poses), the order
     of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
@@ -94,7 +94,7 @@ def _refine(
     seen, take = found.observations, found.take
     if found.views is None or not found.biases or seen is None or take is None:
         raise CalibrationError(
-            "the calibration cannot be refined before the faults are mended",
+            "the calibration cannot be refined before the faults are fixed",
             remedy="Mend what is named as a fault first.",
         )
     static = read_static_points(points, found.views.rig.names) if points else None
@@ -127,7 +127,7 @@ def _print(found: Check, verbose: bool) -> None:
             _screen.say(f"   try: {one.remedy}")
     good = [one for one in found.findings if one.severity == "good"]
     if good and not verbose:
-        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v tells more)")
+        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v says more)")
     columns, rows = camera_rows(found)
     if rows:
         shown = [at for at, name in enumerate(columns) if name in _PRINTED]

@@ -24,7 +24,7 @@ _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold 
 def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
     """Write a first take file from what lies in FOLDER: calibration, videos, keypoints, markers.
 
-    Everything is guessed from names and contents, and told with how sure it is, here and as comments in the file.
+    Everything is guessed from names and contents, and reported with how sure it is, here and as comments in the file.
     Nothing else is changed. Look at what is a guess or open, then run kinefit check.
     """
     from kinefit.errors import TakeError

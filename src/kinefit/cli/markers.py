@@ -25,7 +25,7 @@ Examples:
   kinefit markers audit walk-named.c3d                    swapped labels of a take that somebody named
 """
 _FILE = click.Path(path_type=Path)
-_unit = click.option("--unit", metavar="UNIT", help="Of files that tell none, or a wrong one: mm, cm, m ...")
+_unit = click.option("--unit", metavar="UNIT", help="Of files that state none, or a wrong one: mm, cm, m ...")
 
 
 @click.group(short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES)
@@ -121,7 +121,7 @@ def _tell(labelled: Markers, found: dict[str, TakeIdentification]) -> None:
         never = [label for m, label in enumerate(f.labels) if not seen[:, m].any()]
         _screen.say(
             f"{name}: {len(labelled)} frames at {labelled.rate:g} Hz, {100 * seen.mean():.1f} % of the labels named, "
-            f"{100 * f.filled.mean():.1f} % filled, {f.ghosts} points nobody's"
+            f"{100 * f.filled.mean():.1f} % filled, {f.ghosts} points unassigned"
         )
         if never:
             _screen.say(f"  never found: {', '.join(never)}")

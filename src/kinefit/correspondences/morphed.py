@@ -65,7 +65,7 @@ def on_moved_joints(pose: MorphedPose, rows: Rows) -> DofRows:
     for s in np.unique(rows.segment):
         of = rows.segment == s
         J[of] = a[of] @ pose.segment_jacobian(int(s))
-    return DofRows(J, rows.residual, rows.weight, rows.group, rows.loss)
+    return DofRows(J, rows.residual, rows.weight, rows.group, rows.loss, rows.segment)
 
 
 def morphed_outline_rows(

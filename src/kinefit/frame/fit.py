@@ -110,7 +110,7 @@ class FrameFit:
 def rows_of(
     scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None
 ) -> list[AnyRows]:
-    """Rows of all matches; those of surfaces tell no more of bones than where these lie below them (`frame.skin`).
+    """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What earlier frames tell of the next one: a Kalman filter with constant velocity over all degrees of freedom."""
+"""What earlier frames predict of the next one: a Kalman filter with constant velocity over all degrees of freedom."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def belief(state: BodyState, predicted: BodyState, information: NDArray) -> Para
 
 
 def forgetting(information: NDArray, lost: NDArray) -> NDArray:
-    """Information (n, n) that tells nothing of some degrees of freedom (n,) bool, and of the others what it told."""
+    """Information (n, n) without some degrees of freedom (n,) bool; of the others what it was."""
     kept = np.flatnonzero(~lost)
     out = np.zeros_like(information)
     out[np.ix_(kept, kept)] = inverse(inverse(information)[np.ix_(kept, kept)])

@@ -74,7 +74,7 @@ def deviations(
     ----------
     covariance : (n, n) posterior, the prior counted once
     observed : (D,) bool, optional
-        Coordinates that the data tell of at all; others are unknown however small their variance is.
+        Coordinates that the data observe at all; others are unknown however small their variance is.
     """
     tree = body.tree
     prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])
@@ -96,7 +96,7 @@ def evidence_of(scene: Scene, matched: Sequence[Matched]) -> Evidence:
     """What matches say of each segment at a scene's state."""
     told = Evidence.none(len(scene.body.tree.segments))
     for m in matched:
-        told = told + m.evidence(scene)
+        told = told + m.evidence(scene.at_time(m.time))
     return told
 
 

@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, LineFrame, MarkerFrame, PointCloud, SilhouetteFrame
 from kinefit.sensors.background import Background
-from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.image_lines import ImageLineSensor
 from kinefit.sensors.keypoints import NAME as KEYPOINTS
@@ -40,7 +40,9 @@ class Sensors:
     Raises
     ------
     ObservationError
-        Two sensors of one name; a standard deviation that is not positive.
+        Two sensors of one name, or one without; a standard deviation that is not positive.
+    CalibrationError
+        A camera of `on_body` that the rig does not have.
     """
 
     def __init__(
@@ -53,11 +55,14 @@ class Sensors:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
         self._sensors: dict[str, Sensor] = {}
         for sensor in own:
+            if not isinstance(sensor, Sensor) or not isinstance(sensor.name, str) or not sensor.name:
+                problem = f"a sensor of one's own, {type(sensor).__name__}, has no name"
+                raise ObservationError(problem, remedy="Derive it from Sensor, and give it a name.")
             if sensor.name in self._sensors:
                 raise ObservationError(f"two sensors are named '{sensor.name}'", remedy="Give each its own name.")
             self._sensors[sensor.name] = sensor
         self._own = frozenset(self._sensors)
-        self._backgrounds: dict[str, Background | None] = dict.fromkeys(on_body)
+        self._backgrounds: dict[str, Background | None] = {rig[name].name: None for name in on_body}
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
@@ -75,17 +80,31 @@ class Sensors:
         pixels = [f for f in frames if isinstance(f, KeypointFrame) and f.sensor not in self._own]
         out = []
         for frame in frames:
-            if isinstance(frame, Measurement):
-                out.append(frame)
-            elif frame.sensor in self._own:
-                out.append(self._sensors[frame.sensor].prepare(frame, scene))
-            elif not isinstance(frame, KeypointFrame):
-                out.append(self._of_frame(frame).prepare(frame, scene))
-            elif frame is pixels[0]:
-                out.append(self.keypoints.prepare(pixels, scene))
-        for m in out:
-            _check_measurement(m)
+            with named(frame.sensor):
+                if isinstance(frame, Measurement):
+                    out.append(_checked(frame, frame.sensor))
+                elif frame.sensor in self._own:
+                    out.append(_checked(self._sensors[frame.sensor].prepare(frame, scene), frame.sensor))
+                elif not isinstance(frame, KeypointFrame):
+                    out.append(self._of_frame(frame).prepare(frame, scene))
+                elif frame is pixels[0]:
+                    out.append(self.keypoints.prepare(pixels, scene))
         return out
+
+    @property
+    def own(self) -> tuple[Sensor, ...]:
+        """Those of one's own, in the order of their names."""
+        return tuple(self._sensors[name] for name in sorted(self._own))
+
+    def learnt(self) -> list[dict[str, Any]]:
+        """What sensors of one's own have learnt so far; see `unlearn`."""
+        return [dict(vars(sensor)) for sensor in self.own]
+
+    def unlearn(self, before: Sequence[Mapping[str, Any]]) -> None:
+        """Set sensors of one's own back to what they had learnt."""
+        for sensor, known in zip(self.own, before, strict=True):
+            vars(sensor).clear()
+            vars(sensor).update(known)
 
     @property
     def keypoints(self) -> KeypointSensor:
@@ -117,8 +136,7 @@ class Sensors:
 
     def anew(self) -> Sensors:
         """The same sensors for another run over the take, which know the same backgrounds."""
-        own = [self._sensors[name] for name in sorted(self._own)]
-        out = Sensors(self.rig, self.rate, self.sigma, self.settings, own)
+        out = Sensors(self.rig, self.rate, self.sigma, self.settings, self.own)
         out._backgrounds = self._backgrounds
         return out
 
@@ -153,10 +171,13 @@ class Sensors:
         return SilhouetteSensor(self.rig[name], sigma, self.settings)
 
 
-def _check_measurement(m: Any) -> None:
-    if not isinstance(m, Measurement) or not isinstance(getattr(m, "sensor", None), str):
-        problem = f"a sensor's `prepare` gave a {type(m).__name__}"
+def _checked(m: Any, sensor: str) -> Measurement:
+    if not isinstance(m, Measurement) or getattr(m, "sensor", None) != sensor:
+        problem = f"`prepare` of sensor '{sensor}' gave a {type(m).__name__}"
         raise ObservationError(problem, remedy="It must return a Measurement with the name of its `sensor`.")
+    if not np.isfinite(getattr(m, "time", np.nan)):
+        raise ObservationError(f"a measurement of sensor '{sensor}' has no time", remedy="Give it in seconds.")
+    return m
 
 
 def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:

@@ -1,7 +1,7 @@
-"""How far surfaces tell where bones are: the body's surface lies only about where it is on the person's skeleton.
+"""How far surfaces determine where bones are: the body's surface lies only about where it is on the person's skeleton.
 
 What a surface of simple shapes is off by on a person, and soft tissue, moves every row of a segment alike, in all
-sensors that see surfaces and for as long as the take lasts. However many rows there are, they tell a segment's pose no
+sensors that see surfaces and for as long as the take lasts. However many rows there are, they give a segment's pose no
 better than that. With the segment's surface shifted and turned by an unknown e ~ N(0, Σ), the normal equations
 (H, g) of a segment's rows become
 
@@ -25,7 +25,7 @@ from kinefit.rows import DofRows, Rows
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels
 
-_TINY = 1e-9  # of a segment's largest eigenvalue: below it a direction is not told
+_TINY = 1e-9  # of a segment's largest eigenvalue: below it a direction is not observed
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Skin:
     sigma: NDArray
 
     def rows(self) -> DofRows:
-        """The same as six rows a segment, of directions that are told."""
+        """The same as six rows a segment, of directions that are observed."""
         values, vectors = np.linalg.eigh(self.H)
         told = values > _TINY * np.maximum(values[:, -1:], 1e-12)
         s, k = np.nonzero(told)

@@ -1,4 +1,4 @@
-"""Where a body may be when nothing tells from before: from markers, from keypoints of several cameras, from depth."""
+"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def starts_from_views(
 def known_points(
     frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
 ) -> tuple[PointSet, NDArray]:
-    """Points of the body with their places (K, 3) [m] in the world, as all measurements tell them; NaN where not."""
+    """Points of the body with their places (K, 3) [m] in the world, as all measurements show them; NaN where not."""
     told = list(measurements)
     if not told:
         pixels = [f for f in frames if isinstance(f, KeypointFrame)]

@@ -17,7 +17,7 @@ from kinefit.sensors.depth_view import DepthView
 
 TOLERANCE = 0.10  # [m] a drawn surface this far from the measured one explains nothing: the radius of a thigh
 OVERLAP = 0.5  # [1/m] share of the score that a metre of parts within parts costs: 2 cm, the softness of flesh, 1 %
-POSTURE = 0.004  # share of the score that one standard deviation of every angle from the usual posture costs
+POSTURE = 0.004  # share of the score that one standard deviation of every angle from the prior mean costs
 
 
 def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
@@ -35,7 +35,7 @@ def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
 
 
 def spreads(body: Body) -> NDArray:
-    """(D,) [rad or m] spread of each coordinate's usual values; half its range at most, and 1 without any limit."""
+    """(D,) [rad or m] prior standard deviation of each coordinate; half its range at most, and 1 without any limit."""
     tree = body.tree
     half = 0.5 * (tree.upper - tree.lower)
     return np.minimum(tree.spread, np.where(np.isfinite(half), half, 1.0))

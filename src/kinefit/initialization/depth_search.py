@@ -17,7 +17,7 @@ from kinefit.rows import AnyRows
 from kinefit.sensors.depth_view import DepthView, geodesic_ends
 from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_marquardt
 
-POINTS = 700  # measured points that take part in a fit: more do not tell postures apart
+POINTS = 700  # measured points that take part in a fit: more do not distinguish postures better
 FACING = 0.02  # of the score: a person rather faces the sensor (twice that for one turned away) ...
 UPRIGHT = 0.05  # ... and stands or sits upright (that for one who lies); for what is alike from both sides
 YAWS, LEANS = np.arange(0.0, 2 * np.pi, np.pi / 6), ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg]
@@ -72,7 +72,7 @@ class Search:
         return cost
 
     def trunks(self, count: int) -> list[BodyState]:
-        """The best places of trunk and head, the limbs in usual posture: put behind thick parts, turned every way."""
+        """The best places of trunk and head, the limbs at the prior mean: put behind thick parts, turned every way."""
         roots = self._places()
         angles = np.repeat(self.body.usual_state().angles[None], len(roots), axis=0)
         core = self.score.core

@@ -41,11 +41,11 @@ class Start:
     ----------
     state : BodyState
     score : float, 1 at best
-        Share of the person that the body explains, less what contradicts it. 0.5 is usual for a body of another
+        Share of the person that the body explains, less what contradicts it. 0.5 is common for a body of another
         person's size, 0.8 for the right one.
     visible : (S,) in 0..1
         Share of each segment that the sensor could see. One that is 0 (beside the image, behind another part) is
-        held by the usual posture alone.
+        held by the prior posture alone.
     """
 
     state: BodyState
@@ -74,7 +74,7 @@ def start_from_points(
         the one that the body explains best is taken.
     camera : Camera of the sensor
     depth : (H, W) [m], optional
-        Its image, 0 where nothing was measured. It tells what is empty.
+        Its image, 0 where nothing was measured. It shows what is empty.
     up : (3,) upwards, in the world
     count : int, poses at most
     attempts : int

@@ -95,7 +95,7 @@ def pose_from_points(
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 
-    With no pose given two starts are tried, the usual posture laid on the points and turned about its long axis; the
+    With no pose given two starts are tried, the prior mean laid on the points and turned about its long axis; the
     cheaper end wins. `near` is a start that is known to be close, and the only one then.
 
     Raises

@@ -19,12 +19,12 @@ from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
 
-_TOLD = 0.35  # [rad] an angle less sure than that is not told by its frame, but by those before and after
+_TOLD = 0.35  # [rad] an angle less sure than that is not observed by its frame, but by those before and after
 _HELD = 0.1  # [m] likewise for the root
-_PRIOR = 0.95  # share of the usual posture's spread from which an angle is known by that alone
+_PRIOR = 0.95  # share of the prior standard deviation from which an angle is known by that alone
 _MEMORY = 0.3  # [s] in which the velocity of a body that is not seen forgets itself
 _WORSE = 0.3  # standard deviations that a frame's markers may fit worse for following its neighbours
-_OFF = 4.0  # times the take's usual misfit from which a frame is tried anew, from nowhere
+_OFF = 4.0  # times the take's median misfit from which a frame is tried anew, from nowhere
 _MOST_RUNS = 50  # of such frames
 
 
@@ -40,8 +40,8 @@ def fit_markers(
 ) -> Motion:
     """Motion of a body from labelled markers, each frame from the last, the first with no pose given.
 
-    What a frame does not tell (a limb whose markers are hidden) follows from the frames before and after it, and what
-    no frame tells is as usual for the body; error bars and quality say so.
+    What a frame does not show (a limb whose markers are hidden) follows from the frames before and after it, and what
+    no frame observes stays at the body's prior mean; error bars and quality say so.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.sensors.channels import Channels
 
 _NORMAL = 0.6745  # median |x| of a normal variable with standard deviation 1
-_INLIER = 0.25  # robust factor above which a residual tells of noise and not of an outlier
+_INLIER = 0.25  # robust factor above which a residual is noise and not of an outlier
 _FEW = 30  # samples of a point below which it is taken for as noisy as the others
 _SPAN = 0.5  # [s] over which residuals are followed
 
@@ -109,7 +109,7 @@ def _middle(values: NDArray) -> float:
 
 
 def _memory(r: NDArray, rate: float) -> tuple[float, bool]:
-    """Time [s] after which residuals are as different as they get, and whether that could be told."""
+    """Time [s] after which residuals are as different as they get, and whether that could be determined."""
     lags = np.unique(np.round(np.geomspace(1, max(_SPAN * rate, 2), 8)).astype(int))
     lags = lags[lags < len(r) // 2]
     if len(lags) < 2:

@@ -1,4 +1,4 @@
-"""What measurements can tell of a joint at all: how far a seen point moves when the joint turns."""
+"""What measurements can observe of a joint at all: how far a seen point moves when the joint turns."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def levers(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, 
 
 
 def near(told: NDArray, frames: int) -> NDArray:
-    """(F, D) bool: coordinates that are told of, (F, D) bool, in this frame or at most so many frames away."""
+    """(F, D) bool: coordinates that are observed, (F, D) bool, in this frame or at most so many frames away."""
     count = np.cumsum(np.concatenate([np.zeros((1, told.shape[1]), int), told]), axis=0)
     f = np.arange(len(told))
     return np.asarray(count[np.minimum(f + frames + 1, len(told))] > count[np.maximum(f - frames, 0)])

@@ -78,7 +78,7 @@ class DepthVideo(_Recording):
     near, far : float [m]
         Range gate: nothing measured outside of it is handed out.
     camera : Camera or None
-        What the recording itself tells of its sensor.
+        What the recording itself states of its sensor.
     background : DepthVideo or None
         The same sensor, standing where it stands, before the empty scene.
     on_body : bool

@@ -34,7 +34,7 @@ class Keypoints:
     camera : str
         Name of the camera in the rig.
     keypoint_set : str
-        Name of the set ("BODY_25B", "COCO_17", "HALPE_26", "MEDIAPIPE_33"); tells which names the columns have.
+        Name of the set ("BODY_25B", "COCO_17", "HALPE_26", "MEDIAPIPE_33"); says which names the columns have.
     names : (K,) names of the keypoints.
     rate : float [Hz]
     points : (F, P, K, 2) [px]
@@ -85,14 +85,14 @@ class Detections:
     ----------
     camera : str
     rate : float [Hz]
-    size : (width, height) [px] of the video's picture.
+    size : (width, height) [px] of the video's image.
     points : (F, P, 33, 2) [px]
-        Landmarks of MEDIAPIPE_33 in the video's picture; NaN where a person is not seen. P may be 0.
+        Landmarks of MEDIAPIPE_33 in the video's image; NaN where a person is not seen. P may be 0.
     confidence : (F, P, 33)
-        Probability that a landmark is in the picture and not hidden; 0 where a person is not seen.
+        Probability that a landmark is in the image and not hidden; 0 where a person is not seen.
     mask_runs : (N,)
         Lengths of the runs of all masks, one mask after the other by frame, then person: down the columns of the
-        picture, beginning outside of the person (COCO's uncompressed run-length code).
+        image, beginning outside of the person (COCO's uncompressed run-length code).
     mask_starts : (F * P + 1,)
         Where each mask begins in `mask_runs`; a mask without runs was not made.
     source : str
@@ -162,7 +162,7 @@ class Detections:
             raise ObservationError(
                 f"nobody is seen in any of the {len(self)} frames of camera {camera or self.camera}",
                 file=self.source or None,
-                remedy="The detector wants a person of a tenth of the picture's height or more; leave this camera out.",
+                remedy="The detector wants a person of a tenth of the image's height or more; leave this camera out.",
             )
         points = self.points if image_frame is None else image_frame.to_calibration(self.points)
         return Keypoints(

@@ -1,4 +1,4 @@
-"""Pose from silhouettes as Rosenhahn and Klette print it (P1 4.1): extract, find the rim, pair, fit by rays, again.
+"""Pose from silhouettes as Rosenhahn and Klette print it (P1 4.1): contour, occluding contour, pairs, rays, again.
 
 1. The image's silhouette comes from a threshold on colour and the Laplace operator.
 2. The model's 3D silhouette comes from its projection in a virtual image, anew in every cycle.
@@ -41,7 +41,7 @@ class PaperFit:
     Parameters
     ----------
     state : BodyState
-    error : float [m] root mean square distance of the rim points from their rays.
+    error : float [m] root mean square distance of the contour's points from their rays.
     cycles : int
     """
 
@@ -82,7 +82,7 @@ def pose_from_contours(
     Raises
     ------
     ObservationError
-        No contour has a point near the rim of the body.
+        No contour has a point near the occluding contour of the body.
     """
     mesh = body_mesh(body) if mesh is None else mesh
     finder = RimFinder(mesh) if finder is None else finder

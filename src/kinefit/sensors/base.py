@@ -19,11 +19,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.errors import ObservationError
-from kinefit.rows import AnyRows, DofRows, PairRows, Rows
+from kinefit.rows import AnyRows, PairRows, ParameterRows
+from kinefit.sensors.checks import check_rows, named
 from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
@@ -47,7 +48,7 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What a measurement tells of the body where nothing is known of its pose.
+    """What a measurement shows of the body where nothing is known of its pose.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ class Matched(ABC):
 
     @property
     def key(self) -> bytes:
-        """The same for matches that make the same rows: what tells a fit that nothing discrete changes any more."""
+        """The same for matches that make the same rows: what shows a fit that nothing discrete changes any more."""
         return b""
 
     @abstractmethod
@@ -119,10 +120,12 @@ class Matched(ABC):
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """What the fit leaves over; by default of each segment the rows' signed median, RMS and number [m]."""
-        parts = [r for r in self.rows(scene) if isinstance(r, Rows)]
-        residual = np.concatenate([np.zeros(0), *(r.residual for r in parts)])
-        segment = np.concatenate([np.zeros(0, np.int64), *(r.segment for r in parts)])
-        return [by_segments(self.sensor, scene.body, residual, segment, "m")]
+        residual, segment = [np.zeros(0)], [np.zeros(0, np.int64)]
+        for rows in self.rows(scene):
+            for segments in _segments(rows):
+                felt = rows.weight > 0.0
+                residual, segment = [*residual, rows.residual[felt]], [*segment, segments[felt]]
+        return [by_segments(self.sensor, scene.body, np.concatenate(residual), np.concatenate(segment), "m")]
 
     def evidence(self, scene: Scene) -> Evidence:
         """What it says of each segment; by default every group of rows speaks for its segments, or against them."""
@@ -153,7 +156,7 @@ class Measurement(ABC):
         """Correspondences at a scene's state, within a distance [m]."""
 
     def hints(self, scene: Scene) -> Hints:
-        """What it tells where no pose is known."""
+        """What it shows where no pose is known."""
         return Hints()
 
     def depth_image(self) -> DepthSeen | None:
@@ -182,20 +185,38 @@ class Sensor(ABC):
         """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:  # noqa: B027
-        """Learn from a step that was accepted; `sure` where no segment is lost."""
+        """Learn from a step that was accepted; `sure` where no segment is lost.
+
+        Replace what was learnt by something new, rather than change it in place: where another sensor of the step
+        fails, the attributes of this one are set back. What a later match needs of it belongs into the measurement, so
+        that smoothing sees each time as it was.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class RowsOf(Matched):
-    """A match that is no more than a function from scenes to rows."""
+    """A match that is no more than a function from scenes to rows.
+
+    Parameters
+    ----------
+    make : scene -> rows
+    about : further arguments of it
+    labels : array, optional; what is discrete of the match, such as which point has which name: its `key`
+    """
 
     make: Any
     about: Mapping[str, Any] = field(default_factory=dict)
+    labels: ArrayLike | None = None
+
+    @property
+    def key(self) -> bytes:
+        """The same for the same labels."""
+        return b"" if self.labels is None else np.asarray(self.labels).tobytes()
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """As the function makes them."""
         made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
-        return [made] if isinstance(made, AnyRows) else list(made)
+        return [made] if isinstance(made, AnyRows) else made
 
 
 def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
@@ -206,7 +227,8 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
     ObservationError
         What a sensor's `match` gave is no match.
     """
-    matched = measurement.match(scene.at_time(measurement.time), reach)
+    with named(measurement.sensor):
+        matched = measurement.match(scene.at_time(measurement.time), reach)
     if not isinstance(matched, Matched):
         problem = f"`match` of sensor '{measurement.sensor}' gave a {type(matched).__name__}"
         raise ObservationError(problem, remedy="It must return a Matched, such as RowsOf(function).")
@@ -218,11 +240,18 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
 
 def rows_at(matched: Matched, scene: Scene) -> list[AnyRows]:
     """Rows of a match, with the body where it is at the time of the measurement; see `check_rows` for errors."""
-    return check_rows(matched.rows(scene.at_time(matched.time)), matched.sensor, scene.body)
+    with named(matched.sensor):
+        rows = matched.rows(scene.at_time(matched.time))
+    return check_rows(rows, matched.sensor, scene.body)
+
+
+def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:
+    """What the fit leaves over of a match, with the body where it is at the time of the measurement."""
+    return matched.leftovers(scene.at_time(matched.time))
 
 
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
-    """Residuals (N,) of points on segments (N,), told segment by segment."""
+    """Residuals (N,) of points on segments (N,), segment by segment."""
     count = np.bincount(segment, minlength=len(body.tree.segments))
     median, rms = np.full(len(count), np.nan), np.full(len(count), np.nan)
     for s in np.flatnonzero(count):
@@ -236,35 +265,19 @@ def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, uni
 
 def _groups(rows: AnyRows) -> list[tuple[set[int], float]]:
     """Segments and squared residual, in variances, of each measurement in some rows."""
-    if isinstance(rows, PairRows):
-        square = rows.weight * rows.residual**2
-        return [({int(a), int(b)}, float(s)) for (a, b), s in zip(rows.segments, square)]
-    if not isinstance(rows, Rows) or isinstance(rows, DofRows):
+    segments = _segments(rows)
+    if isinstance(rows, ParameterRows) or not segments:
         return []
-    ids = np.where(rows.group < 0, rows.group.max(initial=-1) + 1 + np.arange(len(rows)), rows.group)
-    square = np.bincount(ids, rows.weight * rows.residual**2)
-    return [({int(s) for s in rows.segment[ids == i]}, float(square[i])) for i in np.unique(ids)]
+    felt = rows.weight > 0.0
+    group = np.full(len(rows), -1) if isinstance(rows, PairRows) else rows.group
+    ids = np.where(group < 0, group.max(initial=-1) + 1 + np.arange(len(rows)), group)[felt]
+    square = np.bincount(ids, (rows.weight * rows.residual**2)[felt])
+    return [({int(s) for of in segments for s in of[felt][ids == i]}, float(square[i])) for i in np.unique(ids)]
 
 
-def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
-    """Rows as a sensor of someone's own made them, or an error that names the sensor.
-
-    Raises
-    ------
-    ObservationError
-        No rows, or on segments or degrees of freedom that the body does not have.
-    """
-    from kinefit.errors import ObservationError
-
-    parts = [rows] if isinstance(rows, AnyRows) else rows
-    if not isinstance(parts, Sequence) or not all(isinstance(p, AnyRows) for p in parts):
-        kinds = type(rows).__name__
-        remedy = "`rows` must return Rows, PairRows, ParameterRows or DofRows, or a list of them."
-        raise ObservationError(f"sensor '{sensor}' gave a {kinds}", remedy=remedy)
-    count = len(body.tree.segments)
-    for p in parts:
-        used = p.segment if isinstance(p, Rows) else p.segments if isinstance(p, PairRows) else np.empty(0, np.int64)
-        if used.size and not 0 <= used.min() <= used.max() < count:
-            problem = f"sensor '{sensor}' has rows on segment {int(used.max())}; body '{body.name}' has {count}"
-            raise ObservationError(problem, remedy="Use body.tree.segment(name), or the segments of a point set.")
-    return list(parts)
+def _segments(rows: AnyRows) -> list[NDArray]:
+    """(N,) segments that rows are about: one each, two of pairs, none of rows on degrees of freedom."""
+    if isinstance(rows, PairRows):
+        return [rows.segments[:, 0], rows.segments[:, 1]]
+    of = None if isinstance(rows, ParameterRows) else rows.segment
+    return [] if of is None else [of]

@@ -13,7 +13,7 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 
-_CLOCK = 0.01  # frames that no clock tells
+_CLOCK = 0.01  # frames, below the resolution of any clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def make_channels(
     ----------
     keypoints : Q records, all with the same frames.
     people : Q arrays (F,) int, which person of each record; -1 for none.
-    sigma : (Q,) [px] accuracy of each record.
+    sigma : (Q,) [px] standard deviation of each record.
     """
     if not keypoints:
         raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")

@@ -117,7 +117,7 @@ class DepthImageMeasurement(Measurement):
         self._judged: tuple[BodyState, NDArray] | None = None
         self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
         patches = surface.areas.sum() / (s.patch**2 * max(len(surface.samples), 1))
-        self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is told of by both
+        self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is measured by both
 
     @property
     def depth(self) -> NDArray:

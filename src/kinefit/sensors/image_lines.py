@@ -20,7 +20,7 @@ from kinefit.sensors.scene import Scene
 
 
 class ImageLineSensor(Sensor):
-    """Lines in the images of one camera, told by name.
+    """Lines in the images of one camera, known by name.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class ImageLineSensor(Sensor):
             frame.names,
         )  # fmt: skip
         scene.rig.index(frame.sensor)
-        made.points_of(scene.body)  # which tells what the body lacks
+        made.points_of(scene.body)  # an error where the body lacks one
         return made
 
 

@@ -51,7 +51,7 @@ class Layout:
 
     @cached_property
     def informs(self) -> NDArray:
-        """(S, N) 0 or 1: channels that tell where a segment is."""
+        """(S, N) 0 or 1: channels that show where a segment is."""
         return informing(self.body, self.channels)
 
     def points_of(self, body: Body) -> PointSet:
@@ -68,13 +68,13 @@ class Layout:
 
 
 class KeypointSensor(Sensor):
-    """The detectors of all cameras of a rig, as one sensor: only together they tell left from right.
+    """The detectors of all cameras of a rig, as one sensor: only together they distinguish left from right.
 
     Parameters
     ----------
     rig : Rig
     sigma : {camera: standard deviation [px] of a keypoint with confidence 1}
-    usual : float [px] that of a camera that none is given for
+    usual : float [px] default, of a camera that none is given for
     loss : Loss of a keypoint, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
     """
@@ -234,17 +234,11 @@ class KeypointMatched(Matched):
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
     """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
-    x = scene.positions(layout.points_of(scene.body))
-    out = np.empty((len(x), 2))
-    for c, camera in enumerate(scene.rig):
-        mine = layout.channels.camera == c
-        if mine.any():
-            out[mine] = camera.project(x[mine])
-    return out
+    return scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
 
 
 def informing(body: Body, channels: Channels) -> NDArray:
-    """(S, N) 0 or 1: channels that tell where a segment is: those on it and those at its children's joints.
+    """(S, N) 0 or 1: channels that show where a segment is: those on it and those at its children's joints.
 
     A segment without any is known through its children.
     """

@@ -17,7 +17,7 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
-_AT_JOINT = 0.05  # [m] from a joint: such a point tells of the segments on both sides of it
+_AT_JOINT = 0.05  # [m] from a joint: such a point is evidence for the segments on both sides of it
 
 
 class MarkerSensor(Sensor):

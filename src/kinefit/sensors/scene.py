@@ -65,7 +65,10 @@ class Scene:
         return out
 
     def at_time(self, time: float) -> Scene:
-        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own."""
+        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own.
+
+        Velocities hold for about a frame: a clock that is farther off must be set right beforehand.
+        """
         if self.velocity is None or not abs(time - self.time) > 1e-9:
             return self
         return self.at(self.state.retract((time - self.time) * self.velocity), time=time)
@@ -89,7 +92,7 @@ class Scene:
 
     @property
     def morphing(self) -> Morphing | None:
-        """Of a body whose joints move with its angles; None where the tree alone tells where segments are."""
+        """Of a body whose joints move with its angles; None where the tree alone places the segments."""
         if "morphing" not in self._shared:
             moving = None
             if self.body.morphs:

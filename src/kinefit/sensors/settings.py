@@ -36,7 +36,7 @@ class TrackSettings:
         Standard deviation of a sensor that none is given for.
     outline : int [px]
         Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
-        and the room about. Outlines are told to parts of a pixel.
+        and the room about. Outlines are found to parts of a pixel.
     angle : float [rad]
         Largest angle between normals of two outlines of which points are paired.
     background : float [s]
@@ -49,7 +49,7 @@ class TrackSettings:
         Softness of what parts that run into each other are kept apart with, and how far they may. See
         `collision_rows`.
     skin_shift, skin_turn : float [m], [rad]
-        Standard deviations by which a segment's surface is shifted and turned about its bone: what surfaces tell of
+        Standard deviations by which a segment's surface is shifted and turned about its bone: what surfaces measure of
         joints is no better, however many points of them are seen.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
@@ -57,7 +57,7 @@ class TrackSettings:
         How long a velocity lasts that nothing confirms.
     loss : Loss of keypoints and markers, in their standard deviations.
     pause : float [s]
-        A longer gap between frames tells nothing of the velocity any more; a clock that goes back further was set.
+        A longer gap between frames leaves the velocity unknown; a clock that goes back further was set.
     search : bool
         Whether what is lost is sought: a limb takes 50 ms of one core, a whole body 2 s. Without it every frame takes
         as long as any other, and `start_at` is the only start.

@@ -25,8 +25,8 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
-_AGREES = 3.0  # standard deviations of a rim that agrees
-_STALE = 0.5  # [px] by which a body may have moved in the virtual image: half of how far beside its rim it is looked at
+_AGREES = 3.0  # standard deviations within which a contour agrees
+_STALE = 0.5  # [px] by which a body may have moved in the virtual image: half of how far beside its contour one looks
 _LIMB = 0.04  # [m] radius of a forearm: an outline farther off is another part's, however poor the masks are
 _SPACING = 2.0  # [px] between points of an outline, in the image in which they are compared
 _LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
@@ -104,7 +104,7 @@ class SilhouetteMeasurement(Measurement):
         seen = scene.surface.rims(self.camera).drawn(self.camera) >= 0
         self.mask = choose_person(mask, cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
         self.outline = np.ascontiguousarray(outline(self.mask)[:, :: max(round(1.3 * _SPACING), 1)])
-        # Over a patch of the surface the errors of an outline are alike, and every place is told of from both sides.
+        # Over a patch of the surface the errors of an outline are alike, and every place is measured from both sides.
         share = min(_SPACING / (of.settings.patch * self.pixels_per_metre), 1.0)
         self._row_sigma = self.sigma / np.sqrt(share / 2.0)
 

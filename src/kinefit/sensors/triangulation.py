@@ -25,7 +25,7 @@ def triangulated_frame(
     """Points (K, 3) [m] of one frame on which two cameras agree, NaN elsewhere; and which sources were exchanged.
 
     Where exchanging left and right in some sources makes more of them agree, it is done: one source after the other,
-    the best first. (Q,) bool tells which.
+    the best first. (Q,) bool says which.
     """
     swapped = np.zeros(len(channels.sources), bool)
     best, support = _agreed(channels, uv, confidence, swapped, max_residual_px)

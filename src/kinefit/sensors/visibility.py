@@ -21,7 +21,7 @@ from kinefit.sensors import _kernels_visibility as kernels
 from kinefit.sensors.evidence import Evidence
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
-FEWEST = 16  # pixels of a whole outline: fewer tell less of a segment
+FEWEST = 16  # pixels of a whole outline: fewer say too little of a segment
 DEVIATIONS = 3.0  # of a measurement that agrees
 
 

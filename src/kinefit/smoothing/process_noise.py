@@ -1,4 +1,4 @@
-"""How lively a person is and how noisy a detector: estimated from the take that is smoothed."""
+"""Process noise of a person and noise of a detector: estimated from the take that is smoothed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
 
-INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
+INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual is noise
 _RAYLEIGH = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ²
 _MEDIAN = 0.4549  # of a squared normal variable
 _ROWS = 30  # of a sensor, with fewer of which its standard deviation stays as it is stated
@@ -30,7 +30,7 @@ _BURST = 0.15  # [s] over which a limb is taken to be equally lively: half of a 
 
 @dataclass(frozen=True, eq=False)
 class Strength:
-    """What a take tells of itself.
+    """What is estimated from a take.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ class Strength:
 class SmoothTake:
     """Measurements of all frames as used (left and right put right), and states to start from.
 
-    `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): how much livelier
-    than usual each degree of freedom is; `others`: what all sensors but the keypoints measured, `linear` the same about
+    `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): its process noise
+    over time, as a factor; `others`: what all sensors but the keypoints measured, `linear` the same about
     the states.
     """
 
@@ -115,7 +115,7 @@ class SmoothTake:
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """All frames together, from where they are."""
         lower, upper, usual = boxes(self.body.tree, self.angles)
-        never = ~self.told.any(axis=0)  # stays at the usual posture
+        never = ~self.told.any(axis=0)  # stays at the prior mean
         lower[:, never] = upper[:, never] = usual[:, never]
         prior = MotionPrior(strength.acceleration, self.memory, self.dt, usual, self.body.tree.spread, self.live)
         make = self.seen(strength.sigma).equations(self.body)
@@ -132,7 +132,7 @@ def estimate(
 ) -> tuple[Strength, list[SmoothTake], int]:
     """Accelerations, liveliness and pixel noise at which neither changes any more (empirical Bayes, MacKay 1992).
 
-    With γ = Σ (1 − var(r)/a²), how many of the changes r the pixels tell of, a² = Σ r² / γ; and likewise for pixels.
+    With γ = Σ (1 − var(r)/a²), how many of the changes r the pixels observe, a² = Σ r² / γ; and likewise for pixels.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def _largest_change(old: dict[str, float], new: dict[str, float]) -> float:
 
 
 def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray, NDArray]:
-    """(T, n) squares of r over what is usual of them, and how far the pixels tell of each, 0..1; zero where unknown."""
+    """(T, n) squares of r over their prior variance, and how far the pixels observe each, 0..1; zero where unknown."""
     squares, informed = np.zeros((2, *take.live.shape))
     _, weight = fit.prior.rows(len(fit.changes))
     squares[2:-1] = np.square(fit.changes[2:]) * fit.prior.weight
@@ -224,7 +224,7 @@ def _changes(take: SmoothTake, fit: Smoothed, post: Posterior) -> tuple[NDArray,
 
 
 def _liveliness(body: Body, dt: float, squares: NDArray, informed: NDArray) -> NDArray:
-    """(T, n) how much more than usual each limb accelerates at a time, over all its degrees of freedom together."""
+    """(T, n) how much more than its mean each limb accelerates at a time, over all its degrees of freedom together."""
     reach = max(int(np.ceil(3.0 * _BURST / dt)), 1)
     bell = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) * dt / _BURST))
     limb = limbs(body)
@@ -258,7 +258,7 @@ def alike(body: Body) -> NDArray:
 
 
 def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: NDArray) -> NDArray:
-    """(n,) by what factor each should change: to start (n,), where the take tells little."""
+    """(n,) by what factor each should change: to start (n,), where the take says little."""
     squares, informed = np.bincount(groups, squares)[groups], np.bincount(groups, informed)[groups]
     own = 0.5 * np.log(np.maximum(squares, 1e-12) / np.maximum(informed, 1e-12))
     share = informed / (informed + _FRAMES)

@@ -20,7 +20,7 @@ from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
-_FEW = 5  # frames of a channel, with fewer of which it tells nothing of what lasts
+_FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
 
 @dataclass(eq=False)

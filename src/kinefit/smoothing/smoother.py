@@ -1,4 +1,4 @@
-"""A whole take at once: every frame fitted together with a motion prior whose process noise the take itself tells."""
+"""A whole take at once: all frames fitted together with a motion prior whose process noise the take determines."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def smooth_results(
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
         matched += () if take.linear is None else take.linear.matched[f]
-        scene = scene_of(state, result.time)
+        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         told = take.told[f]
         smoothed.append(judged(scene, covariances[f], matched, result.iterations, observed=told))
     return SmoothedTake(smoothed, take, took_part, _told(take, strength, rounds))

@@ -55,7 +55,7 @@ def with_lasting_errors(
     Parameters
     ----------
     results : F neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
-    subject : with the shape that the take told; without one it is taken for exact.
+    subject : with the shape that was estimated from the take; without one it is taken for exact.
     take : the pixels as they were used, and the states
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors
@@ -113,15 +113,13 @@ def lasting(
     J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
     Jq = J[:, :, :n].reshape(-1, n)
     each = np.repeat(weight, 2)
-    H = product((Jq * each[:, None]).T, J.reshape(len(each), -1))
+    H = product((Jq * each[:, None]).T, J.reshape(len(each), J.shape[2]))
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
     alone = inverse(H[:, :n] + other_information + prior)
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
-    pushes = [last]
-    for q, shift in enumerate(noise.shift):
-        mine = channels.source == q
-        pushes.append(product(weight[mine][None], J[mine, :, :n].reshape(-1, 2 * n)).reshape(2, n) * shift[:, None])
-    push = np.concatenate(pushes)
+    of_source = [channels.source == q for q in range(len(noise.shift))]
+    shifted = [product(weight[q][None], J[q, :, :n].reshape(int(q.sum()), 2 * n)).reshape(2, n) for q in of_source]
+    push = np.concatenate([last, *(p * shift[:, None] for p, shift in zip(shifted, noise.shift))])
     meat = product(push.T, push) + other_lasting
     answer = -product(alone, H[:, n:])
     dofs = product(product(alone, meat), alone)

@@ -45,7 +45,7 @@ def continued(tree: KinematicTree, before: NDArray, angles: NDArray) -> NDArray:
 
 
 def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Lower and upper ends and usual posture (T, D) in the charts of angles (T, D).
+    """Lower and upper ends and prior mean (T, D) in the charts of angles (T, D).
 
     Limits hold in one chart of a ball joint; where its angles stand in the other, or some turns on, so do these.
     """

@@ -1,7 +1,7 @@
 """The person's own size from the first depth frames: lengths of the limbs and girths of the surfaces.
 
 Gauss-Newton over the poses of a few frames and the logarithms of all sizes together: every measured point should lie
-on the surface nearest to it (point to plane), and no rim of the body should stand out where the sensor saw past it.
+on the surface nearest to it (point to plane), and no contour of the body should stand out where the sensor saw past it.
 Priors hold what was not seen.
 """
 
@@ -191,7 +191,7 @@ class _Problem:
         return found._replace(segment=np.where(away, -1, found.segment), distance=np.where(away, bound, found.distance))
 
     def _protruding(self, body: Body, state: BodyState, i: int) -> tuple[NDArray, NDArray, NDArray, int]:
-        """Points (M, 3) [m] on the person's outline where the body's rim (M,) segments should recede to.
+        """Points (M, 3) [m] on the person's outline where the body's occluding contour (M,) segments should recede to.
 
         Also how sure (M,) that is, and the number of points of the body's surface that were asked.
         """

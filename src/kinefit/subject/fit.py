@@ -61,9 +61,9 @@ class Subject:
     names, mean : (p,) of the parameters.
     covariance : (p, p) posterior, with the poses unknown and lasting errors counted.
     states : K poses, refined along.
-    information : (p, p) what the sensors tell, without the prior, lasting errors counted.
+    information : (p, p) what the sensors measure, without the prior, lasting errors counted.
     prior : Prior
-    excess : {sensor: factor} by which what its frames tell together is less certain than its rows say.
+    excess : {sensor: factor} by which what its frames measure together is less certain than its rows say.
     unmeasured : directions that the prior alone holds, the least measured first.
     cost : float
     rounds : of match and solve
@@ -109,6 +109,7 @@ def fit_subject(
     states: Sequence[BodyState],
     parameters: Sequence[Parameters],
     *,
+    times: Sequence[float] | None = None,
     velocities: Sequence[NDArray] | None = None,
     start: NDArray | None = None,
     reach: Sequence[float] = REACH,
@@ -125,7 +126,8 @@ def fit_subject(
     steps : K lists, what each sensor measured in a frame.
     states : K poses near the truth.
     parameters : kinds of them, applied in this order.
-    velocities : K of (6 + D,) [m/s, rad/s], optional; for measurements of other times than their frame's first.
+    times : (K,) [s] of the states, default that of the first measurement of each frame.
+    velocities : K of (6 + D,) [m/s, rad/s], optional; for measurements of other times than their state's.
     start : (p,) to start from, default the priors' means.
     reach : [m] of correspondences, round by round; the last for all further rounds.
     rounds : of match and solve, at most; correspondences that settle end it earlier.
@@ -143,6 +145,10 @@ def fit_subject(
     if not steps or len(steps) != len(states) or not all(len(several) for several in steps):
         problem = f"{len(steps)} frames of measurements with {len(states)} states"
         raise ObservationError(problem, remedy="Give one state for each frame, and measurements in each.")
+    given = {"times": times, "velocities": velocities}
+    wrong = [name for name, values in given.items() if values is not None and len(values) != len(steps)]
+    if wrong:
+        raise ObservationError(f"other {wrong[0]} than frames", remedy=f"Give {len(steps)}, one for each frame.")
     if rounds < 1 or not reach or (looks is not None and not looks > 0):
         problem = f"{rounds} rounds, {len(reach)} reaches, {looks} looks"
         raise ObservationError(problem, remedy="Give one round and one reach at least, and looks above 0.")
@@ -156,7 +162,7 @@ def fit_subject(
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
     told = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
-        frames = MatchedFrames(worlds, steps, velocities, theta, states, reach[min(used, len(reach)) - 1])
+        frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
         coarse, before = anew or used < min(len(reach), rounds), theta
         solved = solve(
             frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,

@@ -19,12 +19,12 @@ from kinefit.solvers.shape import PixelFrames, Shape, fit_shape
 
 Progress = Callable[[str, int, int], None]
 
-_SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take tells
+_SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
 _BELIEF = 5.0  # axes of points that this counts for
-_UNTOLD = 1.35  # variance of shapes found, over what they tell: limits, weights and spreads are taken for known there.
+_UNTOLD = 1.35  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
 _MOST_HIDDEN = 0.75  # share of all errors that a fit may be thought to follow
-_ROUNDS = 3  # of fits with a better spread; it changes by less than a tenth from then on
+_ROUNDS = 3  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
 _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
 
 
@@ -32,8 +32,8 @@ _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a
 class Subject:
     """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
 
-    `shape` tells from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a
-    body that was given. `length_share` (G,) is each scale's standard deviation over it, where other sensors told it.
+    `shape` says from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a
+    body that was given. `length_share` (G,) is each scale's standard deviation over it, where other sensors gave it.
     """
 
     body: Body
@@ -74,7 +74,7 @@ def fit_subject(
     body : Body, generic.
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
-    trial : what another trial of the same person told: lengths start from there, and stay as near as it was sure.
+    trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def _shape(
 ) -> tuple[Shape, NDArray]:
     """Shape, with as much freedom for a detector's points as this take asks for; and its covariance (p, p).
 
-    How far points stand from where the body has them is found as MacKay (1992) finds a prior's spread, beginning with
+    How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis.
     """
     spread, known, lengths, start = _SHIFT, 0.0, None, None
@@ -136,7 +136,7 @@ def _shape(
         moved = shape.theta - shape.parameters.mean
         open_to = np.isclose(np.diag(shape.prior), spread**-2)
         told = 1.0 - np.diag(covariance)[open_to] / spread**2
-        known = len(moved) - float(np.sum(shape.prior * covariance))  # how many parameters the pixels tell
+        known = len(moved) - float(np.sum(shape.prior * covariance))  # how many parameters the pixels observe
         told = float(np.sum(np.maximum(told, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
     return shape, _UNTOLD * covariance

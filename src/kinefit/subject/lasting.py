@@ -2,7 +2,7 @@
 
 A detector errs in the same place for every posture alike, skin and soft parts slide with it, a model is not the person.
 What lasts does not average out over the frames: the mean residual of a channel over F frames then varies by more than
-one F-th of the variance of a single one. That ratio is by how much the data of all frames tell less than they seem to.
+one F-th of the variance of a single one. That ratio is by how much the data of all frames say less than they seem to.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.solvers.whitened import residuals
 
-_FEWEST = 10  # residuals of a sensor, below which nothing is told of their errors
+_FEWEST = 10  # residuals of a sensor, below which nothing is said of their errors
 _MOST_HIDDEN = 0.75  # share of all lasting errors that a fit may be thought to follow
 _OUTLIER = 3.0  # standard deviations
 
@@ -55,7 +55,7 @@ class Seen:
 
 
 def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float]:
-    """{sensor: factor ≥ 1} by which the variance of what all frames tell together is larger than rows say.
+    """{sensor: factor ≥ 1} by which the variance of what all frames measure together is larger than rows say.
 
     A channel is a row's measurement id and its place in it; of surfaces also a whole segment, because their errors last
     over a patch.
@@ -63,7 +63,7 @@ def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float
     Parameters
     ----------
     frames : what every frame's sensors saw
-    followed : number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data tell.
+    followed : number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data give.
     """
     by_channel, by_segment = _collect(frames, _channels), _collect(frames, _segments)
     surfaces = {one.sensor for several in frames for one in several if not one.of_points}

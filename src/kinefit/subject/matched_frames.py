@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, check_rows, matched_by
+from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part
 from kinefit.subject.lasting import Seen
@@ -64,10 +64,10 @@ class MatchedFrames:
     """Frames with their correspondences: the problem that the solver sees."""
 
     def __init__(
-        self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], velocities: Sequence[NDArray] | None,
-        theta: NDArray, states: Sequence[BodyState], reach: float,
+        self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], times: Sequence[float] | None,
+        velocities: Sequence[NDArray] | None, theta: NDArray, states: Sequence[BodyState], reach: float,
     ) -> None:  # fmt: skip
-        self._worlds, self._steps, self._velocities = worlds, steps, velocities
+        self._worlds, self._steps, self._times, self._velocities = worlds, steps, times, velocities
         self._matched: list[list[Matched]] = []
         self._latest: dict[tuple[int, int], tuple[BodyState, World, list[AnyRows]]] = {}
         world = worlds.at(theta)
@@ -116,7 +116,7 @@ class MatchedFrames:
         same = kept is not None and kept[0] is scene.state
         if same and kept is not None and _alike(kept[1], world, sensor):
             return kept[2]
-        rows = check_rows(matched.rows(scene), sensor, world.body)
+        rows = rows_at(matched, scene)
         if not same:
             self._latest[key] = scene.state, world, rows
         return rows
@@ -124,13 +124,14 @@ class MatchedFrames:
     def _scene(self, world: World, frame: int, state: BodyState) -> Scene:
         several = self._steps[frame]
         velocity = None if self._velocities is None else self._velocities[frame]
+        time = several[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
-        return scene.at(state, time=several[0].time, velocity=velocity, measurements=several)
+        return scene.at(state, time=time, velocity=velocity, measurements=several)
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
     """Names of the points that a match counts, where it has those of one detector or marker system only."""
-    told = matched.leftovers(scene) if matched.of_points else []
+    told = leftovers_at(matched, scene) if matched.of_points else []
     return told[0].names if len(told) == 1 and told[0].rms is None else None
 
 

@@ -1,6 +1,6 @@
 """What a subject fit may find: parameters of a world, each kind of them a few lines.
 
-A kind of parameter is a prior and a function from values to a world. Nothing is told of derivatives, and no sensor
+A kind of parameter is a prior and a function from values to a world. Derivatives are differences, and no sensor
 knows of parameters: the solver compares the rows of the same correspondences in worlds that differ a little.
 """
 
@@ -44,34 +44,26 @@ class World:
 
 
 class Parameters(Protocol):
-    """One kind of parameters.
-
-    Attributes
-    ----------
-    names : (p,)
-    mean : (p,) what is thought of them before.
-    information : (p, p) inverse covariance of the prior.
-    step : (p,) from which derivatives are taken.
-    """
+    """One kind of parameters: names, a prior, and a function from values to a world."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(p,)."""
+        """(p,) names, each of one parameter."""
         ...
 
     @property
     def mean(self) -> NDArray:
-        """(p,)."""
+        """(p,) prior mean."""
         ...
 
     @property
     def information(self) -> NDArray:
-        """(p, p)."""
+        """(p, p) inverse covariance of the prior."""
         ...
 
     @property
     def step(self) -> NDArray:
-        """(p,)."""
+        """(p,) steps of the central differences."""
         ...
 
     def apply(self, world: World, values: NDArray) -> World:

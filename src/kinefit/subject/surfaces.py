@@ -107,7 +107,7 @@ def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
 
 @dataclass(frozen=True, eq=False)
 class AnnyShape:
-    """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a usual shape.
+    """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a mean shape.
 
     It makes the body anew, so it goes before all other parameters; lengths beside the shape's are `SegmentScales` after
     it, and the body that is fitted is one of the model's.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover, Matched, Measurement
+from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.settings import TrackSettings
@@ -20,6 +20,7 @@ from kinefit.smoothing.fixed_lag import FixedLag
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Followed
 from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
+from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.uncertainty import with_lasting_errors
@@ -88,12 +89,13 @@ def motion_of(
         results, take, weight = done.results, done.take, done.weight
         provenance["smoothing"] = done.provenance
         others, matched = take.others, None if take.linear is None else take.linear.matched
-        leftovers = _leftovers(results, frames.scene_of)
+        leftovers = _leftovers(results, frames.scene_of, others, take)
     else:
         if lag is not None:
             results, provenance["fixed lag"] = _behind(frames, body, settings, lag, noise)
-            leftovers = _leftovers(results, frames.scene_of)
         take = pixels_of_track(body, channels, results, rate, settings)
+        if lag is not None:
+            leftovers = _leftovers(results, frames.scene_of, others, take)
         factor = take.factors(channels.sigma, take.fitted(take.roots, take.angles))
         weight = take.confidence / np.square(channels.sigma) * factor
         if others is not None:
@@ -139,9 +141,15 @@ def _behind(
     return out, {"seconds": round(behind.seconds, 4), **behind.noise.as_told(body)}
 
 
-def _leftovers(results: Sequence[FrameResult], scene_of: SceneOf) -> list[list[Leftover]]:
-    """What every sensor leaves over of results."""
-    return [[rest for m in r.matched for rest in m.leftovers(scene_of(r.state, r.time))] for r in results]
+def _leftovers(
+    results: Sequence[FrameResult], scene_of: SceneOf, others: OtherSensors | None, take: SmoothTake
+) -> list[list[Leftover]]:
+    """What every sensor leaves over of results, with the body where it is when each measured."""
+    out = []
+    for f, r in enumerate(results):
+        scene = scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
+        out.append([rest for m in r.matched for rest in leftovers_at(m, scene)])
+    return out
 
 
 def residuals_of(leftovers: Sequence[Sequence[Leftover]], results: Sequence[FrameResult]) -> dict[str, Residuals]:

@@ -161,7 +161,8 @@ def _sigmas(accuracy: float | Sequence[float], count: int) -> tuple[float, ...]:
     """One standard deviation [px] for each of the records."""
     values = np.asarray(accuracy, float).ravel()
     if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
-        raise ObservationError(f"accuracies {values}", remedy=f"Give one positive number of pixels, or {count}.")
+        problem = f"standard deviations {values}"
+        raise ObservationError(problem, remedy=f"Give one positive number of pixels, or {count}.")
     return tuple(float(v) for v in np.broadcast_to(values, count))
 
 

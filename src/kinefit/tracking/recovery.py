@@ -131,7 +131,7 @@ class Recovery:
         return not (hidden & seek).any()
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
-        """How much faster than usual a limb would have moved since it was last seen where it was, 1 at least."""
+        """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
         elapsed = time - float(self._good[seek].min())
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)

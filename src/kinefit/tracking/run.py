@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +63,7 @@ def run(
     sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
     tracker = Tracker(
         body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis, on_body=recording.on_body,
-        settings=settings, sensors=recording.sensors, values=values,
+        settings=settings, sensors=deepcopy(recording.sensors), values=values,
     )  # fmt: skip
     for name, depth in recording.backgrounds.items():
         tracker.know_background(name, depth)
@@ -82,7 +83,8 @@ def run(
         found = tracker.update(frames, time)
         if found is None:
             return None
-        one = KeptFrame.of(found, tracker.scene_of(found.state, time))
+        moving = {"measurements": found.measurements, "velocity": tracker.speed}
+        one = KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving))
         left[i], kept[i] = one.leftovers, one.measurements
         return one.result
 

@@ -13,7 +13,7 @@ from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
-from kinefit.sensors.base import Leftover, Measurement
+from kinefit.sensors.base import Leftover, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
 from kinefit.sensors.scene import Scene
@@ -40,13 +40,12 @@ class KeptFrame:
 
     @classmethod
     def of(cls, result: FrameResult, scene: Scene) -> KeptFrame:
-        """Of a result as a tracker gives it; the scene is at its state."""
-        scene = scene.at(result.state, measurements=result.measurements)
+        """Of a result as a tracker gives it; the scene is at its state, with its measurements and velocity."""
         pixels = tuple(m for m in result.matched if isinstance(m, KeypointMatched))
         return cls(
             replace(result, matched=pixels, measurements=()),
             tuple(m.compact() for m in result.measurements if not isinstance(m, KeypointMeasurement)),
-            tuple(rest for m in result.matched for rest in m.leftovers(scene)),
+            tuple(rest for m in result.matched for rest in leftovers_at(m, scene)),
         )  # fmt: skip
 
     def joined(self, later: KeptFrame) -> KeptFrame:

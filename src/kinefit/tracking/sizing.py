@@ -1,8 +1,8 @@
-"""The body fitted to the person of a recording: first by what tells it from nothing, then by all sensors together."""
+"""The body fitted to the person of a recording: first by what needs no pose, then by all sensors together."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import KinefitError, ObservationError, TrackingError
+from kinefit.frame.results import FrameResult
 from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
@@ -45,7 +46,7 @@ class Person:
     channels : the person's keypoints on this body
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
-    told : what there is to tell of it, for `Motion.provenance`
+    told : what there is to report of it, for `Motion.provenance`
     joint : what the fit of all sensors together found
     """
 
@@ -67,7 +68,7 @@ def fitted_to_person(
     Raises
     ------
     ObservationError
-        A trial, which tells lengths from keypoints, for a recording without keypoints of two cameras.
+        A trial, which knows lengths from keypoints, for a recording without keypoints of two cameras.
     KinefitError
         What the fits raise.
     """
@@ -83,7 +84,7 @@ def fitted_to_person(
         problem = f"the keypoints are of one camera only, {name}"
         raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
     if trial is not None and (cameras < 2 or not size):
-        problem = "a trial of the same person tells lengths by keypoints, and this recording has none of two cameras"
+        problem = "a trial of the same person gives lengths by keypoints, and this recording has none of two cameras"
         raise ObservationError(problem, remedy="Leave the trial out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
     if subject is not None:
@@ -173,20 +174,29 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None) 
         pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
     states = [tracked.results[k].state for k in chosen]
-    found = joint.fit_subject(body, r.rig, steps, states, parameters, loss=settings.loss, rounds=_MATCHES)
+    found = joint.fit_subject(
+        body, r.rig, steps, states, parameters, loss=settings.loss, times=[tracked.results[k].time for k in chosen],
+        velocities=[_velocity(tracked.results, k) for k in chosen], rounds=_MATCHES,
+    )  # fmt: skip
     told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
     person = _wearing(person, replace(person.subject, body=found.body), shape=told)
     return replace(person, start=begin, values=found.values, joint=found)
 
 
+def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
+    """(n,) [m/s, rad/s] of one of several results, from those beside it."""
+    a, b = results[max(k - 1, 0)], results[min(k + 1, len(results) - 1)]
+    return a.state.difference(b.state) / max(b.time - a.time, 1e-6)
+
+
 def _parameters(person: Person, measurements: list[Measurement]) -> list[Parameters]:
-    """What the sensors that took part can tell, beyond what the first fit found."""
+    """What the sensors that took part can estimate, beyond what the first fit found."""
     r, body = person.recording, person.subject.body
     out: list[Parameters] = []
     surfaces = any(not m.settled for m in measurements)
     cameras = len({k.camera for k in r.keypoints})
-    if surfaces and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
+    if surfaces and cameras < 2:  # a surface of simple shapes determines lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))

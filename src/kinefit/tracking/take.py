@@ -32,7 +32,7 @@ def track_take(
     Raises
     ------
     TakeError
-        Nothing in the take tells where the person is, or its subject's trial has another body.
+        Nothing in the take shows where the person is, or its subject's trial has another body.
     KinefitError
         What reading and tracking raise.
     """
@@ -42,7 +42,7 @@ def track_take(
     alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines or take.skin
     if take.silhouettes and not alone:
         raise TakeError(
-            "silhouettes alone do not tell where the body is to begin with", file=take.path, place="[[silhouette]]",
+            "silhouettes alone do not show where the body is to begin with", file=take.path, place="[[silhouette]]",
             remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:

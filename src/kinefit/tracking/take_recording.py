@@ -21,7 +21,7 @@ from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
 from kinefit.tracking.recording import Recording, spread
 
-_EMPTY = 30  # images of an empty scene that are looked at: more tell no more
+_EMPTY = 30  # images of an empty scene that are looked at: more add nothing
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
-from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.frame.fit import Fitted, FrameFit
 from kinefit.frame.prediction import Prediction
 from kinefit.frame.results import FrameResult
@@ -20,7 +20,7 @@ from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Measurement, Sensor
+from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
@@ -67,6 +67,11 @@ class Tracker:
         self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
         self.settings, self.values = settings or TrackSettings(), values or {}
         self.sensors = Sensors(rig, rate, accuracy or {}, self.settings, sensors, tuple(on_body))
+        unknown = [name for name in self.values if name not in {sensor.name for sensor in self.sensors.own}]
+        if unknown:
+            names = [sensor.name for sensor in self.sensors.own]
+            raise ObservationError(choices("sensor of one's own", unknown[0], names), remedy="Leave its values out.")
+        self._others: tuple[Scene, ...] = ()
         self.dropped = self.late = 0
         self._last: FrameResult | None = None
         self._time: float | None = None
@@ -125,7 +130,7 @@ class Tracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
         out = Tracker(
             self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings,
-            values=self.values,
+            sensors=self.sensors.own, values=self.values,
         )  # fmt: skip
         out.sensors, out._direction = self.sensors.anew(), -1.0
         out.start_at(state)
@@ -172,13 +177,16 @@ class Tracker:
             frames, subject, self.settings, smooth=smooth, contacts=contacts, up=axis_of(self.up), name=name, told=told
         )
 
-    def update(self, frames: Sequence[Any], time: float | None = None) -> FrameResult | None:
+    def update(
+        self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = ()
+    ) -> FrameResult | None:  # fmt: skip
         """Track one step of time from what the sensors saw then.
 
         Parameters
         ----------
         frames : of any sensors, or measurements; none where `time` is given: the body is then where it was going.
         time : float [s], default the frames' mean.
+        others : other bodies at this time, for sensors that must tell them apart; see `scene_of`.
 
         Returns
         -------
@@ -194,12 +202,14 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
-        before = self._time, self._recovery.clocks(), self.dropped, copy(self._prediction)
+        before = self._time, self._recovery.clocks(), self.dropped, copy(self._prediction), self._last
+        learnt, self._others = self.sensors.learnt(), tuple(others)
         try:
             return self._updated(frames, time)
-        except KinefitError:  # as if they had never come
-            self._time, clocks, self.dropped, self._prediction = before
+        except BaseException:  # as if they had never come
+            self._time, clocks, self.dropped, self._prediction, self._last = before
             self._recovery.set_clocks(clocks)
+            self.sensors.unlearn(learnt)
             raise
 
     def _updated(self, frames: Sequence[Any], time: float) -> FrameResult | None:
@@ -219,11 +229,13 @@ class Tracker:
         result = self._recovery.run(self, time, frames, measurements, result)
         self._last = result
         if result is not None:
-            scene = self._scene.at(result.state, time=time)
+            moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self._others}
+            scene = self._scene.at(result.state, time=time, **moving)
             for m in measurements:
                 sensor = self.sensors.of(m.sensor)
                 if sensor is not None:
-                    sensor.learn(m, scene, not result.lost.any())
+                    with named(m.sensor):
+                        sensor.learn(m, scene, not result.lost.any())
             if self._session is not None:
                 self._session.add(result, scene)
         return result
@@ -242,7 +254,7 @@ class Tracker:
         return self._fit.apart(scene)
 
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
-        scene = self._scene.at(state, time=time, velocity=self._direction * self.rate * self._prediction.velocity)
+        scene = self._scene.at(state, time=time, velocity=self.speed, others=self._others)
         measurements = self.sensors.measurements(frames, scene)
         return scene.at(state, measurements=tuple(measurements)), measurements
 
@@ -282,3 +294,8 @@ class Tracker:
     def velocity(self) -> NDArray:
         """(n,) [m, rad] a frame, of the last one."""
         return self._prediction.velocity
+
+    @property
+    def speed(self) -> NDArray:
+        """(n,) [m/s, rad/s] of the last frame, forwards in time."""
+        return self._direction * self.rate * self._prediction.velocity

@@ -26,7 +26,7 @@ def track(
 
     The body is fitted to the person, every frame is fitted to all that was measured then, with outliers and exchanged
     sides set right, lost limbs sought; in the end all frames are fitted together with a motion prior whose process
-    noise the take itself tells.
+    noise is estimated from the take.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def test_frames_that_are_missing_are_told(folder):
 @pytest.mark.parametrize(
     ("depth", "head", "more", "words"),
     [
-        ("", "rate = 30", "", "nothing tells its intrinsics"),
+        ("", "rate = 30", "", "nothing states its intrinsics"),
         (ALONE, "", "", "nothing tells its rate"),
         (ALONE + "unit = 1", "rate = 30", "", "depth tof: the median depth is 101"),
         (ALONE + "range = [2, 3]", "rate = 30", "", "depth tof: nothing lies within the range of 2 to 3 m"),
@@ -83,7 +83,7 @@ def test_frames_that_are_missing_are_told(folder):
         (ALONE + "distortion = [0.1]", "rate = 30", "", "1 distortion coefficients"),
         ('camera = "tof"', "rate = 30", "", r"no \[calibration\]"),
         (ALONE + "far = 3", "rate = 30", "", "no key 'far'; there are: name"),
-        (ALONE, "rate = 30", '[calibration]\nfile = "rig.toml"', "intrinsics alone do not tell where"),
+        (ALONE, "rate = 30", '[calibration]\nfile = "rig.toml"', "intrinsics alone do not say where"),
         ('camera = "nix"', "rate = 30", '[calibration]\nfile = "rig.toml"', "no calibration of camera 'nix'"),
         ('camera = "rgb"', "rate = 30", '[calibration]\nfile = "rig.toml"', r"64x48 px, its calibration is of \(640"),
         (ALONE, "rate = 30", '[[depth]]\nname = "tof"\nfile = "depth"', "two of this name"),

@@ -153,7 +153,7 @@ def test_streams_of_different_rate(small):
 
 
 def test_nothing_tells_the_rate(small):
-    with pytest.raises(TakeError, match="nothing tells the rate"):
+    with pytest.raises(TakeError, match="nothing states the rate"):
         load(small, take_text(head=""))
 
 

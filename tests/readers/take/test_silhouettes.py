@@ -54,7 +54,7 @@ def test_wrong_masks_are_told(tmp_path):
     with pytest.raises(FileError, match="damaged"):
         video.frame(2)
     (tmp_path / "none").mkdir()
-    with pytest.raises(FileError, match="no pictures"):
+    with pytest.raises(FileError, match="no images"):
         read_silhouettes(tmp_path / "none", camera="c", rate=30.0, size=(64, 48))
 
 

@@ -83,7 +83,7 @@ def test_some_frames_of_a_later_camera_by_wrists(folder):
 
 
 def test_what_cannot_be_is_told(folder):
-    with pytest.raises(TakeError, match="nothing tells where the face is"):
+    with pytest.raises(TakeError, match="nothing states where the face is"):
         load(folder, SKIN_ENTRY)
     with pytest.raises(KinefitError, match="no face at"):
         load(folder, SKIN_ENTRY + "face = [500, 40, 36, 50]\n").skin[0].frame(0)

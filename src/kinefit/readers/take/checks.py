@@ -189,7 +189,7 @@ def _names(take: Take) -> None:
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(
-            "intrinsics alone do not tell where a sensor stands beside others", file=take.path,
+            "intrinsics alone do not say where a sensor stands beside others", file=take.path,
             place=f"depth {alone[0]}", remedy="Put its intrinsics and its pose into the calibration, and not here.",
         )  # fmt: skip
 

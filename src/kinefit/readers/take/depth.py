@@ -52,12 +52,12 @@ class DepthSensors:
 
 
 def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> DepthSensors:
-    """Read all `[[depth]]` of a take; `rates` [Hz] of its other streams, for recordings that do not tell theirs.
+    """Read all `[[depth]]` of a take; `rates` [Hz] of its other streams, for recordings that do not state theirs.
 
     Raises
     ------
     CalibrationError
-        Nothing tells a sensor's intrinsics, or its images have another size than its calibration.
+        Nothing states a sensor's intrinsics, or its images have another size than its calibration.
     TakeError, ObservationError, FileError
         As `read_depth`, with the sensor's name.
     """
@@ -123,7 +123,7 @@ def _camera(entry: DepthEntry, video: DepthVideo, rig: Rig | None) -> Camera:
         return camera
     if video.camera is None:
         raise CalibrationError(
-            "nothing tells its intrinsics",
+            "nothing states its intrinsics",
             remedy="Write intrinsics = [fx, fy, cx, cy] [px], or add [calibration] with a camera of this name.",
         )  # fmt: skip
     return replace(video.camera, name=entry.name)

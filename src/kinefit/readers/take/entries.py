@@ -25,17 +25,17 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
-    unit: str = "auto"  # of its translations, where the format does not tell
+    unit: str = "auto"  # of its translations, where the format does not state it
 
 
 class CameraEntry(_Entry, frozen=True, kw_only=True):
-    """`[[camera]]`: one camera of the calibration, with its video or the size of its picture."""
+    """`[[camera]]`: one camera of the calibration, with its video or the size of its image."""
 
     name: str
     video: Path | None = None
-    size: tuple[int, int] | None = None  # [px] (width, height) of the picture; default: the video's
-    image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the picture
-    rotation: Literal[0, 90, 180, 270] = 0  # [deg] the picture is the calibration's, turned clockwise
+    size: tuple[int, int] | None = None  # [px] (width, height) of the image; default: the video's
+    image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
+    rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise
     time_offset: float = 0.0  # [s] added to frame / rate
 
 
@@ -57,7 +57,7 @@ class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
     """`[[silhouette]]`: which pixels of one camera show the person."""
 
     camera: str
-    file: Path | None = None  # of "masks": folder or pattern; of "background": picture of the empty scene
+    file: Path | None = None  # of "masks": folder or pattern; of "background": image of the empty scene
     format: Literal["masks", "background", "threshold", "detect"] = "masks"
     frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
     rate: float | None = None  # [Hz] of the masks; default: the camera's video, or the take
@@ -83,7 +83,7 @@ class MarkersEntry(_Entry, frozen=True, kw_only=True):
     """`[[markers]]`: a marker recording."""
 
     file: Path
-    unit: str | None = None  # where the file does not tell it
+    unit: str | None = None  # where the file does not state it
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
     model: Path | None = None  # of the subject, for markers without names; default: they have names
     time_offset: float = 0.0  # [s]
@@ -96,12 +96,12 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     name: str
     camera: str | None = None  # its camera in the calibration; default: of its own name
     file: Path  # or folder, or pattern (frames/depth_*.png)
-    unit: float | None = None  # [m] of one count; default: what the file tells, else millimetres
+    unit: float | None = None  # [m] of one count; default: what the file states, else millimetres
     size: tuple[int, int] | None = None  # [px] (width, height), of raw files
     range: tuple[float, float] | None = None  # [m] (near, far): what is measured outside of it is dropped
     intrinsics: tuple[float, float, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
-    rate: float | None = None  # [Hz]; default: what the file tells, the take's, the videos'
+    rate: float | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: float | None = None  # [s] of the last number in every file's name, where that is the time
     time_offset: float = 0.0  # [s] time of the first frame
     sigma: float = 0.01  # [m] standard deviation of a depth

@@ -83,7 +83,7 @@ class Take:
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
-        Motion file (`motion.npz`) that tells body and pose of the first step; None: they are sought.
+        Motion file (`motion.npz`) that gives body and pose of the first step; None: they are sought.
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None

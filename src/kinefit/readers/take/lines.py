@@ -78,7 +78,7 @@ def load_lines(
     Raises
     ------
     TakeError
-        Nothing tells the rate, or the picture in which the lines are.
+        Nothing states the rate, or the image in which the lines are.
     KinefitError
         As `read_lines`, with the camera's name.
     """
@@ -95,11 +95,11 @@ def load_lines(
 def _lines(entry: LinesEntry, take: Take, image: ImageFrame, rates: Mapping[str, float]) -> LineVideo:
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if entry.frame is None and not same:
-        problem = "the video's picture is not the calibration's, and it is not told in which the lines are"
+        problem = "the video's image is not the calibration's, and it is not stated in which the lines are"
         raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
     rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
     if rate is None:
-        raise TakeError("nothing tells the rate", remedy="Write rate = ... into [take].")
+        raise TakeError("nothing states the rate", remedy="Write rate = ... into [take].")
     names = tuple(entry.landmarks)
     frames, ends = read_lines(entry.file, names)
     if entry.frame == "video" and not same:

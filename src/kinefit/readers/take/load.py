@@ -49,7 +49,7 @@ class Observations:
         In the order of `take.markers`, whole, at their own rates.
     videos : {camera: Path}
     images : {camera: ImageFrame}
-        How the video's picture of each camera relates to the calibration's.
+        How the video's image of each camera relates to the calibration's.
     depth : tuple of DepthVideo
         In the order of `take.depth`, whole, at their own rates; those whose files are images.
     clouds : tuple of CloudVideo
@@ -90,12 +90,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     Parameters
     ----------
     exteriors : bool
-        Whether the calibration must tell where cameras stand; without, one that it puts nowhere stands at the origin.
+        Whether the calibration must state where cameras stand; without, one that it puts nowhere stands at the origin.
 
     Raises
     ------
     CalibrationError
-        A camera without calibration; a picture of another size than the calibration's where the take does not tell how.
+        A camera without calibration; an image of another size than the calibration's where the take does not state how.
     ObservationError
         Streams of different length or rate, with each stream's; and what the readers of the files raise.
     FileError
@@ -188,7 +188,7 @@ def _read_rig(take: Take, exteriors: bool) -> Rig | None:
 
 
 def _image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
-    """How the picture of a camera relates to the calibration's; an error proposes the line to write."""
+    """How the image of a camera relates to the calibration's; an error proposes the line to write."""
     assert rig is not None
     if video_size and entry.size and entry.size != video_size:
         raise TakeError(
@@ -212,8 +212,8 @@ def _image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int
         else 'image = "letterboxed" (bars were added) or image = "scaled" (it was stretched)'
     )
     raise CalibrationError(
-        f"the picture has {size[0]}x{size[1]} px, but the calibration is of {calibrated[0]}x{calibrated[1]} px",
-        file=take.path, place=f"camera {entry.name}", remedy=f"Tell how the picture came about: {line}.",
+        f"the image has {size[0]}x{size[1]} px, but the calibration is of {calibrated[0]}x{calibrated[1]} px",
+        file=take.path, place=f"camera {entry.name}", remedy=f"State how the image came about: {line}.",
     )
 
 
@@ -224,7 +224,7 @@ def _read_keypoints(
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if source.frame is None and not same and source.format != "detect":
         raise TakeError(
-            "the video's picture is not the calibration's, and it is not told in which the keypoints are",
+            "the video's image is not the calibration's, and it is not stated in which the keypoints are",
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
@@ -233,7 +233,7 @@ def _read_keypoints(
         return read_detections(file).keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
-        raise TakeError("nothing tells the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
+        raise TakeError("nothing states the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
     assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
     return read_keypoints(

@@ -20,8 +20,8 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
-_SIDE = 1000  # [px] of a picture that its background is taken from: larger ones are made smaller by a whole number
-_LEARNT = 30  # pictures of a video from which its background is learnt
+_SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
+_LEARNT = 30  # images of a video from which its background is learnt
 _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
@@ -29,7 +29,7 @@ def read_silhouettes(
     path: Path, *, camera: str, rate: float, size: tuple[int, int], image_frame: ImageFrame | None = None,
     time_offset: float = 0.0,
 ) -> SilhouetteVideo:  # fmt: skip
-    """Masks in a folder of pictures, or of a pattern such as "masks/*.png", one a frame; white is the body.
+    """Masks in a folder of images, or of a pattern such as "masks/*.png", one a frame; white is the body.
 
     Parameters
     ----------
@@ -43,20 +43,20 @@ def read_silhouettes(
     Raises
     ------
     FileError
-        No pictures, or one that cannot be read.
+        No images, or one that cannot be read.
     ObservationError
         A mask of another size.
     """
     files = [file for file in listed(path) if file.suffix.lower() in _PICTURES]
     if not files:
-        raise FileError("no pictures of masks", file=path, remedy="Give a folder or pattern of PNG files, one a frame.")
+        raise FileError("no images of masks", file=path, remedy="Give a folder or pattern of PNG files, one a frame.")
     wanted = _picture_size(files[0], size, image_frame)
 
     def image(i: int) -> NDArray:
         mask = _mask(files[i])
         if mask.shape[::-1] != wanted:
             problem = f"the mask has {mask.shape[1]}x{mask.shape[0]} px, not {wanted[0]}x{wanted[1]}"
-            raise ObservationError(problem, file=files[i], remedy="All masks of a camera are of its picture's size.")
+            raise ObservationError(problem, file=files[i], remedy="All masks of a camera are of its image's size.")
         return in_calibration(mask, size, image_frame)
 
     times = time_offset + np.arange(len(files)) / rate
@@ -71,7 +71,7 @@ def load_silhouettes(
     Raises
     ------
     TakeError
-        Nothing tells the rate, or the picture in which masks are.
+        Nothing states the rate, or the image in which masks are.
     KinefitError
         As `read_silhouettes`, with the camera's name.
     """
@@ -95,9 +95,9 @@ def _silhouettes(
     rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
     if entry.format == "masks":
         if rate is None:
-            raise TakeError("nothing tells the rate", remedy="Write rate = ... into [take].")
+            raise TakeError("nothing states the rate", remedy="Write rate = ... into [take].")
         if entry.frame is None and not same:
-            problem = "the video's picture is not the calibration's, and it is not told in which the masks are"
+            problem = "the video's image is not the calibration's, and it is not stated in which the masks are"
             raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
         assert entry.file is not None
         return read_silhouettes(
@@ -155,7 +155,7 @@ class _BeforeBackground:
         if self._file is not None:
             picture = cv2.imread(str(self._file), cv2.IMREAD_COLOR)
             if picture is None:
-                raise FileError("not a picture, or damaged", file=self._file, remedy="Give a PNG or JPEG.")
+                raise FileError("not an image, or damaged", file=self._file, remedy="Give a PNG or JPEG.")
             if picture.shape[1::-1] != self.video.size:
                 problem = f"the background has {picture.shape[1::-1]} px, the video {self.video.size}"
                 raise ObservationError(problem, file=self._file, remedy="Take it with the same camera and settings.")
@@ -175,7 +175,7 @@ class _BeforeBackground:
 
 
 def _everybody(found: Detections, i: int) -> NDArray:
-    """All people of one picture: which of them is the body is told by where it is thought to be."""
+    """All people of one image: which of them is the body is decided by where it is thought to be."""
     out = np.zeros(found.size[::-1], bool)
     for person in range(found.points.shape[1]):
         mask = found.mask(i, person)
@@ -192,7 +192,7 @@ def _picture_size(file: Path, size: tuple[int, int], frame: ImageFrame | None) -
 def _mask(file: Path) -> NDArray:
     mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     if mask is None:
-        raise FileError("not a picture, or damaged", file=file, remedy="Write it again, as an 8-bit PNG.")
+        raise FileError("not an image, or damaged", file=file, remedy="Write it again, as an 8-bit PNG.")
     if mask.ndim == 3:
         mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(axis=2)
     if mask.dtype != np.uint8:
@@ -201,7 +201,7 @@ def _mask(file: Path) -> NDArray:
 
 
 def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | None) -> NDArray:
-    """A mask (H, W) uint8 of the delivered picture in the calibration's image of `size` (width, height)."""
+    """A mask (H, W) uint8 of the delivered image in the calibration's image of `size` (width, height)."""
     if frame is None or np.allclose(frame.T_image_calibration, np.eye(3), atol=1e-9):
         return mask
     T = frame.T_image_calibration[:2]

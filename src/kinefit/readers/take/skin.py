@@ -21,12 +21,12 @@ _NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
 
 
 def load_skin(take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str, Path]) -> tuple[KeypointVideo, ...]:
-    """All `[[keypoints]]` of a take with format = "skin"; pictures are read when their frames are asked for.
+    """All `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
 
     Raises
     ------
     TakeError
-        Nothing tells where the face is.
+        Nothing states where the face is.
     KinefitError
         What reading the video, and the tracker at a face that is not in it, raise; with the camera's name.
     """
@@ -66,8 +66,8 @@ def _detected_face(
     file = detections_file(take.path, entry.camera)
     if not file.exists():
         raise TakeError(
-            "nothing tells where the face is",
-            remedy="Write face = [left, top, width, height] of the first picture used, or run `kinefit detect`.",
+            "nothing states where the face is",
+            remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
         )
     found = read_detections(file)
     frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
@@ -78,7 +78,7 @@ def _detected_face(
 
 
 class _Seen:
-    """Face and hands in the frames of a video: followed from the first one on, each picture once."""
+    """Face and hands in the frames of a video: followed from the first one on, each image once."""
 
     def __init__(
         self, video: Video, begin: int, face: tuple[float, float, float, float], image: ImageFrame

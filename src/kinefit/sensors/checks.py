@@ -1,0 +1,59 @@
+"""What a sensor of someone's own can do wrong, told with its name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from kinefit.bodies import Body
+from kinefit.errors import ObservationError
+from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
+
+
+@contextmanager
+def named(sensor: str) -> Iterator[None]:
+    """Within it, errors in what was measured name the sensor."""
+    try:
+        yield
+    except ObservationError as error:
+        if sensor in str(error):
+            raise
+        raise ObservationError(f"sensor '{sensor}': {error.problem}", remedy=error.remedy) from error
+
+
+def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
+    """Rows as a sensor of someone's own made them, or an error that names the sensor.
+
+    Raises
+    ------
+    ObservationError
+        No rows; of wrong shapes, not finite, of negative weight; on segments or degrees of freedom that the body does
+        not have.
+    """
+    parts = [rows] if isinstance(rows, AnyRows) else rows
+    if not isinstance(parts, Sequence) or not all(isinstance(p, AnyRows) for p in parts):
+        kinds = type(rows).__name__
+        remedy = "`rows` must return Rows, PairRows, ParameterRows or DofRows, or a list of them."
+        raise ObservationError(f"sensor '{sensor}' gave a {kinds}", remedy=remedy)
+    count, n = len(body.tree.segments), body.tree.n_dofs
+    for p in parts:
+        if isinstance(p, Rows) and not p.segment.shape == p.group.shape == p.data.shape[1:] == (p.data.size // 8,):
+            shapes = p.data.shape, p.segment.shape, p.group.shape
+            raise ObservationError(f"sensor '{sensor}' has rows of shapes {shapes}", remedy="Make them with Rows.of.")
+        if isinstance(p, Rows) and not math.isfinite(p.data.sum()):
+            remedy = "Leave out what was not measured."
+            raise ObservationError(f"sensor '{sensor}' has rows that are not finite", remedy=remedy)
+        if p.weight.ndim == 1 and len(p) and p.weight.min() < 0.0:
+            raise ObservationError(f"sensor '{sensor}' has rows of negative weight", remedy="Weights are 1/σ².")
+        used = p.segments if isinstance(p, PairRows) else p.index if isinstance(p, ParameterRows) else p.segment
+        what, most = ("degree of freedom", n) if isinstance(p, ParameterRows) else ("segment", count)
+        if used is not None and used.size and not 0 <= used.min() <= used.max() < most:
+            wrong = int(used.min() if used.min() < 0 else used.max())
+            problem = f"sensor '{sensor}' has rows on {what} {wrong}; body '{body.name}' has {most}"
+            raise ObservationError(problem, remedy="Use body.tree.segment(name), or the segments of a point set.")
+        if isinstance(p, DofRows) and p.jacobian.shape[1] != n:
+            problem = f"sensor '{sensor}' has a jacobian of {p.jacobian.shape[1]} columns; body '{body.name}' has {n}"
+            raise ObservationError(problem, remedy="Give one column for each degree of freedom.")
+    return list(parts)
