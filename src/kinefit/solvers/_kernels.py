@@ -205,12 +205,3 @@ def joint_moves(frames, screws, rest, root, dof_parent, last_dof, moves):
             m[1, d] = t[1] + t[5] * x - t[3] * z
             m[2, d] = t[2] + t[3] * y - t[4] * x
             d = dof_parent[d]
-
-
-@jit
-def within(index, count):
-    """Whether all of some indices (N,) name one of so many."""
-    for i in index:
-        if i < 0 or i >= count:
-            return False
-    return True

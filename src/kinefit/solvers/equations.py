@@ -169,7 +169,7 @@ def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
 def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
     """Kernels look nowhere else: an index of another body must not reach them."""
     for index in indices:
-        if not _kernels.within(index, count):
+        if index.size and not 0 <= index.min() <= index.max() < count:
             raise ObservationError(
                 f"rows name {what} {int(index.max())}, but body '{body.name}' has {count}",
                 remedy="Make the rows with the body that is fitted.",
