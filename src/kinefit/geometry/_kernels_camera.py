@@ -117,6 +117,14 @@ def project_points(camera, points, uv):
 
 
 @jit
+def project_each(cameras, camera, points, uv):
+    """Project points (N, 3) [m], each by its camera of a rig, into uv (N, 2) [px]; NaN where not visible."""
+    for i in range(points.shape[0]):
+        result = project_jacobian(cameras[camera[i]], points[i, 0], points[i, 1], points[i, 2])
+        uv[i, 0], uv[i, 1] = result[1], result[2]
+
+
+@jit
 def project_points_jacobian(camera, points, uv, jacobian):
     """As `project_points`, with the derivatives by the world point in jacobian (N, 2, 3)."""
     for i in range(points.shape[0]):

@@ -297,6 +297,13 @@ class Rig:
         packed = np.array([camera.packed for camera in self.cameras], float)
         return _read_only(packed.reshape(len(self.cameras), _PACKED))
 
+    def project(self, x_world: NDArray, camera: NDArray) -> NDArray:
+        """Project points (N, 3) [m], each by its camera (N,) int, to (N, 2) [px]; NaN as of `Camera.project`."""
+        uv = np.empty((len(x_world), 2))
+        if len(self.cameras):
+            kernels.project_each(self.packed, camera, np.array(x_world, float, order="C"), uv)
+        return uv
+
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""
         if name not in self.names:

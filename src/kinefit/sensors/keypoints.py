@@ -234,13 +234,7 @@ class KeypointMatched(Matched):
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
     """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
-    x = scene.positions(layout.points_of(scene.body))
-    out = np.empty((len(x), 2))
-    for c, camera in enumerate(scene.rig):
-        mine = layout.channels.camera == c
-        if mine.any():
-            out[mine] = camera.project(x[mine])
-    return out
+    return scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
 
 
 def informing(body: Body, channels: Channels) -> NDArray:

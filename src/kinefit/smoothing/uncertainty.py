@@ -117,11 +117,9 @@ def lasting(
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
     alone = inverse(H[:, :n] + other_information + prior)
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
-    pushes = [last]
-    for q, shift in enumerate(noise.shift):
-        mine = channels.source == q
-        pushes.append(product(weight[mine][None], J[mine, :, :n].reshape(-1, 2 * n)).reshape(2, n) * shift[:, None])
-    push = np.concatenate(pushes)
+    of_source = [channels.source == q for q in range(len(noise.shift))]
+    shifted = [product(weight[q][None], J[q, :, :n].reshape(int(q.sum()), 2 * n)).reshape(2, n) for q in of_source]
+    push = np.concatenate([last, *(p * shift[:, None] for p, shift in zip(shifted, noise.shift))])
     meat = product(push.T, push) + other_lasting
     answer = -product(alone, H[:, n:])
     dofs = product(product(alone, meat), alone)

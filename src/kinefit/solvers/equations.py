@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -146,7 +147,7 @@ def inverse(matrix: NDArray) -> NDArray:
 
 def product(A: NDArray, B: NDArray) -> NDArray:
     """A B of small matrices (..., k), (k, m), without threads that would only get in each other's way."""
-    lines = np.ascontiguousarray(A, float).reshape(-1, A.shape[-1])
+    lines = np.ascontiguousarray(A, float).reshape(math.prod(A.shape[:-1]), A.shape[-1])
     out = np.empty((len(lines), B.shape[1]))
     _kernels_linear.multiply(lines, np.ascontiguousarray(B, float), out)
     return out.reshape(*A.shape[:-1], B.shape[1])
