@@ -132,11 +132,13 @@ def rows_of(
     ----------
     scale : {sensor: factor} on standard deviations
     """
-    parts, surface = [], []
+    parts: list[AnyRows] = []
+    surface: list[Rows] = []
+    beside = settings.skin_shift > 0.0 and any(m.of_points for m in matched)
     for m in matched:
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            if not m.of_points and isinstance(rows, Rows) and settings.skin_shift > 0.0:
+            if beside and not m.of_points and isinstance(rows, Rows):
                 surface.append(rows)
             else:
                 parts.append(rows)

@@ -100,7 +100,7 @@ class TrackSettings:
     flesh: float = 0.02
     skin_shift: float = 0.02
     skin_turn: float = 0.1
-    angle_acceleration: float = 150.0
+    angle_acceleration: float = 60.0
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
     loss: Loss = field(default_factory=geman_mcclure)
