@@ -42,6 +42,7 @@ MIXES: dict[str, tuple[str, ...]] = {
     "silhouettes_alone": ("first keypoints", "all masks"),
 }
 CONDITIONS = ("smoothed", "frames", "outliers", "lost")
+LAG = 0.1  # [s] of the condition "lag": each frame knows of later ones so far ahead alone
 WRONG, LOST = 0.2, 30  # share, frames
 Run = tuple[str, str]  # mix, condition
 
@@ -69,6 +70,11 @@ class Outcome:
     seen: NDArray
     seen_turn: NDArray
     seconds: float
+
+    @property
+    def passing(self) -> float:
+        """[m] root mean square of the errors without each joint's mean error over the take."""
+        return float(np.sqrt(np.mean(np.square(self.shift - self.shift.mean(axis=0)))))
 
     @property
     def distance(self) -> NDArray:
@@ -155,7 +161,8 @@ def draw_runs(draw: int, frames: int, runs: Sequence[Run]) -> dict[Run, Outcome 
             take.write_text(take_text(folder, MIXES[mix]))
             begin = time.perf_counter()
             try:
-                motion = track_take(take, smooth=condition != "frames")[0]
+                lag = LAG if condition == "lag" else None
+                motion = track_take(take, smooth=condition != "frames", lag=lag)[0]
                 out[mix, condition] = compare(recording.truth, motion, seen[mix], time.perf_counter() - begin)
             except Exception as error:  # whatever it is, it is told with the figure
                 out[mix, condition] = f"{type(error).__name__}: {error}".replace(work, "")

@@ -23,6 +23,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
+from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import Subject
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take import track_take
@@ -207,6 +208,8 @@ ARGUMENTS = {
     "smooth": lambda body: False,
     "contacts": lambda body: True,
     "shape_frames": lambda body: 3,
+    "lag": lambda body: 0.1,
+    "noise": lambda body: KnownNoise.usual(body),
 }
 
 
@@ -297,7 +300,7 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 
 OPTIONS = {
     "overlays": "--overlays", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
-    "realtime": "--realtime", "verbose": "-v", "out": None, "take": None,
+    "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "out": None, "take": None,
 }  # fmt: skip
 
 

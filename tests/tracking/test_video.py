@@ -99,7 +99,7 @@ def test_a_person_who_leaves_is_told_and_found_again(truth):
     std = motion.dof_std[19:35, 6:]  # the prediction holds it for a while, ever less sure
     half = np.median(std, axis=1)
     assert np.all(np.diff(half[np.isfinite(half)]) > 0) and half[0] < 0.1
-    assert np.isinf(std[-1]).mean() > 0.5
+    assert np.isinf(std[-1]).mean() > 0.2
     off, told = joint_errors(truth, motion)[gone], np.linalg.norm(motion.joint_std[gone], axis=-1)
     assert (off < 2.0 * told).mean() > 0.95
     assert motion.quality[36:].min() > 0.4

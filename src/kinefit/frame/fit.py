@@ -128,13 +128,16 @@ def rows_of(
 ) -> list[AnyRows]:
     """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
+    That holds beside keypoints and markers, which are points of bones or near them. Where only surfaces are seen there
+    is nothing that they could draw bones away from, and all of what they tell counts.
+
     Parameters
     ----------
     scale : {sensor: factor} on standard deviations
     """
     parts: list[AnyRows] = []
     surface: list[Rows] = []
-    beside = settings.skin_shift > 0.0 and any(m.of_points for m in matched)
+    beside = settings.skin_shift > 0.0
     for m in matched:
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))

@@ -83,7 +83,7 @@ def known_points(
         marked = [f for f in frames if isinstance(f, MarkerFrame)]
         told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
     sets, places = [], [np.zeros((0, 3))]
-    for m in told:
+    for m in (m for m in told if m.settled):  # surfaces give views alone
         hints = m.hints(scene)
         if hints.points is not None and hints.x_world is not None:
             names = tuple(f"{m.sensor}/{name}" for name in hints.points.names)

@@ -115,7 +115,8 @@ def make_channels(
         if record.camera not in rig:
             raise ObservationError(choices("camera", record.camera, rig.names), file=record.source or None)
         known = known_points(body, record.keypoint_set).names
-        names.setdefault(record.keypoint_set, [n for n in record.names if n in known])
+        mine = names.setdefault(record.keypoint_set, [])
+        mine += [n for n in dict.fromkeys(record.names) if n in known and n not in mine]
     sets, parts, start = {}, [], 0
     for name, chosen in names.items():
         if not chosen:
@@ -137,13 +138,15 @@ def make_channels(
         camera += [rig.index(record.camera)] * len(chosen)
         column += list(range(span.start, span.stop))
         spread += [float(sigma[q])] * len(chosen)
-        columns = [record.names.index(n) for n in chosen]
+        lacking = np.array([n not in record.names for n in chosen], bool)
+        columns = [0 if none else record.names.index(n) for n, none in zip(chosen, lacking)]
         if record.points.shape[1] == 0:  # nobody was ever seen there
             uv.append(np.full((len(record), len(chosen), 2), np.nan))
             confidence.append(np.zeros((len(record), len(chosen))))
             continue
         frames, one = np.arange(len(record)), np.maximum(person, 0)
         there = (np.asarray(person) >= 0)[:, None]
+        there = there & ~lacking
         seen = np.where(there[..., None], record.points[frames, one][:, columns], np.nan)
         trust = np.where(there, record.confidence[frames, one][:, columns], 0.0)
         late = float(common_start(keypoints) - record.times[0]) * record.rate

@@ -16,7 +16,7 @@ from kinefit.losses import Loss
 from kinefit.observations import KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
-from kinefit.sensors.channels import Channels, make_channels
+from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
@@ -83,7 +83,7 @@ class KeypointSensor(Sensor):
 
     def __init__(self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float) -> None:
         self.rig, self.sigma, self.usual, self.loss, self.near = rig, sigma, usual, loss, near
-        self._layouts: dict[tuple[object, ...], tuple[Layout, list[list[int]]]] = {}
+        self._layouts: dict[tuple[object, ...], tuple[Layout, list[tuple[int, NDArray]]]] = {}
 
     def prepare(self, frame: KeypointFrame | Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
         """Of the frames of all cameras at one time.
@@ -95,29 +95,32 @@ class KeypointSensor(Sensor):
         """
         frames = [frame] if isinstance(frame, KeypointFrame) else list(frame)
         layout, columns = self._layout(scene.body, frames)
-        uv = np.concatenate([f.uv[c] for f, c in zip(frames, columns)])
-        confidence = np.concatenate([f.confidence[c] for f, c in zip(frames, columns)])
+        parts = [(frames[k], c, c >= 0) for k, c in columns]
+        uv = np.concatenate([np.zeros((0, 2)), *(np.where(has[:, None], f.uv[c], np.nan) for f, c, has in parts)])
+        confidence = np.concatenate([np.zeros(0), *(np.where(has, f.confidence[c], 0.0) for f, c, has in parts)])
         time = float(np.mean([f.time for f in frames]))
         return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
 
-    def _layout(self, body: Body, frames: Sequence[KeypointFrame]) -> tuple[Layout, list[list[int]]]:
+    def _layout(self, body: Body, frames: Sequence[KeypointFrame]) -> tuple[Layout, list[tuple[int, NDArray]]]:
+        """Channels of some frames; and of each frame that has any the places of their names in it, -1 for none."""
         key = (id(body), *((f.sensor, f.keypoint_set, f.names) for f in frames))
         if key not in self._layouts:
-            records, columns = [], []
-            for f in frames:
+            used, records = [], []
+            for k, f in enumerate(frames):
                 self.rig.index(f.sensor)
-                known = (body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks).names
-                columns.append([f.names.index(n) for n in f.names if n in known])
-                shape = (1, 1, len(f.names))
-                records.append(
-                    Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, np.zeros((*shape, 2)), np.zeros(shape))
-                )
-            used = [k for k, c in enumerate(columns) if c]
-            people = [np.zeros(1, np.int64)] * len(used)
-            sigma = [self.sigma.get(frames[k].sensor, self.usual) for k in used]
+                if set(f.names) & set(known_points(body, f.keypoint_set).names):
+                    empty = np.zeros((1, 1, len(f.names)))
+                    used.append(k)
+                    records.append(Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, np.zeros((*empty.shape, 2)), empty))
+            sigma = [self.sigma.get(r.camera, self.usual) for r in records]
             channels = Channels.none(self.rig, 1)
-            if used:
-                channels = make_channels(body, self.rig, [records[k] for k in used], people, sigma)
+            if records:
+                channels = make_channels(body, self.rig, records, [np.zeros(1, np.int64)] * len(records), sigma)
+            columns = []
+            for q, k in enumerate(used):
+                names = [channels.points.names[c] for c in channels.column[channels.source == q]]
+                has = frames[k].names
+                columns.append((k, np.array([has.index(n) if n in has else -1 for n in names], np.int64)))
             if len(self._layouts) > 16:
                 self._layouts.clear()
             self._layouts[key] = Layout(channels, body), columns

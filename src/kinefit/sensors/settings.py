@@ -49,8 +49,9 @@ class TrackSettings:
         Softness of what parts that run into each other are kept apart with, and how far they may. See
         `collision_rows`.
     skin_shift, skin_turn : float [m], [rad]
-        Standard deviations by which a segment's surface is shifted and turned about its bone: what surfaces measure of
-        joints is no better, however many points of them are seen.
+        Standard deviations by which a segment's surface is shifted and turned about its bone: what surfaces tell of
+        joints is no better, however many points of them are seen. 0 m takes surfaces for exact; `track` does so only
+        where no keypoints of several cameras are seen beside them (`SKIN_SHIFT`).
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
@@ -98,7 +99,7 @@ class TrackSettings:
     through: float = 3.0
     collision: float = 0.01
     flesh: float = 0.02
-    skin_shift: float = 0.02
+    skin_shift: float = 0.0
     skin_turn: float = 0.1
     angle_acceleration: float = 60.0
     root_acceleration: float = 15.0

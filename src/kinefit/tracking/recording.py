@@ -147,7 +147,7 @@ class Recording:
         if len(known) < len(told):  # evenly beyond the ends
             times = np.where(np.isfinite(told), times, times[known[0]] + (np.arange(len(told)) - known[0]) / rate)
         sigma = dict(sigma or {})
-        there = {_name(f) for seen in steps for f in seen}
+        there = {*rig.names, *(_name(f) for seen in steps for f in seen)}
         for name in sigma:
             if name not in there:
                 remedy = "Leave its standard deviation out, or correct its name."

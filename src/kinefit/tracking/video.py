@@ -15,6 +15,10 @@ from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
 from kinefit.tracking.sizing import fitted_to_person
 
+SKIN_SHIFT = 0.02
+"""[m] by which a segment's surface may lie beside where the body has it on the bone. On the balancing trial's first 30
+frames 0.01 left keypoints 1.085 times as far off as without silhouettes, 0.02 1.037 times."""
+
 
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
@@ -76,7 +80,7 @@ def track(
         raise ObservationError(problem, remedy="Smooth the whole take instead: leave the lag out.")
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
-    settings = settings or TrackSettings()
+    settings = settings or _settings_of(recording)
     person = fitted_to_person(
         recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
         progress=progress,
@@ -98,3 +102,9 @@ def track(
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))
     return motion
+
+
+def _settings_of(recording: Recording) -> TrackSettings:
+    """Settings as they are; beside keypoints of several cameras surfaces tell of bones only where these lie below."""
+    several = len({k.camera for k in recording.keypoints}) >= 2
+    return TrackSettings(skin_shift=SKIN_SHIFT) if several else TrackSettings()
