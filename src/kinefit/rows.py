@@ -74,7 +74,8 @@ class Rows:
         given = {"point": (n, 3), "direction": (n, 3), "residual": (n,), "weight": (n,)}
         for (name, shape), values in zip(given.items(), (point, direction, residual, weight)):
             if np.shape(values) not in (shape, ()):
-                raise ObservationError(f"{name} of {n} rows has shape {np.shape(values)}", remedy=f"Give {shape}, or one for all.")
+                problem = f"{name} of {n} rows has shape {np.shape(values)}"
+                raise ObservationError(problem, remedy=f"Give {shape}, or one for all.")
         data = np.empty((8, n))
         data[0:3], data[3:6] = np.asarray(point).T, np.asarray(direction).T
         data[6], data[7] = residual, weight

@@ -111,7 +111,8 @@ class KeypointSensor(Sensor):
                 if set(f.names) & set(known_points(body, f.keypoint_set).names):
                     empty = np.zeros((1, 1, len(f.names)))
                     used.append(k)
-                    records.append(Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, np.zeros((*empty.shape, 2)), empty))
+                    uv = np.zeros((*empty.shape, 2))
+                    records.append(Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, uv, empty))
             sigma = [self.sigma.get(r.camera, self.usual) for r in records]
             channels = Channels.none(self.rig, 1)
             if records:
