@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.frame.skin import skin_of
+from kinefit.frame.skin import SKIN_SHIFT, skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.smoothing.linearised import OtherSensors, squares_of
@@ -82,7 +82,7 @@ def other_noise(
             for part, rows in enumerate(rows_at(m, scene)):
                 if not isinstance(rows, Rows | DofRows) or not len(rows):
                     continue
-                if not m.of_points and isinstance(rows, Rows) and others.settings.skin_shift > 0.0:
+                if not m.of_points and isinstance(rows, Rows):
                     surface.append(rows.weaker(scale))
                     continue
                 J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
@@ -106,7 +106,8 @@ def other_noise(
                     normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
-            skin = skin_of(scene, surface, others.settings.skin_shift, others.settings.skin_turn)
+            shift_m = others.settings.skin_shift or SKIN_SHIFT  # what lasts, also where the fit takes surfaces for exact
+            skin = skin_of(scene, surface, shift_m, others.settings.skin_turn)
             information[f] += skin.information
             lasting[f] += skin.pushes.T @ skin.pushes
         pushes.append(push)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
+from kinefit.frame.skin import SKIN_SHIFT
 from kinefit.motion import Motion
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import lag_frames
@@ -14,10 +15,6 @@ from kinefit.tracking.motions import TrackedFrames, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
 from kinefit.tracking.sizing import fitted_to_person
-
-SKIN_SHIFT = 0.02
-"""[m] by which a segment's surface may lie beside where the body has it on the bone. On the balancing trial's first 30
-frames 0.01 left keypoints 1.085 times as far off as without silhouettes, 0.02 1.037 times."""
 
 
 def track(
