@@ -106,7 +106,7 @@ def other_noise(
                     normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
-            shift_m = others.settings.skin_shift or SKIN_SHIFT  # what lasts, also where the fit takes surfaces for exact
+            shift_m = others.settings.skin_shift or SKIN_SHIFT  # also where the fit takes surfaces for exact
             skin = skin_of(scene, surface, shift_m, others.settings.skin_turn)
             information[f] += skin.information
             lasting[f] += skin.pushes.T @ skin.pushes
