@@ -128,8 +128,8 @@ def rows_of(
 ) -> list[AnyRows]:
     """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
-    That holds beside keypoints and markers, which are points of bones or near them. Where only surfaces are seen there
-    is nothing that they could draw bones away from, and all of what they tell counts.
+    That is so where `settings.skin_shift` is above 0, which `track` chooses beside keypoints of several cameras where
+    it is given no settings; else surfaces are taken for exact.
 
     Parameters
     ----------
@@ -137,11 +137,10 @@ def rows_of(
     """
     parts: list[AnyRows] = []
     surface: list[Rows] = []
-    beside = settings.skin_shift > 0.0
     for m in matched:
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            if beside and not m.of_points and isinstance(rows, Rows):
+            if settings.skin_shift > 0.0 and not m.of_points and isinstance(rows, Rows):
                 surface.append(rows)
             else:
                 parts.append(rows)

@@ -39,15 +39,6 @@ def gated_points(
 
 
 @jit
-def soften(data, scale):
-    """Geman-McClure factors of residuals at `scale` [m] into the weights of rows (8, N), in place."""
-    inverse = 1.0 / (scale * scale)
-    for i in range(data.shape[1]):
-        q = 1.0 + data[6, i] * data[6, i] * inverse
-        data[7, i] /= q * q
-
-
-@jit
 def box(x, out):
     """Least and largest coordinates (2, 3) of points (N, 3)."""
     for k in range(3):
