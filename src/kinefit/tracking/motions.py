@@ -81,6 +81,7 @@ def motion_of(
         others = OtherSensors(
             frames.times, tuple(frames.measurements), frames.scene_of, frames.apart, settings,
             dict.fromkeys({m.sensor for several in frames.measurements for m in several}, 1.0),
+            2 * np.count_nonzero(channels.weight, axis=1),
         )  # fmt: skip
     matched: tuple[tuple[Matched, ...], ...] | None = None
     if smooth:
