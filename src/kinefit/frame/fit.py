@@ -124,29 +124,38 @@ class FrameFit:
 
 
 def rows_of(
-    scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None
-) -> list[AnyRows]:
+    scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None,
+    points: int = 0,
+) -> list[AnyRows]:  # fmt: skip
     """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
-    That is so where `settings.skin_shift` is above 0, which `track` chooses beside keypoints of several cameras where
-    it is given no settings; else surfaces are taken for exact.
+    That is so where points (keypoints, markers) have at least as many rows as the body has degrees of freedom, and so
+    tell by themselves where bones are. With fewer, surfaces are all that holds the body from frame to frame, and their
+    error, which lasts, does not harm that: they are taken for exact.
 
     Parameters
     ----------
     scale : {sensor: factor} on standard deviations
+    points : rows of points that are not among the matches
     """
     parts: list[AnyRows] = []
     surface: list[Rows] = []
     for m in matched:
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            if settings.skin_shift > 0.0 and not m.of_points and isinstance(rows, Rows):
+            if not m.of_points and isinstance(rows, Rows):
                 surface.append(rows)
             else:
                 parts.append(rows)
-    if surface:
-        parts.append(skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows())
-    return parts
+                points += int(np.count_nonzero(rows.weight)) if m.of_points else 0
+    if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
+        return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
+    return [*parts, *surface]
+
+
+def rows_of_points(scene: Scene, matched: Sequence[Matched]) -> int:
+    """How many rows of points there are among some matches."""
+    return sum(int(np.count_nonzero(rows.weight)) for m in matched if m.of_points for rows in rows_at(m, scene))
 
 
 def weaker(rows: AnyRows, factor: float) -> AnyRows:

@@ -72,6 +72,7 @@ class OtherSensors:
     apart : scene -> rows that keep parts of the body from running into each other
     settings : TrackSettings
     scale : {sensor: factor on its standard deviation}, as the take shows it; 1 where none is given
+    points : (T,) int, rows of keypoints in every frame
     """
 
     times: NDArray
@@ -80,10 +81,12 @@ class OtherSensors:
     apart: ApartRows
     settings: TrackSettings
     scale: dict[str, float]
+    points: NDArray
 
     def part(self, frames: slice) -> OtherSensors:
         """A stretch of it."""
-        return replace(self, times=self.times[frames], measurements=self.measurements[frames])
+        names = ("times", "measurements", "points")
+        return replace(self, **{name: getattr(self, name)[frames] for name in names})
 
     def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
         """Of one frame of states (T, 4, 4), (T, D), with the velocity that they have there."""
@@ -115,7 +118,7 @@ class OtherSensors:
             matched = self.matched(scene)
             if keep is not None:
                 keep.append(matched)
-            parts = rows_of(scene, matched, self.settings, self.scale)
+            parts = rows_of(scene, matched, self.settings, self.scale, int(self.points[f]))
             rows[k] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.frame.skin import SKIN_SHIFT, skin_of
+from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.smoothing.linearised import OtherSensors, squares_of
@@ -22,6 +22,7 @@ from kinefit.smoothing.spool import Spool
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_EXACT = 1e-4  # [m] as good as 0
 _FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
 
@@ -117,8 +118,8 @@ def other_noise(
                     normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
-            shift_m = others.settings.skin_shift or SKIN_SHIFT  # also where the fit takes surfaces for exact
-            skin = skin_of(scene, surface, shift_m, others.settings.skin_turn)
+            settings = others.settings  # also where the fit takes surfaces for exact
+            skin = skin_of(scene, surface, max(settings.skin_shift, _EXACT), settings.skin_turn)
             information[f] += skin.information[upper]
             lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
         pushes.append(push)

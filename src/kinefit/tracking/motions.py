@@ -82,7 +82,10 @@ def motion_of(
     others = None
     names = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0)
     if names:
-        others = OtherSensors(frames.times, frames.measurements, frames.scene_of, frames.apart, settings, names)
+        points = 2 * np.count_nonzero(channels.weight, axis=1)
+        others = OtherSensors(
+            frames.times, frames.measurements, frames.scene_of, frames.apart, settings, names, points
+        )  # fmt: skip
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
         done = smooth_results(
