@@ -87,7 +87,7 @@ def track(
     )  # fmt: skip
     steps, tracker = tracked.steps, tracked.tracker
     frames = TrackedFrames(
-        person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
+        person.channels.part(steps), tracked.results, tracked.measurements, tracked.residuals,
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
     told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
