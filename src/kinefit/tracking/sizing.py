@@ -172,7 +172,8 @@ def _by_all(
     good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
-    poses = _POSES if r.keypoints or r.depth or _sees_surfaces(tracked) else _MANY
+    surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
+    poses = _POSES if surfaces or r.keypoints else _MANY
     chosen = [good[k] for k in spread(len(good), poses)]
     told = [m for k in chosen for m in tracked.measurements[k]]
     unknown = unknowns_of(r, generic, person.subject, told, size=size, height=height, trial=trial)
