@@ -37,6 +37,11 @@ class Evidence:
         return cls(np.zeros(segments), np.zeros(segments))
 
     @property
+    def balance(self) -> float:
+        """How much more speaks for the body's place than against it, in outlines."""
+        return float(self.agreeing.sum() - self.contrary.sum())
+
+    @property
     def quality(self) -> NDArray:
         """(S,) in 0..1: share of what is seen of a segment that speaks for it; 0 where nothing is."""
         seen = self.agreeing + self.contrary

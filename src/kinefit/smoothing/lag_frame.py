@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import BLIND, FrameResult
-from kinefit.multiview.observability import SHORTEST, levers
+from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.keypoints import KeypointMatched

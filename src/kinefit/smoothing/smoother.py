@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.frame.results import BLIND, FrameResult, judged
-from kinefit.multiview.observability import SHORTEST, levers, near
+from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
