@@ -54,6 +54,15 @@ class Layout:
         """(S, N) 0 or 1: channels that show where a segment is."""
         return informing(self.body, self.channels)
 
+    @cached_property
+    def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
+        """Of each source its label, its channels, and their names and segments."""
+        out = []
+        for q, label in enumerate(self.channels.sources):
+            mine = np.flatnonzero(self.channels.source == q)
+            out.append((label, mine, tuple(self.points.names[k] for k in mine), self.points.segments[mine]))
+        return out
+
     def points_of(self, body: Body) -> PointSet:
         """The same of another body of this make."""
         return self.points if body is self.body else self._of(self.channels.with_points(body))
@@ -215,19 +224,16 @@ class KeypointMatched(Matched):
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Of every point of every detector."""
-        layout, channels = self.measurement.layout, self.measurement.layout.channels
-        points = layout.points_of(scene.body)
-        uv = np.where((self.weight > 0)[:, None], self.uv, np.nan)
+        layout, seen = self.measurement.layout, self.weight > 0
+        uv = np.where(seen[:, None], self.uv, np.nan)
         values = uv - projected(scene, layout)
-        factor = np.where(self.weight > 0, self.loss.factor(self.squares(scene)), 0.0)
-        out = []
-        for q, label in enumerate(channels.sources):
-            mine = np.flatnonzero(channels.source == q)
-            out.append(Leftover(
-                label, tuple(points.names[k] for k in mine), points.segments[mine], values[mine], factor[mine], "px",
-                uv[mine], bool(self.swapped[mine].any()),
-            ))  # fmt: skip
-        return out
+        factor = np.where(seen, self.loss.factor(self.squares(scene)), 0.0)
+        return [
+            Leftover(
+                label, names, segments, values[mine], factor[mine], "px", uv[mine], bool(self.swapped[mine].any())
+            )
+            for label, mine, names, segments in layout.parts
+        ]
 
     def evidence(self, scene: Scene) -> Evidence:
         """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""
@@ -238,7 +244,9 @@ class KeypointMatched(Matched):
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
     """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
-    return scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
+    return scene.once(
+        layout, lambda: scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
+    )
 
 
 def informing(body: Body, channels: Channels) -> NDArray:

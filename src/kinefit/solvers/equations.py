@@ -98,8 +98,12 @@ def normal_equations(
         _kernels_linear.unpack(C, chain, depth, H)
         for p in joint:
             pull = p.weight @ p.residual
-            H[np.ix_(p.index, p.index)] += p.weight
-            g[p.index] += pull
+            if len(p) == n and (np.diff(p.index) == 1).all():
+                H += p.weight
+                g += pull
+            else:
+                H[np.ix_(p.index, p.index)] += p.weight
+                g[p.index] += pull
             cost += float(p.residual @ pull)
         for q in pairs:
             cost += _kernels.add_pairs(
