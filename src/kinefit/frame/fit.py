@@ -76,19 +76,17 @@ class FrameFit:
         self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
 
     def run(
-        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None,
-        missed: NDArray | None = None,
-    ) -> Fitted:  # fmt: skip
+        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None
+    ) -> Fitted:
         """Fit from a scene's state on, and judge.
 
         A robust loss drops what is far from the start: a limb that moved while nobody saw it would stay where it was
-        expected. So where single points contradict a segment, or show one again that was not seen before, a second fit
-        begins with a loss as wide as the prediction is uncertain, and the better of both is taken.
+        expected. So where single points contradict a segment, a second fit begins with a loss as wide as the prediction
+        is uncertain, and the better of both is taken.
 
         Parameters
         ----------
         known : (D,) bool, coordinates that were observed before
-        missed : (S,) bool, segments that were lost or hidden before
         """
         points = [m for m in measurements if m.settled]
         found = self._fitted(scene, held, measurements)
@@ -98,8 +96,7 @@ class FrameFit:
             of_points = told if every else evidence_of(
                 found.scene, [a for a, m in zip(found.matched, measurements) if m.settled]
             )  # fmt: skip
-            seek = of_points.lost if missed is None else of_points.lost | (missed & ~of_points.hidden)
-            if seek.any():
+            if of_points.lost.any():
                 other = self._settled(scene, held, points, self._uncertain(held))
                 other = other if every else self._renewed(other.scene, held, measurements)
                 also = evidence_of(other.scene, other.matched)

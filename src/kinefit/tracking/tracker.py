@@ -227,8 +227,7 @@ class Tracker:
                 self._prediction.halt()
             held = self._prediction.ahead(steps)
             scene, measurements = self._scene_of(frames, held[0], time)
-            missed = None if self._last is None else self._last.lost | self._last.hidden
-            fitted = self._fit.run(scene, held, measurements, self._known(time), missed)
+            fitted = self._fit.run(scene, held, measurements, self._known(time))
             self._take(fitted, time)
             result = fitted.result
         result = self._recovery.run(self, time, frames, measurements, result)
