@@ -13,7 +13,7 @@ from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, 
 from kinefit.frame.prediction import belief
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged
 from kinefit.frame.skin import skin_of
-from kinefit.frame.trust import forgotten, left_out, levered, moving, observed
+from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed
 from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
@@ -89,19 +89,18 @@ class FrameFit:
         known : (D,) bool, coordinates that were observed before
         """
         points = [m for m in measurements if m.settled]
+        every = len(points) == len(measurements)
         found = self._fitted(scene, held, measurements)
         told = evidence_of(found.scene, found.matched)
-        if points:
-            every = len(points) == len(measurements)
-            of_points = told if every else evidence_of(
-                found.scene, [a for a, m in zip(found.matched, measurements) if m.settled]
-            )  # fmt: skip
-            if of_points.lost.any():
-                other = self._settled(scene, held, points, self._uncertain(held))
-                other = other if every else self._renewed(other.scene, held, measurements)
-                also = evidence_of(other.scene, other.matched)
-                if other.cost < found.cost if every else also.balance > told.balance:
-                    found, told = other, also
+        of_points = told if every else evidence_of(
+            found.scene, [a for a, m in zip(found.matched, measurements) if m.settled]
+        )  # fmt: skip
+        if points and of_points.lost.any():
+            other = self._settled(scene, held, points, self._uncertain(held))
+            other = other if every else self._renewed(other.scene, held, measurements)
+            also = evidence_of(other.scene, other.matched)
+            if other.cost < found.cost if every else also.balance > told.balance:
+                found, told = other, also
         return self._judged(found, held, told, known)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
@@ -198,9 +197,12 @@ class FrameFit:
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
         posterior = inverse(H)
         if lost is not None:
-            gone = moving(tree, lost) & ~seen
+            elsewhere = np.zeros(len(lost), bool) if told.elsewhere is None else lost & told.elsewhere
+            gone = holding(tree, elsewhere) | (moving(tree, lost) & ~seen)
             known, posterior = known & ~gone[6:], forgotten(tree, posterior, gone)
         result = judged(scene, posterior, found.matched, found.iterations, observed=known, told=told)
+        if lost is not None:
+            result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
         return Fitted(result, inverse(alone), seen[6:], known)
 
     def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None) -> NDArray:

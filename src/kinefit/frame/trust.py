@@ -46,6 +46,14 @@ def moving(tree: KinematicTree, segments: NDArray) -> NDArray:
     return out
 
 
+def holding(tree: KinematicTree, segments: NDArray) -> NDArray:
+    """(n,) bool: coordinates of the joints of some segments (S,) bool, and of those that they hang on."""
+    away = np.array(segments)
+    parents = tree.parents[segments]
+    away[parents[parents >= 0]] = True
+    return np.concatenate([np.zeros(6, bool), away[tree.owners]])
+
+
 def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
     """A covariance (n, n) that knows of some degrees of freedom (n,) bool no more than the prior does."""
     prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.spread, _MOST)])

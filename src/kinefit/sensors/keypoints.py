@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.losses import Loss
 from kinefit.observations import KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
@@ -239,7 +240,30 @@ class KeypointMatched(Matched):
         """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""
         agrees = self.squares(scene) < AGREES**2
         seen, informs = self.weight > 0, self.measurement.layout.informs
-        return Evidence(SHOWN * (informs @ (seen & agrees)), SHOWN * (informs @ (seen & ~agrees)))
+        right, wrong = seen & agrees, seen & ~agrees
+        return Evidence(SHOWN * (informs @ right), SHOWN * (informs @ wrong), self._elsewhere(right, wrong))
+
+    def _elsewhere(self, right: NDArray, wrong: NDArray) -> NDArray | None:
+        """(S,) bool: segments whose own points most views show beside where they should be, two of them in one place.
+
+        A joint's point counts for the segment beyond the joint alone: an elbow may be off where shoulder and hand are
+        right.
+        """
+        layout = self.measurement.layout
+        channels, owner = layout.channels, layout.points.segments
+        count = len(layout.body.tree.segments)
+        out = 2 * np.bincount(owner, wrong, count) > np.bincount(owner, wrong | right, count)
+        which = np.flatnonzero(wrong & out[owner])
+        if len(which) < 2:
+            return None
+        points, row = np.unique(channels.column[which], return_inverse=True)
+        views = np.full((len(points), len(channels.rig), 2), np.nan)
+        views[row, channels.camera[which]] = self.uv[which]
+        limit = AGREES * float(channels.sigma[which].max())
+        there = np.isfinite(triangulate_robust(channels.rig, views, max_residual_px=limit)[0]).all(axis=1)
+        out[:] = False
+        out[owner[which[there[row]]]] = True
+        return out if out.any() else None
 
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
