@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import BLIND, FrameResult
-from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise, known_sigma
