@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
-from kinefit.multiview.observability import SHORTEST, levers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise, known_sigma
@@ -141,7 +141,7 @@ class FrameCosts:
         """Rows of matches, beside points that are no part of them."""
         known = [self._known(m) if isinstance(m, KeypointMatched) else m for m in matched]
         points = rows_of_points(scene, [m for m in beside if m not in matched])
-        return rows_of(scene, known, self.tracker.settings, self.noise.scale, points)
+        return rows_of(scene, known, self.tracker.settings, self.noise.scale, points=points)
 
     def _known(self, m: KeypointMatched) -> KeypointMatched:
         """Keypoints with the noise that is known."""

@@ -118,7 +118,7 @@ class OtherSensors:
             matched = self.matched(scene)
             if keep is not None:
                 keep.append(matched)
-            parts = rows_of(scene, matched, self.settings, self.scale, int(self.points[f]))
+            parts = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]))
             rows[k] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)
