@@ -94,6 +94,7 @@ def track(
     motion = motion_of(
         frames, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
         lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
+        found=person.joint,
     )  # fmt: skip
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))
