@@ -160,7 +160,8 @@ class Sensors:
         return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
 
     def _cloud(self, name: str) -> PointCloudSensor:
-        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings)
+        camera = self.rig[name] if name in self.rig else None
+        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings, camera)
 
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
