@@ -89,8 +89,9 @@ def test_a_rigid_free_form_object_by_the_command(rigid, tmp_path):
     assert told.exit_code == 0, told.output
     motion = read_motion(tmp_path / "motion.npz")
     turned, away = off(motion)
-    print(turned, away, np.degrees(motion.dof_std))
-    assert len(motion) == FRAMES and turned.max() < 1.5 and away.max() < 0.003
+    assert len(motion) == FRAMES and turned.max() < 1.0 and away.max() < 0.0015
+    told = np.degrees(motion.dof_std[:, 3:]).max(axis=1)  # no bone lies below its surface: the bars are of outlines
+    assert told.max() < 1.5 and (turned < 3.0 * told).all()
     assert motion.quality.min() > 0.9 and "shape" not in motion.provenance
     assert set(motion.residuals) == {"silhouette c0", "silhouette c1"}
     assert (tmp_path / "report.html").stat().st_size > 1000

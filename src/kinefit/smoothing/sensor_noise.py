@@ -20,6 +20,7 @@ from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
 
@@ -107,7 +108,8 @@ def other_noise(
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
             shift_m = others.settings.skin_shift or SKIN_SHIFT  # also where the fit takes surfaces for exact
-            skin = skin_of(scene, surface, shift_m, others.settings.skin_turn)
+            beside = (shift_m, others.settings.skin_turn) if body.tree.coordinates else _RIGID
+            skin = skin_of(scene, surface, *beside)
             information[f] += skin.information
             lasting[f] += skin.pushes.T @ skin.pushes
         pushes.append(push)
