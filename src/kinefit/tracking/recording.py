@@ -14,7 +14,7 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
-from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, LineFrame, Markers, SilhouetteFrame
+from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, LineFrame, MarkerFrame, Markers, SilhouetteFrame
 from kinefit.sensors.base import Sensor
 
 Steps = Callable[[int], Sequence[Any]]
@@ -140,12 +140,12 @@ class Recording:
             No steps, or steps without any frame; a standard deviation of no sensor.
         """
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
-        known = np.flatnonzero(np.isfinite(told))
-        if not len(known):
+        timed = np.flatnonzero(np.isfinite(told))
+        if not len(timed):
             raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
-        times = np.interp(np.arange(len(told)), known, np.array(told)[known])
-        if len(known) < len(told):  # evenly beyond the ends
-            times = np.where(np.isfinite(told), times, times[known[0]] + (np.arange(len(told)) - known[0]) / rate)
+        times = np.interp(np.arange(len(told)), timed, np.array(told)[timed])
+        if len(timed) < len(told):  # evenly beyond the ends
+            times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
         sigma = dict(sigma or {})
         there = {*rig.names, *(_name(f) for seen in steps for f in seen)}
         for name in sigma:
@@ -155,10 +155,12 @@ class Recording:
         records = _records(steps, times, rate)
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
         accuracy = tuple(sigma.get(r.camera, 4.0) for r in records)
+        worn = _marker_records(steps, rate)
+        known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
         return cls(
             times, rate, rig, steps=lambda i: others[i], keypoints=records,
             people=tuple(np.where((r.confidence > 0).any(axis=(1, 2)), 0, -1) for r in records),
-            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **more,
+            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **{**known, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -206,6 +208,23 @@ def _records(steps: Sequence[Sequence[Any]], times: NDArray, rate: float) -> tup
             points[i, 0], confidence[i, 0] = f.uv, f.confidence
         out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=float(times[0])))
     return tuple(out)
+
+
+def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> list[tuple[Markers, str]]:
+    """Markers of single frames as whole recordings, one for each sensor and marker set, which is named beside it."""
+    seen: dict[tuple[str, str], dict[int, MarkerFrame]] = {}
+    for i, frames in enumerate(steps):
+        for f in frames:
+            if isinstance(f, MarkerFrame):
+                seen.setdefault((f.sensor, f.marker_set), {})[i] = f
+    out = []
+    for (sensor, marker_set), frames_of in seen.items():
+        names = tuple(dict.fromkeys(n for f in frames_of.values() for n in f.names))
+        positions = np.full((len(steps), len(names), 3), np.nan)
+        for i, f in frames_of.items():
+            positions[i, [names.index(n) for n in f.names]] = f.positions
+        out.append((Markers(names, rate, positions, source=sensor), marker_set))
+    return out
 
 
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.initialization.from_depth import sized_start
@@ -23,7 +22,7 @@ from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import Progress, Subject, fit_subject
 from kinefit.subject.parameters import Parameters, PointOffsets, SegmentScales
 from kinefit.subject.sensor_parameters import OwnUnknowns
-from kinefit.subject.surfaces import CylinderShape
+from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
 
@@ -207,8 +206,8 @@ def _parameters(person: Person, measurements: list[Measurement], size: bool) -> 
     landmarks = size and r.markers and not r.marker_sets[0][0]  # markers of a set have a fit of their own
     if (surfaces or landmarks) and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
         out.append(_Lengths(body, person.subject))
-    if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
-        out.append(CylinderShape(body))
+    if surfaces:
+        out += shape_of(body)
     sets = {name: std for name, std in r.marker_sets if std is not None}
     if size and cameras >= 2:  # else the markers' own fit has found them
         out += [PointOffsets(body, name, std) for name, std in sets.items()]

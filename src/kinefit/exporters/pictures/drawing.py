@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.correspondences.rims import RimFinder
 from kinefit.exporters.skeletons.tubes import side_colour
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
+from kinefit.rendering import Canvas
 
 LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
-_SPACING = 3.0  # [px] between points of an outline
 _SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
 
 
@@ -66,12 +65,9 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
 
 
 @lru_cache(maxsize=8)
-def _outlined(body: Body) -> tuple[Morphing, RimFinder] | None:
+def _outlined(body: Body) -> Morphing | None:
     """What draws the outline of a body with a skin or a mesh; None for one of simple shapes."""
-    if not (body.skin or any(isinstance(s, MeshSurface) for s in body.surfaces)):
-        return None
-    morphing = Morphing(body)
-    return morphing, RimFinder(morphing.mesh)
+    return Morphing(body) if body.skin or any(isinstance(s, MeshSurface) for s in body.surfaces) else None
 
 
 def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
@@ -81,24 +77,22 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
         draw_bones(image, motion, frame, camera, image_frame)
     if outlined is None:
         return
-    morphing, finder = outlined
-    vertices = morphing.pose(motion.state(frame)).vertices
-    rim = finder.find(vertices, camera, spacing=_SPACING)
-    along = 0.5 * _SPACING * np.stack([-rim.outline[3], rim.outline[2]])
-    ends = image_frame.from_calibration(np.stack([rim.outline[:2] - along, rim.outline[:2] + along]).transpose(2, 0, 1))
-    edge = max(1, round(image.shape[0] / 480))
-    colours = [side_colour(name) for name in segments]
-    lost = motion.segment_quality[frame] <= 0
-    for width, black in ((3 * edge, True), (edge, False)):
-        for uv, s in zip(ends, rim.segment):
-            _line(image, uv, DARK if black else LOST if lost[s] else colours[s], width)
+    mesh, vertices = outlined.mesh, outlined.pose(motion.state(frame)).vertices
+    drawn = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True, labels=mesh.face_segment).segment
+    edge, lost = max(1, round(image.shape[0] / 480)), motion.segment_quality[frame] <= 0
+    for s in np.unique(drawn[drawn >= 0]):
+        rims, _ = cv2.findContours((drawn == s).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        for rim in rims:
+            uv = image_frame.from_calibration(np.vstack([rim[:, 0], rim[:1, 0]]).astype(float))
+            _line(image, uv, DARK, 3 * edge)
+            _line(image, uv, LOST if lost[s] else side_colour(segments[s]), edge)
 
 
 def drawn_points(motion: Motion, frame: int) -> NDArray:
     """(N, 3) [m] in the world what `draw_body` fills: ends of bones, and nodes of a skin or of meshes."""
     state, outlined = motion.state(frame), _outlined(motion.body)
     ends = motion.body.positions(state, bones(motion.body)[0])
-    return ends if outlined is None else np.vstack([ends, outlined[0].pose(state).vertices])
+    return ends if outlined is None else np.vstack([ends, outlined.pose(state).vertices])
 
 
 def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame: ImageFrame) -> None:
