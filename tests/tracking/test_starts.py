@@ -155,6 +155,23 @@ def test_a_person_who_is_put_by_angles(tmp_path):
     np.testing.assert_array_equal(motion.body.tree.offsets, body.tree.offsets)
 
 
+def test_a_rough_start_is_fitted_coarse_to_fine(tmp_path):
+    """All angles are off by 40 degrees this way or that: what silhouettes alone could not follow from."""
+    body, rig = load_body("humanoid10"), ring()
+    truth = [BodyState(posture(body, 0).T_world_root, body.tree.usual)] * 2
+    seen = [[silhouettes(body, s, [c], 0.0)[0].mask for s in truth] for c in rig]
+    swing = np.where(np.arange(len(body.tree.usual)) % 2, 40.0, -40.0)
+    low, high = np.degrees(body.tree.lower), np.degrees(body.tree.upper)
+    far = np.clip(np.degrees(body.tree.usual) + swing, low, high)
+    angles = ", ".join(f"{name} = {value:.4f}" for name, value in zip(body.tree.coordinates, far))
+    start = f"[start]\nat = [0, 0.95, 0]\nforward = [1, 0, 0]\nangles = {{ {angles} }}"
+    head = f'body = "humanoid10"\nsize = false\n{start}'
+    motion, _ = track_take(saved(tmp_path, rig, seen, head))
+    last = BodyState(motion.Ts_world_root[-1], motion.angles[-1])
+    gap = body.positions(last, body.landmarks) - body.positions(truth[-1], body.landmarks)
+    assert np.linalg.norm(gap, axis=1).mean() < 0.03
+
+
 WRONG = {
     "no such angle": ("angles = { knee = 3 }", "no angle of body 'pebble' 'knee'"),
     "no such step": ("step = 8", r"step = 8, and the take has the steps \[0, 8\]"),

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._jit import cache_directory
 from kinefit.bodies.anny_cylinders import as_wide, widths
 from kinefit.bodies.anny_files import FACTORS, AnnyData, read_anny
+from kinefit.bodies.anny_rest import between, frame, swapped
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import load_body
 from kinefit.bodies.morphing import Morphing
@@ -212,30 +213,30 @@ class AnnyModel:
     def _turn(self, segment: str, joints: NDArray, heads: NDArray) -> NDArray:
         """(3, 3) what takes a segment from the modelled pose to the rest pose."""
         if segment.endswith("_l"):  # the right one's in the mirror
-            other = self._turn(segment[:-2] + "_r", _swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
+            other = self._turn(segment[:-2] + "_r", swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
             return _MIRROR @ other @ _MIRROR
         tree, names = self._base.tree, list(self.data.bones)
         at = lambda name: joints[tree.segment(name + "_r")]
         limb = segment.removesuffix("_r")
         if limb in ("thigh", "shank"):
-            return _between(at(_BEYOND[limb]) - at(limb), _DOWN)
+            return between(at(_BEYOND[limb]) - at(limb), _DOWN)
         if limb in ("foot", "toes"):
             forward = (at("toes") - at("foot")) * (1.0, 0.0, 1.0)
-            return _between(forward, np.array([1.0, 0.0, 0.0]))
+            return between(forward, np.array([1.0, 0.0, 0.0]))
         if limb not in ("upperarm", "forearm", "hand"):
             return np.eye(3)
         upper, fore = at("forearm") - at("upperarm"), at("hand") - at("forearm")
         hinge = np.cross(upper, fore)  # the elbow is modelled bent
         if limb == "upperarm":
-            return _frame(upper, hinge)
-        R = _frame(fore, hinge)
+            return frame(upper, hinge)
+        R = frame(fore, hinge)
         thumb = R @ (heads[names.index("RThumb")] - at("hand"))
         about = np.arctan2(thumb[0], thumb[2])  # palms forward: the thumb to the side
         R = se3.exp_so3(np.array([0.0, -about, 0.0])) @ R
         if limb == "forearm":
             return R
         fingers = R @ (heads[names.index("RightHandFinger1")] - at("hand"))
-        return _between(fingers, _DOWN) @ R
+        return between(fingers, _DOWN) @ R
 
     def _other_side(self, heads: NDArray) -> NDArray:
         """(B, 3) heads in the mirror."""
@@ -338,26 +339,3 @@ def _with(values: NDArray, k: int, value: float) -> NDArray:
     out = values.copy()
     out[k] = value
     return out
-
-
-def _swapped(joints: NDArray, base: Body) -> NDArray:
-    """(S, 3) joints with right and left exchanged."""
-    tree = base.tree
-    twin = lambda n: n[:-2] + {"_r": "_l", "_l": "_r"}[n[-2:]] if n[-2:] in ("_r", "_l") else n
-    return joints[[tree.segment(twin(n)) for n in tree.segments]]
-
-
-def _between(direction: NDArray, wanted: NDArray) -> NDArray:
-    """(3, 3) the least turn of a direction to a unit vector."""
-    a = direction / np.linalg.norm(direction)
-    axis = np.cross(a, wanted)
-    sine = np.linalg.norm(axis)
-    return se3.exp_so3(axis * (np.arctan2(sine, a @ wanted) / sine)) if sine > 1e-12 else np.eye(3)
-
-
-def _frame(along: NDArray, hinge: NDArray) -> NDArray:
-    """(3, 3) what turns a limb down and its hinge to the right (z)."""
-    y = -along / np.linalg.norm(along)
-    z = hinge - (hinge @ y) * y
-    z /= np.linalg.norm(z)
-    return np.stack([np.cross(y, z), y, z])

@@ -16,7 +16,7 @@ from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import Subject, fit_subject
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
 _USUAL = "humanoid"  # body of a take that names none
@@ -60,6 +60,8 @@ def track_take(
             file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
         )  # fmt: skip
     recording, body = recording_of(take, seen, body)
+    if take.pose is not None:
+        recording = from_afar(recording, body, settings)
     motion = track(
         recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
         size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings, progress=progress,

@@ -14,12 +14,14 @@ from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
 from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
+from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
-from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers
+from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers, SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
+from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.recording import Recording, spread
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
@@ -104,6 +106,18 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
             recording, keypoints=pixels.keypoints, people=pixels.people, keypoint_sigma=pixels.keypoint_sigma
         )
     return recording, body
+
+
+def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) -> Recording:
+    """A recording whose start, which may be tens of degrees off, is fitted to the silhouettes of its step."""
+    if recording.start is None:
+        return recording
+    step, state = recording.start
+    shown = [f for f in recording.steps(step) if isinstance(f, SilhouetteFrame)]
+    if not shown:
+        return recording
+    found = coarse_to_fine(body, recording.rig, shown, state, accuracy=recording.sigma, settings=settings)
+    return replace(recording, start=(step, found.result.state))
 
 
 def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
