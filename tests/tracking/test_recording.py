@@ -1,7 +1,10 @@
 """Recordings of frames in memory: markers among them tell the person's size; times that do not agree are told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.subject.measured import Rope
 from tests.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, depth_frame, keypoint_frame, marker_frame
 
 from kinefit.errors import ObservationError
@@ -46,6 +49,18 @@ def test_frames_may_have_some_of_the_markers():
     assert markers.names == names[:6]
     assert np.isfinite(markers.positions).all(axis=2).sum(axis=1).tolist() == [4, 5, 6]
     np.testing.assert_array_equal(markers.positions[1, :5], steps[1][0].positions)
+
+
+def test_two_frames_of_one_name_are_told():
+    """Markers of two systems that are both called mocap; two sets of keypoints of one camera are two sensors."""
+    names = BODY.landmarks.names
+    steps = [[marker_frame(i, names), marker_frame(i, names, shift=0.1)] for i in range(3)]
+    with pytest.raises(ObservationError, match=r"two frames of sensor 'mocap' in step 0.*own name"):
+        Recording.of_frames(steps, a_rig(), rate=RATE)
+    other = [[keypoint_frame(0, "left"), replace(keypoint_frame(0, "left"), keypoint_set="BODY_25B")]]
+    assert len(Recording.of_frames(other, a_rig(), rate=RATE).keypoints) == 2
+    with pytest.raises(ObservationError, match="two sensors are named 'rope'"):
+        Recording.of_frames(steps[:0] + [steps[0][:1]], a_rig(), rate=RATE, sensors=(Rope(), Rope()))
 
 
 @pytest.mark.parametrize("frame", [depth_frame, lambda i: keypoint_frame(i, "left")])

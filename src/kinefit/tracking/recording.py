@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,19 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
-from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, LineFrame, MarkerFrame, Markers, SilhouetteFrame
+from kinefit.observations import (
+    DepthFrame,
+    Frame,
+    KeypointFrame,
+    Keypoints,
+    LineFrame,
+    MarkerFrame,
+    Markers,
+    SilhouetteFrame,
+)
 from kinefit.sensors.base import Sensor
+
+_PARTS = ("keypoint_set", "marker_set", "segment")  # of which one sensor may have several frames at one time
 
 Steps = Callable[[int], Sequence[Any]]
 """Number of a step of time -> what the sensors saw then; nothing where none did."""
@@ -74,8 +85,10 @@ class Recording:
             raise ObservationError(problem, remedy="Start at a step of the recording.")
         for name in (*self.on_body, *self.backgrounds):
             self.rig.index(name)
-        if len({s.name for s in self.sensors}) < len(self.sensors):
-            raise ObservationError("two sensors of one name", remedy="Give each its own name.")
+        names = [s.name for s in self.sensors]
+        for name in names:
+            if names.count(name) > 1:
+                raise ObservationError(f"two sensors are named '{name}'", remedy="Give each its own name.")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -137,8 +150,10 @@ class Recording:
         Raises
         ------
         ObservationError
-            No steps, or steps without any frame; a standard deviation of no sensor.
+            No steps, or steps without any frame; two frames of one sensor in a step; a standard deviation of no sensor.
         """
+        for i, seen in enumerate(steps):
+            _check_names(i, seen)
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
         timed = np.flatnonzero(np.isfinite(told))
         if not len(timed):
@@ -176,6 +191,15 @@ def _name(frame: Any) -> str:
     """Of the sensor that a frame is of."""
     kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
     return kind + str(frame.sensor)
+
+
+def _check_names(step: int, seen: Sequence[Any]) -> None:
+    """Refuse two frames of one sensor in a step that are of the same points."""
+    told = [(type(f), f.sensor, *(getattr(f, part, "") for part in _PARTS)) for f in seen]
+    for one in told:
+        if isinstance(seen[told.index(one)], get_args(Frame)) and told.count(one) > 1:
+            problem = f"two frames of sensor '{one[1]}' in step {step}"
+            raise ObservationError(problem, remedy="Give each sensor its own name, or each time its own step.")
 
 
 def _cut(record: Keypoints, frames: slice) -> Keypoints:
