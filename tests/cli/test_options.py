@@ -193,7 +193,9 @@ def test_a_key_of_the_start_acts(key, take):
 def test_an_old_key_is_a_note_of_the_command(take):
     path = take("markers")
     path.write_text(changed(path.read_text(), "[[markers]]", "accuracy = 0.01"))
-    code, _, words, _ = run(path, "--no-overlays", "--no-report")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", FutureWarning)
+        code, _, words, _ = run(path, "--no-overlays", "--no-report")
     assert code == 0 and "note: " in words and "'accuracy' is now called 'sigma'" in words
     assert ".py" not in words.partition("'accuracy'")[0]
 
