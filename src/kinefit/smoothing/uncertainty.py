@@ -54,7 +54,7 @@ class Lasting:
 
 def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
-    others: OtherNoise | None = None, answers: Answers | None = None,
+    others: OtherNoise | None = None, answers: Sequence[Answers] = (),
 ) -> tuple[list[FrameResult], DetectorNoise]:  # fmt: skip
     """The same results with the standard deviations that lasting errors and the shape add; and the detectors' noise.
 
@@ -65,7 +65,7 @@ def with_lasting_errors(
     take : the pixels as they were used, and the states
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors
-    answers : what a shape adds that was found from all sensors together, where it was
+    answers : what shapes add that were found from several kinds of sensors together
     """
     body, channels = subject.body, take.channels
     fitted = take.fitted(take.roots, take.angles)
@@ -89,10 +89,10 @@ def with_lasting_errors(
         added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
         if f in sampled:
             alone.append(one.alone)
-    shape = answers([int(f) for f in sampled], alone) if answers is not None else None
+    shapes = [one([int(f) for f in sampled], alone) for one in answers]
     out = []
     for f, (result, (dofs, joints)) in enumerate(zip(results, added)):
-        if shape is not None:
+        for shape in shapes:
             dofs, joints = (mine + of_shape for mine, of_shape in zip((dofs, joints), shape.at(f)))
         out.append(replace(
             result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),

@@ -63,7 +63,7 @@ class TrackedFrames:
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", name: str = "motion",
-    told: Mapping[str, Any] | None = None, found: joint.Subject | None = None,
+    told: Mapping[str, Any] | None = None, found: Sequence[joint.Subject] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 
@@ -78,7 +78,7 @@ def motion_of(
     noise : that is known beforehand, for a lag
     up, name : of the motion
     told : what else there is to tell, for `Motion.provenance`
-    found : the shape that all sensors together were fitted with, with its covariance
+    found : what all sensors were fitted with together, with its covariance
     """
     body, rate, channels = subject.body, frames.rate, frames.channels
     results: Sequence[FrameResult] = frames.results
@@ -119,7 +119,7 @@ def motion_of(
     if others is not None and matched is not None:
         noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
         provenance["sensor noise"] = noise_of_others.as_told()
-    answers = None if found is None else partial(shape_errors, found, settings, seen)
+    answers = [partial(shape_errors, one, settings, seen) for one in found]
     results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others, answers)
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)

@@ -20,9 +20,10 @@ from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import Progress, Subject, fit_subject
+from kinefit.subject.parameters import SegmentScales
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
-from kinefit.tracking.unknowns import unknowns_of
+from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
 _POSES = 8  # and how many of them it is found from: twice as many change no half axis by more than its deviation
@@ -45,7 +46,7 @@ class Person:
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
     told : what there is to report of it, for `Motion.provenance`
-    joint : what the fit of all sensors together found
+    joint : what fits of several kinds of sensors together found, in their order
     """
 
     recording: Recording
@@ -54,7 +55,7 @@ class Person:
     start: Start | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
-    joint: joint.Subject | None = None
+    joint: tuple[joint.Subject, ...] = ()
 
 
 def fitted_to_person(
@@ -175,9 +176,7 @@ def _by_all(
     surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
     poses = _POSES if surfaces or r.keypoints else _MANY
     chosen = [good[k] for k in spread(len(good), poses)]
-    told = [m for k in chosen for m in tracked.measurements[k]]
-    unknown = unknowns_of(r, generic, person.subject, told, size=size, height=height, trial=trial)
-    if not chosen or not unknown.parameters:
+    if not chosen:
         return person
     layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
     steps: list[list[Measurement]] = []
@@ -185,28 +184,40 @@ def _by_all(
         f, result = first + tracked.steps[k], tracked.results[k]
         pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
-    states = [tracked.results[k].state for k in chosen]
-    found = joint.fit_subject(
-        unknown.world.body, r.rig, steps, states, unknown.parameters, start=unknown.start, loss=settings.loss,
-        times=[tracked.results[k].time for k in chosen],
-        velocities=[_velocity(tracked.results, k) for k in chosen], rounds=_MATCHES,
-    )  # fmt: skip
+    states: Sequence[BodyState] = [tracked.results[k].state for k in chosen]
+    times, velocities = [tracked.results[k].time for k in chosen], [_velocity(tracked.results, k) for k in chosen]
+
+    def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> joint.Subject:
+        return joint.fit_subject(
+            unknown.world.body, r.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
+            times=times, velocities=velocities, rounds=_MATCHES,
+        )  # fmt: skip
+
+    points = of_points(r, generic, person.subject, height, trial) if size else None
+    if points is not None:
+        found = fit(points, [[m for m in several if m.settled] for several in steps], states)
+        person, states = _by_joint(person, found), found.states
+    lengths = points is None and person.subject.shape is None
+    left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
+    if left is not None:
+        found = fit(left, steps, states)
+        person, states = _by_joint(person, found), found.states
+    return replace(person, start=(first + tracked.steps[chosen[0]], states[0]))
+
+
+def _by_joint(person: Person, found: joint.Subject) -> Person:
+    """The person as a fit of several kinds of sensors found it; with its lengths where they were sought."""
+    subject, count = person.subject, len(person.subject.scales)
+    if any(isinstance(p, SegmentScales) for p in found.parameters):
+        base = subject.scales if found.prior_world.body is subject.body else 1.0
+        subject = replace(
+            subject, scales=base * np.exp(found.mean[:count]), shape=None, covariance=None,
+            length_share=found.std[:count],
+        )  # fmt: skip
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
-    begin = first + tracked.steps[chosen[0]], found.states[0]
-    person = _wearing(person, _sized(person.subject, found), shape=shape)
-    return replace(person, start=begin, values=found.values, joint=found)
-
-
-def _sized(subject: Subject, found: joint.Subject) -> Subject:
-    """The body that all sensors found together, with its lengths where they were among what was sought."""
-    count = len(subject.scales)
-    if not (len(found.names) >= count and found.names[0].startswith("length ")):
-        return replace(subject, body=found.body)
-    base = 1.0 if found.prior_world.body is not subject.body else subject.scales
-    return replace(
-        subject, body=found.body, scales=base * np.exp(found.mean[:count]), shape=None, covariance=None,
-        length_share=found.std[:count],
-    )  # fmt: skip
+    person = _wearing(person, replace(subject, body=found.body), shape={**person.told.get("shape", {}), **shape})
+    values = {**person.values, **found.values}
+    return replace(person, values=values, joint=(*person.joint, found))
 
 
 def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
