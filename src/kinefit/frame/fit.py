@@ -189,21 +189,39 @@ class FrameFit:
         if lost is not None:
             rows = self.rows(scene, held, found.matched, apart=found.apart, without=lost)
             H = normal_equations(self.body, scene.state, rows).matrix
-        now = H if held is None else H - held[1] + _TRACE * np.eye(len(H))
+        if held is None:
+            H = now = H + _TRACE * np.eye(len(H))  # where nothing measures the root, nothing holds it
+        else:
+            now = H - held[1] + _TRACE * np.eye(len(H))
         seen = self._seen(scene, found.matched, now, lost)
         known = seen[6:] if known is None else seen[6:] | known
         known = known | ~np.isfinite(tree.spread)
         alone = np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
         posterior = inverse(H)
+        stated = posterior + self._of_surfaces(scene, found.matched, now, lost)
         if lost is not None:
             elsewhere = np.zeros(len(lost), bool) if told.elsewhere is None else lost & told.elsewhere
             gone = holding(tree, elsewhere) | (moving(tree, lost) & ~seen)
-            known, posterior = known & ~gone[6:], forgotten(tree, posterior, gone)
-        result = judged(scene, posterior, found.matched, found.iterations, observed=known, told=told)
+            known, stated = known & ~gone[6:], forgotten(tree, stated, gone)
+        result = judged(scene, stated, found.matched, found.iterations, observed=known, told=told)
         if lost is not None:
             result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
         return Fitted(result, inverse(alone), seen[6:], known)
+
+    def _of_surfaces(
+        self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None
+    ) -> NDArray:
+        """(n, n) what the surfaces' own error, which lasts, adds to a pose, with the information of one time."""
+        s, n = self.settings, self.body.tree.n_dofs
+        if s.skin_shift <= 0.0 or n == 6 or all(m.of_points for m in matched):
+            return np.zeros((n, n))
+        _, surface, points = _kinds(scene, matched, None, 0, without)
+        if not surface:
+            return np.zeros((n, n))
+        skin = skin_of(scene, surface, s.skin_shift, s.skin_turn)
+        moved = (skin.pushes if points >= n else skin.exact_pushes) @ inverse(now)
+        return moved.T @ moved
 
     def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None) -> NDArray:
         """(n,) bool: what measurements observe, with the information of one time, the prior included.
@@ -241,6 +259,16 @@ def rows_of(
     points : rows of points that are not among the matches
     without : (S,) bool, segments whose rows weigh nothing
     """
+    parts, surface, points = _kinds(scene, matched, scale, points, without)
+    if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
+        return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
+    return [*parts, *surface]
+
+
+def _kinds(
+    scene: Scene, matched: Sequence[Matched], scale: Mapping[str, float] | None, points: int, without: NDArray | None
+) -> tuple[list[AnyRows], list[Rows], int]:
+    """Rows of all but surfaces, rows of surfaces, and how many of points there are."""
     parts: list[AnyRows] = []
     surface: list[Rows] = []
     for m in matched:
@@ -252,9 +280,7 @@ def rows_of(
             else:
                 parts.append(rows)
                 points += int(np.count_nonzero(rows.weight)) if m.of_points else 0
-    if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
-        return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
-    return [*parts, *surface]
+    return parts, surface, points
 
 
 def rows_of_points(scene: Scene, matched: Sequence[Matched]) -> int:

@@ -37,12 +37,14 @@ class Skin:
     H, g : (S, 6, 6), (S, 6) of twists (v at the middle, ω)
     jacobian : (S, 6, n) of those twists by the degrees of freedom
     sigma : (6,) [m, rad] standard deviations of the surface's error
+    exact : (S, 6, 6) H of surfaces that are taken for exact, nothing eliminated
     """
 
     H: NDArray
     g: NDArray
     jacobian: NDArray
     sigma: NDArray
+    exact: NDArray
 
     def rows(self) -> DofRows:
         """The same as six rows a segment, of directions that are observed."""
@@ -62,7 +64,15 @@ class Skin:
     @property
     def pushes(self) -> NDArray:
         """(6 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
-        return np.einsum("sin,sij,j->sjn", self.jacobian, self.H, self.sigma, optimize=True).reshape(-1, self.n)
+        return self._pushes(self.H)
+
+    @property
+    def exact_pushes(self) -> NDArray:
+        """(6 S, n) the same where surfaces are taken for exact."""
+        return self._pushes(self.exact)
+
+    def _pushes(self, H: NDArray) -> NDArray:
+        return np.einsum("sin,sij,j->sjn", self.jacobian, H, self.sigma, optimize=True).reshape(-1, self.n)
 
     @property
     def n(self) -> int:
@@ -98,9 +108,9 @@ def skin_of(scene: Scene, parts: Sequence[Rows], shift: float, turn: float) -> S
     sigma = np.array([shift] * 3 + [turn] * 3)
     inverse = np.diag(sigma**-2.0)
     kept = np.linalg.solve(H + inverse, np.concatenate([H, g[..., None]], axis=2))
-    H = H - H @ kept[..., :6]
+    left = H - H @ kept[..., :6]
     g = inverse @ kept[..., 6:]
-    return Skin(0.5 * (H + H.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma)
+    return Skin(0.5 * (left + left.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H)
 
 
 def _factor(rows: Rows) -> NDArray:

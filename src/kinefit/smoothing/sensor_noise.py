@@ -70,14 +70,16 @@ class OtherNoise:
 
 
 def other_noise(
-    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray
-) -> OtherNoise:
+    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
+    *, surfaces: bool = True,
+) -> OtherNoise:  # fmt: skip
     """Noise of all sensors but the keypoints, from their residuals at fitted states.
 
     Parameters
     ----------
     matched : T lists of matches
     roots, angles : (T, 4, 4), (T, D) fitted
+    surfaces : whether errors of surfaces as wholes count
     """
     T, n = len(roots), body.tree.n_dofs
     pushes, shifts = Spool[list[tuple[str, float, NDArray]]](), Spool[list[tuple[str, NDArray]]]()
@@ -123,7 +125,8 @@ def other_noise(
             beside = max(settings.skin_shift, _EXACT), settings.skin_turn
             skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID))
             information[f] += skin.information[upper]
-            lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
+            if surfaces:
+                lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
         pushes.append(push)
         shifts.append(moved)
     shift = {

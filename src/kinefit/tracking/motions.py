@@ -117,7 +117,10 @@ def motion_of(
     provenance["contradictions"] = contradictions(*zip(*(seen(int(f)) for f in spread(len(results), LOOKS))))
     noise_of_others = None
     if others is not None and matched is not None:
-        noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
+        # the tracker's own frames hold the surfaces' errors already
+        noise_of_others = other_noise(
+            body, others, matched, take.roots, take.angles, surfaces=smooth or lag is not None
+        )
         provenance["sensor noise"] = noise_of_others.as_told()
     answers = [partial(shape_errors, one, settings, seen) for one in found]
     results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others, answers)
