@@ -128,7 +128,9 @@ def lasting(
     each = np.repeat(weight, 2)
     H = product((Jq * each[:, None]).T, J.reshape(len(each), J.shape[2]))
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
-    alone = inverse(H[:, :n] + other_information + prior)
+    free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
+    alone = np.zeros((n, n))
+    alone[free, free] = inverse((H[:, :n] + other_information + prior)[free, free])
     last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
     of_source = [channels.source == q for q in range(len(noise.shift))]
     shifted = [product(weight[q][None], J[q, :, :n].reshape(int(q.sum()), 2 * n)).reshape(2, n) for q in of_source]
