@@ -1,0 +1,72 @@
+"""Which parameters a recording can tell: points first, then surfaces and what sensors do not know of themselves."""
+
+import numpy as np
+import pytest
+
+from kinefit import Markers, load_body
+from kinefit.geometry.camera import Rig
+from kinefit.subject.keypoints import Subject
+from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
+from kinefit.subject.surfaces import CylinderShape
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.unknowns import of_all, of_points
+
+BODY = load_body("humanoid")
+SET = next(iter(BODY.marker_sets))
+SCALES = np.full(len(BODY.scale_groups), 1.04)
+SIZED = Subject(BODY.scaled(SCALES), SCALES)
+
+
+def a_recording(marker_set=SET, std=None):
+    names = BODY.markers(SET).names
+    markers = Markers(names, 10.0, np.zeros((4, len(names), 3)), up="z", unit="m")
+    return Recording(0.1 * np.arange(4), 10.0, Rig(()), markers=(markers,), marker_sets=((marker_set, std),))
+
+
+def kinds(unknown):
+    return [type(p) for p in unknown.parameters]
+
+
+def test_markers_tell_lengths_and_their_own_places():
+    unknown = of_points(a_recording(), BODY, SIZED, None, None)
+    assert kinds(unknown) == [SegmentScales, PointOffsets]
+    assert unknown.world.body is BODY
+    lengths = unknown.start[: len(SCALES)]
+    np.testing.assert_allclose(lengths, np.log(SCALES))
+    np.testing.assert_allclose(unknown.start[len(SCALES) :], 0.0, atol=1e-12)
+    assert unknown.start.shape == (sum(len(p.names) for p in unknown.parameters),)
+
+
+def test_a_set_says_how_far_its_markers_may_sit_elsewhere():
+    std = np.linspace(0.005, 0.03, len(BODY.markers(SET)))
+    known = of_points(a_recording(std=std), BODY, SIZED, None, None).parameters[1]
+    np.testing.assert_allclose(known.std, std)
+
+
+def test_a_height_holds_the_size():
+    free, held = (of_points(a_recording(), BODY, SIZED, h, None).parameters[0] for h in (None, 1.9))
+    assert held.mean[0] == pytest.approx(np.log(1.9 / BODY.stature)) and free.mean[0] == 0.0
+    assert held.information.sum() > 10.0 * free.information.sum()
+
+
+def test_another_trial_of_the_person_holds_lengths_as_sure_as_it_was():
+    trial = Subject(SIZED.body, SCALES, covariance=np.diag(np.full(len(SCALES), 0.01**2)))
+    lengths = of_points(a_recording(), BODY, SIZED, None, trial).parameters[0]
+    assert isinstance(lengths, KnownLengths)
+    np.testing.assert_allclose(lengths.mean, np.log(SCALES))
+    np.testing.assert_allclose(np.diag(lengths.information) ** -0.5, 0.01 / SCALES)
+
+
+def test_landmarks_as_markers_have_no_places_to_find():
+    recording = a_recording(marker_set="")
+    assert of_points(recording, BODY, SIZED, None, None) is None
+    assert kinds(of_all(recording, SIZED.body, size=True, lengths=True, surfaces=False)) == [SegmentScales]
+
+
+@pytest.mark.parametrize(("lengths", "expected"), [(True, [SegmentScales, CylinderShape]), (False, [CylinderShape])])
+def test_surfaces_tell_lengths_only_where_points_do_not(lengths, expected):
+    assert kinds(of_all(a_recording(), SIZED.body, size=True, lengths=lengths, surfaces=True)) == expected
+
+
+def test_a_body_of_known_size_leaves_nothing_to_find():
+    assert of_all(a_recording(), SIZED.body, size=False, lengths=True, surfaces=True) is None
