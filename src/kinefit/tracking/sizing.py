@@ -206,7 +206,7 @@ def _parameters(person: Person, measurements: list[Measurement], size: bool) -> 
     cameras = len({k.camera for k in r.keypoints})
     landmarks = size and r.markers and not r.marker_sets[0][0]  # markers of a set have a fit of their own
     if (surfaces or landmarks) and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
-        out.append(_Lengths(body, person.subject))
+        out.append(FittedLengths(body, person.subject))
     if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
         out.append(CylinderShape(body))
     sets = {name: std for name, std in r.marker_sets if std is not None}
@@ -216,7 +216,7 @@ def _parameters(person: Person, measurements: list[Measurement], size: bool) -> 
     return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]
 
 
-class _Lengths(SegmentScales):
+class FittedLengths(SegmentScales):
     """Scales of a body that was fitted already, as sure of each as that fit was."""
 
     def __init__(self, body: Body, subject: Subject) -> None:
