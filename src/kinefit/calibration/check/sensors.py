@@ -36,7 +36,7 @@ from kinefit.subject.keypoints import Subject as Person
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
-from kinefit.subject.surfaces import CylinderShape
+from kinefit.subject.surfaces import CylinderShape, CylinderSlide
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.sizing import FittedLengths
 from kinefit.tracking.take_recording import recording_of
@@ -52,6 +52,7 @@ _FEWEST = 4  # frames in which a sensor must have seen the person
 _FAR = (0.3, 0.2, 0.12, 0.08)  # [m] of correspondences while only the frames of the sensors move
 _COARSE, _ROUNDS = 5, 3  # frames of the first fit; rounds of match and solve of the second
 _DETECTOR = 0.005  # [m] by which a detector's points may stand elsewhere than the fit of the keypoints has them
+_SETTINGS = TrackSettings(through=np.inf)  # free space ends half a pixel within a person and lifts a standing one
 _INSIDE, _DRAWS = 0.95, 4000  # share of errors within the bars that are stated; numbers drawn for that
 
 
@@ -154,7 +155,7 @@ class _Problem:
     """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
 
     def __init__(self, recording: Recording, motion: Motion, person: Person, depth: frozenset[str]) -> None:
-        self.recording, self.motion, self.depth, self.settings = recording, motion, depth, TrackSettings()
+        self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
         self.person = person
         self.body: Body = motion.body
         channels = make_channels(
@@ -217,7 +218,7 @@ class _Problem:
         out: list[Parameters] = [FittedLengths(self.body, self.person)]
         surfaces = self.body.surfaces if any(isinstance(f, DepthFrame) for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
-            out.append(CylinderShape(self.body))
+            out += [CylinderShape(self.body), CylinderSlide(self.body)]
         sets = {name: std for name, std in self.recording.marker_sets if std is not None}
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         return out + [PointOffsets(self.body, name, _DETECTOR) for name in self.layout.channels.sets]
