@@ -18,9 +18,6 @@ GIRTH, OFFSET = 0.2, 0.015
 """Standard deviations between people: of the logarithm of a half axis (ANSUR II: girths by 10 %; a body of cylinders
 differs from a person's by as much again), and of where a surface lies about its bone [m]."""
 
-SLIDE = 0.02
-"""Standard deviation [m] between people of where along its bone a surface begins and ends."""
-
 _KINDS = ("start a", "start b", "end a", "end b", "start offset", "end offset")
 _STEP = 1e-3
 
@@ -96,66 +93,6 @@ class CylinderShape:
             for s, g in zip(world.body.surfaces, self._groups[1], strict=True)
         )
         return replace(world, body=replace(world.body, surfaces=surfaces))
-
-
-@dataclass(frozen=True, eq=False)
-class CylinderSlide:
-    """Shifts [m] of tapered cylinders along their own axes; left and right alike.
-
-    Where heads end and shoulders begin differs between people of the same bones. A standing person's height over the
-    floor is measured no better by a sensor that sees surfaces alone.
-
-    Parameters
-    ----------
-    body : Body with cylinders.
-    std : standard deviation of each [m].
-    """
-
-    body: Body
-    std: float = SLIDE
-
-    @cached_property
-    def _shape(self) -> CylinderShape:
-        return CylinderShape(self.body)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """(C,)."""
-        return tuple(f"{name} slide" for name in self._shape._groups[0])
-
-    @property
-    def touches(self) -> tuple[frozenset[int], ...]:
-        """Of each parameter the segments that it changes."""
-        return self._shape.touches[:: len(_KINDS)]
-
-    @property
-    def mean(self) -> NDArray:
-        """(C,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
-    def information(self) -> NDArray:
-        """(C, C)."""
-        return np.eye(len(self.names)) / self.std**2
-
-    @property
-    def step(self) -> NDArray:
-        """(C,)."""
-        return np.full(len(self.names), 0.1 * _STEP)
-
-    def apply(self, world: World, values: NDArray) -> World:
-        """The body with its cylinders shifted."""
-        surfaces = tuple(
-            _slid(s, float(values[g])) if isinstance(s, TaperedCylinder) else s
-            for s, g in zip(world.body.surfaces, self._shape._groups[1], strict=True)
-        )
-        return replace(world, body=replace(world.body, surfaces=surfaces))
-
-
-def _slid(surface: TaperedCylinder, shift: float) -> Surface:
-    axis = shift * surface.axes[2]
-    start, end = (tuple(np.add(at, axis).tolist()) for at in (surface.start, surface.end))
-    return replace(surface, start=start, end=end, side=tuple(surface.axes[0].tolist()))
 
 
 def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
