@@ -167,7 +167,7 @@ def world_of(walk: Walk, rig: Rig) -> NDArray:
 
 
 def left_over(walk: Walk, rig: Rig, T_sensor: NDArray) -> tuple[float, float]:
-    """Turn [deg], and shift [mm] in the middle of the person's places, of a sensor that puts x_true at T_sensor x_true."""
+    """Turn [deg], and shift [mm] in the middle of the walk, of a sensor that puts x_true at T_sensor x_true."""
     x, world = walk.truth.positions().reshape(-1, 3).mean(axis=0), world_of(walk, rig)
     turn = float(np.degrees(np.linalg.norm(se3.log_so3(T_sensor[:3, :3] @ world[:3, :3].T))))
     return turn, 1e3 * float(np.linalg.norm(se3.apply(T_sensor, x) - se3.apply(world, x)))

@@ -83,7 +83,7 @@ def _refine(
 
 
 def write_refined(found: Check, refined: Refined, path: Path, *, copy: bool) -> None:
-    """Write the refined calibration beside the old one and say what to change in the take at `path`; or a copy of it."""
+    """Write the refined calibration beside the old one and say what to change in the take at `path`, or copy that."""
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.calibration.write import write_calibration_like
 

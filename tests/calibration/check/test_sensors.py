@@ -39,7 +39,7 @@ def test_a_fault_names_the_sensor_and_how_much():
     assert "--refine" in found.remedy
 
 
-@pytest.mark.parametrize("small", [{}, {"x": 0.004}, {"x": 0.003, "ry": 0.004}, {"ry": 0.005}])
+@pytest.mark.parametrize("small", [{}, {"x": 0.004}, {"x": 0.012, "ry": 0.008}, {"ry": 0.005}])
 def test_what_is_small_or_not_sure_is_good_news(small):
     assert [f.severity for f in sensor_findings([fit(**small)], DEPTH)] == ["good"]
 

@@ -52,12 +52,10 @@ _FEWEST = 4  # frames in which a sensor must have seen the person
 _FAR = (0.3, 0.2, 0.12, 0.08)  # [m] of correspondences while only the frames of the sensors move
 _COARSE, _ROUNDS = 5, 3  # frames of the first fit; rounds of match and solve of the second
 _DETECTOR = 0.005  # [m] by which a detector's points may stand elsewhere than the fit of the keypoints has them
-_SURFACE = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0])
-_UPRIGHT = 0.01
-"""[m, rad, s], and [m] upwards: what a surface of simple shapes leaves wrong on a person of another shape, in all frames
-alike: RMS errors of three simulated Anny people (draws 100 to 102 of `benchmarks.mixed_misfit`)."""
-
-_SETTINGS = TrackSettings(through=np.inf)  # free space ends half a pixel within a person: 7 mm too high with it, 6 without
+# [m, rad, s], and [m] upwards: what a surface of simple shapes leaves wrong on a person of another shape, in all frames
+# alike: RMS errors of three simulated Anny people (draws 100 to 102 of `benchmarks.mixed_misfit`).
+_SURFACE, _UPRIGHT = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0]), 0.01
+_SETTINGS = TrackSettings(through=np.inf)  # with free space two heights were off by 8 and 21 mm, without by 7 and 17
 _HEIGHTS, _NEAR = np.linspace(-0.06, 0.06, 9), 0.05  # [m] that are tried, and at which a distance counts in full
 _INSIDE, _DRAWS = 0.95, 4000  # share of errors within the bars that are stated; numbers drawn for that
 
@@ -160,6 +158,17 @@ def fit_sensors(
     return tuple(out)
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One frame of the motion: what the sensors saw, the body's state, time [s] and velocity (n,)."""
+
+    frame: int
+    seen: Sequence[Any]
+    state: BodyState
+    time: float
+    velocity: NDArray
+
+
 class _Problem:
     """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
 
@@ -189,8 +198,8 @@ class _Problem:
     def chosen(self, most: int) -> NDArray:
         """Frames to fit, in which the person was tracked and a sensor saw something."""
         good = np.flatnonzero(self.motion.quality > _TRACKED)
-        good = [int(f) for f in good[spread(len(good), 4 * most)] if self.seen(int(f))]
-        return np.array(good, int)[spread(len(good), most)]
+        some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
+        return some[spread(len(some), most)]
 
     def fitted(self, chosen: NDArray) -> tuple[Subject, NDArray]:
         """The fit of everything, and the centre (3,) [m] of the sensors' frames."""
@@ -202,55 +211,53 @@ class _Problem:
         self.names = tuple(dict.fromkeys(f.sensor for seen in frames for f in seen))
         centre = np.mean([motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
         place = SensorFrames(self.names)
-        given = chosen, frames, states, times, velocities
-        some = spread(len(chosen), _COARSE)
-        few = [[values[k] for k in some] for values in given]
-        coarse = self.fit(*few, centre, {}, [place], np.zeros(len(place.names)), reach=_FAR, rounds=len(_FAR), looks=1.0)
+        looks = [_Look(*each) for each in zip(chosen.tolist(), frames, states, times, velocities)]
+        few = [looks[k] for k in spread(len(looks), _COARSE)]
+        nothing = np.zeros(len(place.names))
+        coarse = self.fit(few, centre, {}, [place], nothing, reach=_FAR, rounds=len(_FAR), looks=1.0)
+        few = [replace(look, state=state) for look, state in zip(few, coarse.states)]
         values = {name: dict(own) for name, own in coarse.values.items()}
         for sensor in self.depth & set(self.names):
-            raised = self.height(sensor, few, coarse.states, centre, values) * self.recording.up_axis
+            raised = self.height(sensor, few, centre, values) * self.recording.up_axis
             for axis, shift in zip(AXES, raised):
                 values[sensor][axis] += float(shift)
         parameters = [*self.parameters(frames), place]
         moved = [values[name][what] for name in self.names for what in (*AXES, CLOCK)]
         start = np.concatenate([*(p.mean for p in parameters[:-1]), moved])
-        return self.fit(*given, centre, values, parameters, start, rounds=_ROUNDS), centre
+        return self.fit(looks, centre, values, parameters, start, rounds=_ROUNDS), centre
 
-    def height(
-        self, sensor: str, few: Sequence[Any], states: Sequence[BodyState], centre: NDArray, values: Any
-    ) -> float:  # fmt: skip
+    def height(self, sensor: str, looks: Sequence[_Look], centre: NDArray, values: Any) -> float:
         """[m] by which a depth sensor is to be raised, so that its points lie nearest to the surface.
 
         Correspondences slide along a standing person: matched and solved in turn, heights come 3 % nearer in a round.
         So heights are tried, and the smallest truncated distances of all points, with new correspondences, are found.
         """
-        chosen, frames, _, times, _ = few
-        own = [[f for f in seen if f.sensor == sensor] for seen in frames]
-        steps = self.measured(chosen, own, states, times, centre, values)
+        own = [replace(look, seen=[f for f in look.seen if f.sensor == sensor]) for look in looks]
+        steps = self.measured(own, centre, values)
         cost = np.zeros(len(_HEIGHTS))
         for k, raised in enumerate(_HEIGHTS):
             shift = dict(zip(AXES, raised * self.recording.up_axis))
             there = {sensor: {what: v + shift.get(what, 0.0) for what, v in values[sensor].items()}}
-            for several, state, time in zip(steps, states, times):
-                scene = Scene(self.body, state, self.recording.rig, time=time, values=there)
+            for several, look in zip(steps, own):
+                scene = Scene(self.body, look.state, self.recording.rig, time=look.time, values=there)
                 for m in several:
                     if m.sensor == sensor:
                         r = rows_at(matched_by(m, scene, _NEAR), scene)[0].residual
                         cost[k] += float(np.sum(np.minimum(np.square(r), _NEAR**2) - _NEAR**2))
         least = int(np.clip(np.argmin(cost), 2, len(_HEIGHTS) - 3))
         a, b, _ = np.polyfit(_HEIGHTS[least - 2 : least + 3], cost[least - 2 : least + 3], 2)
-        return float(np.clip(-0.5 * b / a, _HEIGHTS[0], _HEIGHTS[-1])) if a > 0.0 else float(_HEIGHTS[np.argmin(cost)])
+        best = -0.5 * b / a if a > 0.0 else _HEIGHTS[least]
+        return float(np.clip(best, _HEIGHTS[0], _HEIGHTS[-1]))
 
     def fit(
-        self, chosen: Sequence[int], frames: Sequence[Sequence[Any]], states: Sequence[BodyState],
-        times: Sequence[float], velocities: Sequence[NDArray], centre: NDArray, values: Any,
-        parameters: Sequence[Parameters], start: NDArray, **options: Any,
+        self, some: Sequence[_Look], centre: NDArray, values: Any, parameters: Sequence[Parameters], start: NDArray,
+        **options: Any,
     ) -> Subject:  # fmt: skip
         """Parameters of some frames from a start, at which the sensors have `values`."""
-        steps = self.measured(chosen, frames, states, times, centre, values)
         return fit_subject(
-            self.body, self.recording.rig, steps, states, parameters, start=start, times=times, velocities=velocities,
-            loss=self.settings.loss, **options,
+            self.body, self.recording.rig, self.measured(some, centre, values), [look.state for look in some],
+            parameters, start=start, times=[look.time for look in some],
+            velocities=[look.velocity for look in some], loss=self.settings.loss, **options,
         )  # fmt: skip
 
     def parameters(self, frames: Sequence[Sequence[Any]]) -> list[Parameters]:
@@ -263,23 +270,19 @@ class _Problem:
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         return out + [PointOffsets(self.body, name, _DETECTOR) for name in self.layout.channels.sets]
 
-    def measured(
-        self, chosen: Sequence[int], frames: Sequence[Sequence[Any]], states: Sequence[BodyState], times: Sequence[float],
-        centre: NDArray, values: Any,
-    ) -> list[list[Measurement]]:  # fmt: skip
+    def measured(self, looks: Sequence[_Look], centre: NDArray, values: Any) -> list[list[Measurement]]:
         """What was measured in each frame, prepared about the body where the sensors' frames have it."""
         channels, out = self.layout.channels, []
-        for f, seen, state, time in zip(chosen, frames, states, times):
+        for look in looks:
             several: list[Measurement] = []
-            for frame in seen:
+            for frame in look.seen:
                 T = displacement(values.get(frame.sensor, {}), centre)
-                there = BodyState(se3.inverse(T) @ state.T_world_root, state.angles)
-                scene = Scene(self.body, there, self.recording.rig, time=time, samples=self.settings.samples)
+                there = BodyState(se3.inverse(T) @ look.state.T_world_root, look.state.angles)
+                scene = Scene(self.body, there, self.recording.rig, time=look.time, samples=self.settings.samples)
                 several += [Displaced(m, centre) for m in self.sensors.measurements([frame], scene)]
-            k = int(f) + self.first
-            several.append(KeypointMeasurement(
-                self.pixels, self.layout, channels.uv[k], channels.confidence[k], time
-            ))
+            k = look.frame + self.first
+            pixels = channels.uv[k], channels.confidence[k]
+            several.append(KeypointMeasurement(self.pixels, self.layout, *pixels, look.time))
             out.append(several)
         return out
 
@@ -288,4 +291,5 @@ class _Problem:
         a, b = max(frame - 1, 0), min(frame + 1, len(self.motion) - 1)
         if a == b:
             raise ObservationError("a motion of one frame", remedy="Record the person for some seconds.")
-        return self.motion.state(a).difference(self.motion.state(b)) / float(self.motion.times[b] - self.motion.times[a])
+        seconds = float(self.motion.times[b] - self.motion.times[a])
+        return self.motion.state(a).difference(self.motion.state(b)) / seconds

@@ -33,7 +33,6 @@ from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, check_rates, common_frames
 
-
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
 
