@@ -4,10 +4,10 @@
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
 interval), "smoothing" (it helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
-second sensor never harms the balancing trial). The first three are of simulated takes: see `benchmarks.mixed_takes` for
-the person, motion and sensors, `benchmarks.mixed_runs` for the mixes and conditions, `benchmarks.mixed_figures` for
-definitions. True surface: Anny; fitted body: the catalogue's humanoid of cylinders, its size found by
-`kinefit.track_take`.
+second sensor never harms the balancing trial), "memory" (what each frame of a long take needs). The first three are of
+simulated takes: see `benchmarks.mixed_takes` for the person, motion and sensors, `benchmarks.mixed_runs` for the mixes
+and conditions, `benchmarks.mixed_figures` for definitions. True surface: Anny; fitted body: the catalogue's humanoid of
+cylinders, its size found by `kinefit.track_take`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from kinefit.errors import AssetError
 SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
-GROUPS = (*SIMULATED, "misfit", "real")
+GROUPS = (*SIMULATED, "misfit", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 2, 1.2
 
 

@@ -87,6 +87,24 @@ def test_halt_stays():
     np.testing.assert_allclose(stopped.difference(prediction.ahead()[0]), 0, atol=1e-12)
 
 
+def test_what_is_out_of_sight_may_go_on_as_it_went():
+    """Halted for a second, a walker who in truth walks on stays within two standard deviations."""
+    prediction, speed = Prediction(BODY, DT, angle_acceleration=ACCELERATION, root_acceleration=1.0, memory=0.1), 1.5
+    step = np.zeros(N)
+    step[0] = speed * DT
+    prediction.start(BODY.usual_state())
+    for _ in range(20):
+        ahead, information = prediction.ahead()
+        prediction.correct(prediction.state.retract(step), np.linalg.inv(information + 1e6 * np.eye(N)))
+    walked = prediction.velocity[0]  # a little less: it fades
+    assert 0.7 * step[0] < walked < step[0]
+    for f in range(1, 51):
+        prediction.halt()
+        ahead, information = prediction.ahead()
+        prediction.correct(ahead, np.linalg.inv(information))
+        assert f * step[0] < 2.0 * prediction.std[0] < 2.0 * (f * step[0] + 0.01)
+
+
 def test_another_chart_goes_on_the_same_way():
     body = load_body("humanoid")
     prediction = Prediction(body, DT, angle_acceleration=ACCELERATION, root_acceleration=1.0, memory=1e9)

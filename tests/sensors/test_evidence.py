@@ -31,3 +31,12 @@ def test_evidence_adds_up(a, b, c):
     assert not (one.hidden & ~a.hidden).any() and not (one.hidden & one.lost).any()
     assert ((one.quality >= 0) & (one.quality <= 1)).all()
     assert np.array_equal(one.lost, ~one.hidden & (one.quality < BELIEVED))
+
+
+def test_a_segment_that_cameras_agree_on_elsewhere_is_lost():
+    none, told = Evidence(np.ones(2), np.zeros(2)), Evidence(np.ones(2), np.ones(2), np.array([True, False]))
+    for both in (none + told, told + none):
+        assert both.lost.tolist() == [True, False] and both.balance == 2.0
+    assert (none + none).elsewhere is None
+    unseen = Evidence(np.zeros(2), np.zeros(2), np.array([True, False]))
+    assert not unseen.lost.any()

@@ -1,6 +1,5 @@
 """Keypoints that are seen, in front of which a depth camera beside theirs has measured something."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.depth_image import DepthImageSensor
-from kinefit.sensors.keypoints import KeypointMatched, KeypointSensor
+from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.occlusion import THICK, DepthSeen, beside, depth_behind, hidden_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -120,8 +119,7 @@ def test_the_tracker_shows_keypoints_what_depth_images_saw():
     uv = CAMERA.project(BODY.positions(TRUTH, WRISTS))
     keypoints = KeypointFrame("depth", 0.0, WRISTS.names, uv, np.ones(2))
     for frames, count in (([keypoints, drawn()], 1), ([drawn(), keypoints], 1), ([keypoints], 0)):
-        tracker = a_tracker(start=None, settings=replace(TrackSettings(search=False), iterations=1))
-        (match,) = (
-            m for m in tracker.fitted(0.0, frames, pushed(0.4)).result.matched if isinstance(m, KeypointMatched)
-        )
+        tracker = a_tracker(start=None, settings=TrackSettings(search=False))
+        scene, measurements = tracker._scene_of(frames, pushed(0.4), 0.0)
+        (match,) = (m.match(scene, 0.03) for m in measurements if isinstance(m, KeypointMeasurement))
         assert len(match.hidden) == count

@@ -61,7 +61,8 @@ def whole(tracker, results, noise):
     if any(kept):
         names = {m.sensor for several in kept for m in several}
         times = np.array([r.time for r in results])
-        others = OtherSensors(times, kept, tracker.scene_of, tracker.apart, STILL, dict.fromkeys(names, 1.0))
+        count = 2 * np.count_nonzero(channels.weight, axis=1)
+        others = OtherSensors(times, kept, tracker.scene_of, tracker.apart, STILL, dict.fromkeys(names, 1.0), count)
         take = replace(take, others=others)
     take = replace(take, angles=unwrap(BODY.tree, take.angles))
     for _ in range(3):

@@ -15,8 +15,8 @@ from kinefit import Motion, Recording, load_body, track
 from kinefit.bodies.charts import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
-from kinefit.multiview.observability import levers, near
 from kinefit.sensors.channels import make_channels
+from kinefit.sensors.observability import levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles

@@ -23,7 +23,7 @@ from kinefit.geometry import se3
 from kinefit.losses import SQUARED, geman_mcclure, huber, tukey
 from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
 from kinefit.solvers import _kernels_linear
-from kinefit.solvers.equations import Covariance, covariance, joint_std, normal_equations
+from kinefit.solvers.equations import Covariance, covariance, inverse, joint_std, normal_equations, variances
 from kinefit.solvers.least_squares import levenberg_marquardt
 
 LOSSES = {"squared": SQUARED, "huber": huber(), "tukey": tukey(), "geman-mcclure": geman_mcclure()}
@@ -393,3 +393,14 @@ def test_a_contact_adds_certainty():
     ]
     a, b = (covariance(normal_equations(body, truth, parts)).matrix for parts in (rows, with_contact))
     assert np.all(np.diag(b) <= np.diag(a) + 1e-15) and np.any(np.diag(b) < 0.9 * np.diag(a))
+
+
+def test_inverses_of_small_matrices():
+    random = np.random.default_rng(5)
+    A = random.normal(size=(40, 30))
+    H = A.T @ A + np.diag(10.0 ** random.uniform(-3, 3, 30))
+    np.testing.assert_allclose(inverse(H), np.linalg.inv(H), rtol=1e-9, atol=1e-12)
+    assert np.array_equal(inverse(H), inverse(H).T)
+    np.testing.assert_allclose(variances(H), np.diag(np.linalg.inv(H)), rtol=1e-9)
+    H[3] = H[:, 3] = 0.0  # of one nothing is known
+    np.testing.assert_allclose(variances(H), np.diag(np.linalg.pinv(H)), rtol=1e-6, atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 
 from kinefit import Keypoints, Recording, load_body, load_observations, read_take, track
 from kinefit.errors import ObservationError, TrackingError
-from kinefit.evaluation import joint_errors
+from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.take import track_take
 
@@ -83,27 +83,53 @@ def test_exact_pixels_give_the_exact_motion(truth):
     assert joint_errors(truth, motion).mean() < 0.004
 
 
-def test_a_person_who_leaves_is_told_and_found_again(truth):
-    rig = studio_rig(truth)
-    keypoints = simulate_keypoints(truth, rig, "BODY_25B", seed=2)
-    gone = slice(20, 35)
-    emptied = []
-    for k in keypoints:
+def with_a_gap(truth, gone, seed):
+    """A recording in which nobody is seen for some frames."""
+    rig, emptied = studio_rig(truth), []
+    for k in simulate_keypoints(truth, rig, "BODY_25B", seed=seed):
         points, confidence = k.points.copy(), k.confidence.copy()
         points[gone], confidence[gone] = np.nan, 0.0
         emptied.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
-    recording = Recording.of_keypoints(rig, emptied, accuracy=3.0, up=truth.up)
-    motion = track(recording, load_body("humanoid"), smooth=False)
+    return Recording.of_keypoints(rig, emptied, accuracy=3.0, up=truth.up)
+
+
+def inside(truth, motion, frames):
+    """Share of the joints and of the angles that are known, whose truth lies within two standard deviations."""
+    told = np.linalg.norm(motion.joint_std[frames], axis=-1)
+    joints = (joint_errors(truth, motion)[frames] < 2.0 * told)[np.isfinite(told)]
+    std = motion.dof_std[frames, 6:]
+    angles = (np.radians(np.abs(angle_errors(truth, motion)[frames])) < 2.0 * std)[np.isfinite(std)]
+    return joints.mean(), angles.mean()
+
+
+@pytest.mark.parametrize(("gone", "seed"), [(slice(20, 35), 0), (slice(20, 35), 1), (slice(10, 25), 3)])
+def test_a_person_who_leaves_is_told_and_found_again(truth, gone, seed):
+    motion = track(with_a_gap(truth, gone, seed), load_body("humanoid"), smooth=False)
     assert np.all(motion.quality[gone] == 0.0)
     assert np.all(motion.segment_quality[gone] == 0.0)
-    std = motion.dof_std[19:35, 6:]  # the prediction holds it for a while, ever less sure
-    half = np.median(std, axis=1)
+    half = np.median(motion.dof_std[gone.start - 1 : gone.stop, 6:], axis=1)  # predicted, ever less sure
     assert np.all(np.diff(half[np.isfinite(half)]) > 0) and half[0] < 0.1
-    assert np.isinf(std[-1]).mean() > 0.2
-    off, told = joint_errors(truth, motion)[gone], np.linalg.norm(motion.joint_std[gone], axis=-1)
-    assert (off < 2.0 * told).mean() > 0.95
-    assert motion.quality[36:].min() > 0.4
-    assert joint_errors(truth, motion)[38:].mean() < 0.02
+    assert np.isinf(motion.dof_std[gone.stop - 1, 6:]).mean() > 0.5
+    assert min(inside(truth, motion, gone)) > 0.95
+    assert joint_errors(truth, motion)[gone.stop :].max() < 0.1  # a leg that swung meanwhile is found at once
+    assert motion.quality[gone.stop + 1 :].min() > 0.4
+    assert joint_errors(truth, motion)[gone.stop :].mean() < 0.01
+
+
+def test_after_a_second_out_of_sight_nothing_is_known(truth):
+    gone = slice(12, 50)
+    motion = track(with_a_gap(truth, gone, 2), load_body("humanoid"), smooth=False)
+    unseen = slice(gone.start + 31, gone.stop)
+    assert np.isinf(motion.dof_std[unseen]).all() and np.isinf(motion.joint_std[unseen]).all()
+    assert np.isfinite(motion.joint_std[gone.start]).mean() > 0.9
+    assert joint_errors(truth, motion)[gone.stop :].max() < 0.1
+
+
+def test_a_gap_that_is_bridged_holds_the_truth(truth):
+    gone = slice(20, 35)
+    motion = track(with_a_gap(truth, gone, 1), load_body("humanoid"))
+    assert min(inside(truth, motion, gone)) > 0.9
+    assert joint_errors(truth, motion)[gone.stop :].max() < 0.1
 
 
 def test_a_hidden_limb_is_told_by_segment(truth):

@@ -135,3 +135,12 @@ def retract(root, angles, delta, lower, upper, new_root, new_angles):
         q = angles[d] + delta[6 + d]
         q = lower[d] if q < lower[d] else q
         new_angles[d] = upper[d] if q > upper[d] else q
+
+
+@jit
+def place(frames, segments, rest, out):
+    """out (K, 3): points (K, 3) of a resting body where their segments are."""
+    for k in range(segments.size):
+        f, p = frames[segments[k]], rest[k]
+        for r in range(3):
+            out[k, r] = f[3 * r] * p[0] + f[3 * r + 1] * p[1] + f[3 * r + 2] * p[2] + f[9 + r]

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import _kernels
 from kinefit.bodies.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
@@ -125,8 +126,9 @@ class Body:
     def positions(self, state: BodyState, points: PointSet) -> NDArray:
         """(K, 3) [m] points in the world at a state."""
         frames, _ = self.tree.forward(state.T_world_root, state.angles)
-        f = frames[points.segments]
-        return (f[:, :9].reshape(-1, 3, 3) @ self.points_rest(points)[:, :, None])[..., 0] + f[:, 9:]
+        out = np.empty((len(points), 3))
+        _kernels.place(frames, points.segments, self.points_rest(points), out)
+        return out
 
     def trajectories(self, Ts_world_root: NDArray, angles: NDArray, points: PointSet) -> NDArray:
         """(F, K, 3) [m] points in the world over time: roots (F, 4, 4), angles (F, D)."""

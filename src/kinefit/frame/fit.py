@@ -11,18 +11,22 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.frame.prediction import belief
-from kinefit.frame.results import BLIND, FrameResult, judged
+from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged
 from kinefit.frame.skin import skin_of
+from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed
 from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.equations import inverse
+from kinefit.solvers.equations import Equations, inverse, joint_moves, normal_equations
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
+_ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wide: the next one begins there
 
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it, without the posture prior."""
@@ -34,12 +38,26 @@ class Fitted:
 
     Parameters
     ----------
-    observed : (D,) bool, coordinates that sensors have told of, now or before
+    seen : (D,) bool, coordinates that this frame's measurements observe
+    known : (D,) bool, those, and what was known before and is not lost now
     """
 
     result: FrameResult
     filtered: NDArray
-    observed: NDArray
+    seen: NDArray
+    known: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Where a fit ended: the scene there, the normal matrix (n, n), the cost under its own match."""
+
+    scene: Scene
+    H: NDArray
+    cost: float
+    matched: tuple[Matched, ...]
+    iterations: int
+    apart: bool = False
 
 
 class FrameFit:
@@ -60,10 +78,37 @@ class FrameFit:
     def run(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None
     ) -> Fitted:
-        """Fit from a scene's state on, and judge; `known` (D,) bool are coordinates that were observed before."""
-        known = np.zeros(len(self.body.tree.coordinates), bool) if known is None else known
-        if all(m.settled for m in measurements):
-            return self._settled(scene, held, measurements, known)
+        """Fit from a scene's state on, and judge.
+
+        A robust loss drops what is far from the start: a limb that moved while nobody saw it would stay where it was
+        expected. So where single points contradict a segment, a second fit begins with a loss as wide as the prediction
+        is uncertain, and the better of both is taken.
+
+        Parameters
+        ----------
+        known : (D,) bool, coordinates that were observed before
+        """
+        points = [m for m in measurements if m.settled]
+        every = len(points) == len(measurements)
+        found = self._fitted(scene, held, measurements)
+        told = evidence_of(found.scene, found.matched)
+        of_points = told if every else evidence_of(
+            found.scene, [a for a, m in zip(found.matched, measurements) if m.settled]
+        )  # fmt: skip
+        if points and of_points.lost.any():
+            other = self._settled(scene, held, points, self._uncertain(held))
+            other = other if every else self._renewed(other.scene, held, measurements)
+            also = evidence_of(other.scene, other.matched)
+            if other.cost < found.cost if every else also.balance > told.balance:
+                found, told = other, also
+        return self._judged(found, held, told, known)
+
+    def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
+        settled = all(m.settled for m in measurements)
+        return self._settled(scene, held, measurements) if settled else self._renewed(scene, held, measurements)
+
+    def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
+        """Where nearest points take part: one step under each match."""
         s, reach, iterations = self.settings, self.settings.far, 0
         while iterations < s.iterations:
             iterations += 1
@@ -74,30 +119,55 @@ class FrameFit:
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
                 break
             reach = max(reach * s.shrink, s.near)
-        return self._judged(scene, held, step.equations.matrix, matched, iterations, known)
+        return _Found(scene, step.equations.matrix, step.equations.cost, tuple(matched), iterations, True)
 
     def _settled(
-        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray
-    ) -> Fitted:
-        """Where a match changes in what is discrete alone: to the minimum under each, until it stays as it is."""
-        matched, iterations = _match(scene, measurements, self.settings.near), 0
+        self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], reach: float = 0.0
+    ) -> _Found:
+        """Where a match changes in what is discrete alone: to the minimum under each, until it stays as it is.
+
+        A `reach` [m] beyond the settings' nearest widens the loss at first.
+        """
+        s, iterations = self.settings, 0
+        while reach > s.near:
+            scene, _, tried = self._minimum(scene, held, _match(scene, measurements, reach), *_ROUGH)
+            reach, iterations = reach * s.shrink, iterations + tried
+        matched = _match(scene, measurements, s.near)
         for last in [False] * (_ROUNDS - 1) + [True]:
-            fit = levenberg_marquardt(
-                self.body, scene.state, lambda state: self.rows(scene.at(state), held, matched),  # noqa: B023
-                max_iterations=40, tolerance=1e-4, damping=None if held is None else _LIGHT,
-            )  # fmt: skip
-            scene, iterations = scene.at(fit.state), iterations + fit.iterations
-            again = matched if last else _match(scene, measurements, self.settings.near)
+            scene, equations, tried = self._minimum(scene, held, matched, 40, 1e-4)
+            iterations += tried
+            again = matched if last else _match(scene, measurements, s.near)
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return self._judged(scene, held, fit.equations.matrix, matched, iterations, known)
+        return _Found(scene, equations.matrix, equations.cost, tuple(matched), iterations)
+
+    def _minimum(
+        self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
+    ) -> tuple[Scene, Equations, int]:
+        fit = levenberg_marquardt(
+            self.body, scene.state, lambda state: self.rows(scene.at(state), held, matched),
+            max_iterations=most, tolerance=tolerance, damping=None if held is None else _LIGHT,
+        )  # fmt: skip
+        return scene.at(fit.state), fit.equations, fit.iterations
+
+    def _uncertain(self, held: Held | None) -> float:
+        """[m] how far some joint centre may be from where it is expected, one standard deviation; `far` at least."""
+        if held is None:
+            return self.settings.far
+        moves = joint_moves(self.body, held[0])
+        variance = np.einsum("...i,...i->...", moves @ inverse(held[1]), moves).sum(axis=1)
+        return float(np.clip(np.sqrt(variance.max()), self.settings.far, ANYWHERE))
 
     def rows(
-        self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False
-    ) -> list[AnyRows]:
-        """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart."""
-        parts = rows_of(scene, matched, self.settings)
+        self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False,
+        without: NDArray | None = None,
+    ) -> list[AnyRows]:  # fmt: skip
+        """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart.
+
+        Measurements of the segments `without` (S,) bool weigh nothing.
+        """
+        parts = rows_of(scene, matched, self.settings, without=without)
         if held is not None:
             parts.append(belief(scene.state, *held))
         usual = self.body.tree.usual
@@ -112,41 +182,84 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _judged(
-        self, scene: Scene, held: Held | None, H: NDArray, matched: Sequence[Matched], iterations: int, known: NDArray
-    ) -> Fitted:  # fmt: skip
-        posterior, alone = inverse(H), np.array(H)
+    def _judged(self, found: _Found, held: Held | None, told: Evidence, known: NDArray | None) -> Fitted:
+        """Where measurements contradict a segment, none of them makes it more certain."""
+        scene, tree, H = found.scene, self.body.tree, found.H
+        lost = told.lost if told.lost.any() else None
+        if lost is not None:
+            rows = self.rows(scene, held, found.matched, apart=found.apart, without=lost)
+            H = normal_equations(self.body, scene.state, rows).matrix
+        now = H if held is None else H - held[1] + _TRACE * np.eye(len(H))
+        seen = self._seen(scene, found.matched, now, lost)
+        known = seen[6:] if known is None else seen[6:] | known
+        known = known | ~np.isfinite(tree.spread)
+        alone = np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
-        now = posterior if held is None else inverse(H - held[1] + _TRACE * np.eye(len(H)))
-        seen = np.sqrt(np.maximum(np.diag(now)[6:], 0.0)) <= BLIND * self.body.tree.spread
-        known = known | seen | ~np.isfinite(self.body.tree.spread)
-        return Fitted(judged(scene, posterior, matched, iterations, observed=known), inverse(alone), known)
+        posterior = inverse(H)
+        if lost is not None:
+            elsewhere = np.zeros(len(lost), bool) if told.elsewhere is None else lost & told.elsewhere
+            gone = holding(tree, elsewhere) | (moving(tree, lost) & ~seen)
+            known, posterior = known & ~gone[6:], forgotten(tree, posterior, gone)
+        result = judged(scene, posterior, found.matched, found.iterations, observed=known, told=told)
+        if lost is not None:
+            result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
+        return Fitted(result, inverse(alone), seen[6:], known)
+
+    def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None) -> NDArray:
+        """(n,) bool: what measurements observe, with the information of one time, the prior included.
+
+        Keypoints observe no joint that hardly moves them, see `SHORTEST`: others must.
+        """
+        seen = observed(self.body.tree, now)
+        pixels = [m for m in matched if isinstance(m, KeypointMatched)]
+        if not pixels:
+            return seen
+        short = seen[6:] & ~levered(scene, pixels)
+        if short.any():
+            others = [m for m in matched if not isinstance(m, KeypointMatched)]
+            if others:
+                rows = self.rows(scene, None, others, without=without)
+                H = normal_equations(self.body, scene.state, rows).matrix + _TRACE * np.eye(len(now))
+                short &= ~observed(self.body.tree, H)[6:]
+            seen[6:] &= ~short
+        return seen
 
 
 def rows_of(
-    scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None
-) -> list[AnyRows]:
+    scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None, *,
+    points: int = 0, without: NDArray | None = None,
+) -> list[AnyRows]:  # fmt: skip
     """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
-    That is so where `settings.skin_shift` is above 0, which `track` chooses beside keypoints of several cameras where
-    it is given no settings; else surfaces are taken for exact.
+    That is so where points (keypoints, markers) have at least as many rows as the body has degrees of freedom, and so
+    tell by themselves where bones are. With fewer, surfaces are all that holds the body from frame to frame, and their
+    error, which lasts, does not harm that: they are taken for exact.
 
     Parameters
     ----------
     scale : {sensor: factor} on standard deviations
+    points : rows of points that are not among the matches
+    without : (S,) bool, segments whose rows weigh nothing
     """
     parts: list[AnyRows] = []
     surface: list[Rows] = []
     for m in matched:
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            if settings.skin_shift > 0.0 and not m.of_points and isinstance(rows, Rows):
+            rows = rows if without is None else left_out(rows, without)
+            if not m.of_points and isinstance(rows, Rows):
                 surface.append(rows)
             else:
                 parts.append(rows)
-    if surface:
-        parts.append(skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows())
-    return parts
+                points += int(np.count_nonzero(rows.weight)) if m.of_points else 0
+    if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
+        return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
+    return [*parts, *surface]
+
+
+def rows_of_points(scene: Scene, matched: Sequence[Matched]) -> int:
+    """How many rows of points there are among some matches."""
+    return sum(int(np.count_nonzero(rows.weight)) for m in matched if m.of_points for rows in rows_at(m, scene))
 
 
 def weaker(rows: AnyRows, factor: float) -> AnyRows:

@@ -38,7 +38,7 @@ class Prediction:
         self._first_velocity = np.diag(np.concatenate([np.full(3, 1.0), np.full(n - 3, 5.0)]) * dt) ** 2
         self._wide = np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)])
         self.state: BodyState | None = None
-        self._velocity = np.zeros(n)
+        self._velocity, self._halted = np.zeros(n), False
 
     def start(self, state: BodyState, std: NDArray | None = None) -> None:
         """Begin at a state whose velocity is unknown; std (n,) [m, rad], inf where nothing is known."""
@@ -72,8 +72,12 @@ class Prediction:
         self._xx, self._vx, self._vv = both * self._xx, both * self._vx, both * self._vv
 
     def halt(self) -> None:
-        """Stay where the body was last seen: for a frame in which nothing is."""
-        self._velocity = np.zeros_like(self._velocity)
+        """Stay where the body was last seen: for a frame in which nothing is.
+
+        That it stays is no knowledge: it may as well go on as it went, and its velocity does not fade.
+        """
+        self._vv = self._vv + np.outer(self._velocity, self._velocity)
+        self._velocity, self._halted = np.zeros_like(self._velocity), True
 
     def ahead(self, steps: float = 1.0) -> tuple[BodyState, NDArray]:
         """The state some frames on, and the information (n, n) of it.
@@ -84,14 +88,14 @@ class Prediction:
         self._ahead = self.state
         whole = int(steps + 1e-6)
         for h in [1.0] * whole + [steps - whole] * (steps - whole > 1e-6):
-            keep = self._keep**h
+            keep = 1.0 if self._halted else self._keep**h
             self._velocity = keep * self._velocity
             vx, vv = keep * self._vx, keep**2 * self._vv
             self._xx = self._xx + h * (vx + vx.T) + h**2 * vv + h**3 * self._noise[0]
             self._vx = vx + h * vv + h**2 * self._noise[1]
             self._vv = vv + h * self._noise[2]
             self._ahead = self._ahead.retract(h * self._velocity, self._bounds)
-        self._information = inverse(self._xx)
+        self._information, self._halted = inverse(self._xx), False
         return self._ahead, self._information
 
     def correct(self, state: BodyState, posterior: NDArray) -> None:

@@ -104,16 +104,18 @@ def evidence_of(scene: Scene, matched: Sequence[Matched]) -> Evidence:
 
 
 def judged(
-    scene: Scene, covariance: NDArray, matched: Sequence[Matched], iterations: int, *, observed: NDArray | None = None
-) -> FrameResult:
+    scene: Scene, covariance: NDArray, matched: Sequence[Matched], iterations: int, *, observed: NDArray | None = None,
+    told: Evidence | None = None,
+) -> FrameResult:  # fmt: skip
     """A fitted frame with its deviations and its quality.
 
     Parameters
     ----------
     scene : at the fitted state
     covariance, observed : see `deviations`
+    told : what the matches say at the fitted state, where that is known already
     """
-    told = evidence_of(scene, matched)
+    told = evidence_of(scene, matched) if told is None else told
     total = float(told.agreeing.sum() + told.contrary.sum())
     support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)

@@ -25,10 +25,6 @@ from kinefit.rows import DofRows, Rows
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels
 
-SKIN_SHIFT = 0.02
-"""[m] by which a segment's surface may lie beside where the body has it on the bone. On the balancing trial's first 30
-frames 0.01 left keypoints 1.085 times as far off as without silhouettes, 0.02 1.037 times."""
-
 _TINY = 1e-9  # of a segment's largest eigenvalue: below it a direction is not observed
 
 

@@ -1,1 +1,1 @@
-"""Several cameras together: people, left and right, noise, observability."""
+"""Several cameras together: people, left and right, noise."""

@@ -23,18 +23,28 @@ class Evidence:
     agreeing, contrary : (S,)
         In outlines of the segment: 1 where a depth image shows all of it. A keypoint or a marker counts `SHOWN`, which
         is just enough to call a segment seen.
+    elsewhere : (S,) bool, optional
+        Segments that several cameras together show to be at another place, however much speaks for a part of them.
     """
 
     agreeing: NDArray
     contrary: NDArray
+    elsewhere: NDArray | None = None
 
     def __add__(self, other: Evidence) -> Evidence:
-        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary)
+        told = [e for e in (self.elsewhere, other.elsewhere) if e is not None]
+        elsewhere = np.logical_or.reduce(told) if told else None
+        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary, elsewhere)
 
     @classmethod
     def none(cls, segments: int) -> Evidence:
         """Nothing was seen."""
         return cls(np.zeros(segments), np.zeros(segments))
+
+    @property
+    def balance(self) -> float:
+        """How much more speaks for the body's place than against it, in outlines."""
+        return float(self.agreeing.sum() - self.contrary.sum())
 
     @property
     def quality(self) -> NDArray:
@@ -49,5 +59,8 @@ class Evidence:
 
     @property
     def lost(self) -> NDArray:
-        """(S,) bool: it is seen, and less than half of that speaks for it."""
-        return ~self.hidden & (self.quality < BELIEVED)
+        """(S,) bool: it is seen, and less than half of that speaks for it, or cameras agree that it is elsewhere."""
+        contradicted = self.quality < BELIEVED
+        if self.elsewhere is not None:
+            contradicted |= self.elsewhere
+        return ~self.hidden & contradicted

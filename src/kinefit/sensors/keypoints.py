@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.losses import Loss
 from kinefit.observations import KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
@@ -53,6 +54,15 @@ class Layout:
     def informs(self) -> NDArray:
         """(S, N) 0 or 1: channels that show where a segment is."""
         return informing(self.body, self.channels)
+
+    @cached_property
+    def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
+        """Of each source its label, its channels, and their names and segments."""
+        out = []
+        for q, label in enumerate(self.channels.sources):
+            mine = np.flatnonzero(self.channels.source == q)
+            out.append((label, mine, tuple(self.points.names[k] for k in mine), self.points.segments[mine]))
+        return out
 
     def points_of(self, body: Body) -> PointSet:
         """The same of another body of this make."""
@@ -215,30 +225,52 @@ class KeypointMatched(Matched):
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Of every point of every detector."""
-        layout, channels = self.measurement.layout, self.measurement.layout.channels
-        points = layout.points_of(scene.body)
-        uv = np.where((self.weight > 0)[:, None], self.uv, np.nan)
+        layout, seen = self.measurement.layout, self.weight > 0
+        uv = np.where(seen[:, None], self.uv, np.nan)
         values = uv - projected(scene, layout)
-        factor = np.where(self.weight > 0, self.loss.factor(self.squares(scene)), 0.0)
-        out = []
-        for q, label in enumerate(channels.sources):
-            mine = np.flatnonzero(channels.source == q)
-            out.append(Leftover(
-                label, tuple(points.names[k] for k in mine), points.segments[mine], values[mine], factor[mine], "px",
-                uv[mine], bool(self.swapped[mine].any()),
-            ))  # fmt: skip
-        return out
+        factor = np.where(seen, self.loss.factor(self.squares(scene)), 0.0)
+        return [
+            Leftover(
+                label, names, segments, values[mine], factor[mine], "px", uv[mine], bool(self.swapped[mine].any())
+            )
+            for label, mine, names, segments in layout.parts
+        ]
 
     def evidence(self, scene: Scene) -> Evidence:
         """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""
         agrees = self.squares(scene) < AGREES**2
         seen, informs = self.weight > 0, self.measurement.layout.informs
-        return Evidence(SHOWN * (informs @ (seen & agrees)), SHOWN * (informs @ (seen & ~agrees)))
+        right, wrong = seen & agrees, seen & ~agrees
+        return Evidence(SHOWN * (informs @ right), SHOWN * (informs @ wrong), self._elsewhere(right, wrong))
+
+    def _elsewhere(self, right: NDArray, wrong: NDArray) -> NDArray | None:
+        """(S,) bool: segments whose own points most views show beside where they should be, two of them in one place.
+
+        A joint's point counts for the segment beyond the joint alone: an elbow may be off where shoulder and hand are
+        right.
+        """
+        layout = self.measurement.layout
+        channels, owner = layout.channels, layout.points.segments
+        count = len(layout.body.tree.segments)
+        out = 2 * np.bincount(owner, wrong, count) > np.bincount(owner, wrong | right, count)
+        which = np.flatnonzero(wrong & out[owner])
+        if len(which) < 2:
+            return None
+        points, row = np.unique(channels.column[which], return_inverse=True)
+        views = np.full((len(points), len(channels.rig), 2), np.nan)
+        views[row, channels.camera[which]] = self.uv[which]
+        limit = AGREES * float(channels.sigma[which].max())
+        there = np.isfinite(triangulate_robust(channels.rig, views, max_residual_px=limit)[0]).all(axis=1)
+        out[:] = False
+        out[owner[which[there[row]]]] = True
+        return out if out.any() else None
 
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
     """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
-    return scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
+    return scene.once(
+        layout, lambda: scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
+    )
 
 
 def informing(body: Body, channels: Channels) -> NDArray:

@@ -38,8 +38,13 @@ def find_swaps(channels: Channels, groups: NDArray, uv: NDArray, weight: NDArray
     """
     partner = channels.partner
     paired = partner != np.arange(len(partner))
-    as_is = np.minimum(np.nan_to_num(weight * np.sum((uv - fitted) ** 2, axis=1), nan=0.0), _TRUNCATE)
-    turned = np.minimum(np.nan_to_num(weight * np.sum((uv - fitted[partner]) ** 2, axis=1), nan=0.0), _TRUNCATE)
+    as_is, turned = _cost(uv - fitted, weight), _cost(uv - fitted[partner], weight)
     key = channels.source * (groups.max(initial=0) + 1) + groups
     gain = np.bincount(key[paired], (as_is - turned)[paired], minlength=key.max(initial=0) + 1)
     return paired & (gain[key] > _ODDS)
+
+
+def _cost(gap: NDArray, weight: NDArray) -> NDArray:
+    cost = np.minimum(weight * (gap[:, 0] ** 2 + gap[:, 1] ** 2), _TRUNCATE)
+    cost[np.isnan(cost)] = 0.0
+    return cost

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,6 +53,7 @@ class Scene:
         self._samples = samples
         self._shared: dict[str, Any] = {} if surface is None else {"surface": surface}
         self._frames: NDArray | None = None
+        self._made: dict[Any, Any] = {}
 
     def at(self, state: BodyState, **changes: Any) -> Scene:
         """The same scene with the body in another state; `changes` are other arguments of a scene."""
@@ -115,6 +116,12 @@ class Scene:
             else:
                 self._frames = self.body.tree.forward(self.state.T_world_root, self.state.angles)[0]
         return self._frames
+
+    def once(self, key: Any, make: Callable[[], NDArray]) -> NDArray:
+        """What is made at this state, the first time that it is asked for under a key; not to be changed."""
+        if key not in self._made:
+            self._made[key] = make()
+        return self._made[key]
 
     def positions(self, points: PointSet) -> NDArray:
         """(K, 3) [m] points of the body in the world."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -143,9 +144,10 @@ class SilhouetteMeasurement(Measurement):
 
     def compact(self) -> SilhouetteMeasurement:
         """Without what was drawn of the body."""
-        out = copy(self)
-        out._last = None
-        return out
+        return copy(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_last": None}
 
 
 @dataclass(frozen=True, eq=False)

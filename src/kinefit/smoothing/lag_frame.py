@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.frame.fit import rows_of
+from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
-from kinefit.multiview.observability import SHORTEST, levers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise, known_sigma
@@ -112,7 +112,7 @@ class FrameCosts:
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         for several, far in ((others, False), (pixels, True)):
             if several:
-                H = H + normal_equations(self.body, scene.state, self._rows(several, scene)).matrix
+                H = H + normal_equations(self.body, scene.state, self._rows(several, scene, frame.points)).matrix
                 seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
                 told |= seen & self._far(pixels, scene) if far else seen
         return told
@@ -137,9 +137,11 @@ class FrameCosts:
         scene = self.tracker.scene_of(frame.state, frame.result.time)
         return scene.at(frame.state, measurements=frame.measurements, velocity=velocity)
 
-    def _rows(self, matched: Sequence[Matched], scene: Scene) -> list[AnyRows]:
+    def _rows(self, matched: Sequence[Matched], scene: Scene, beside: Sequence[Matched] = ()) -> list[AnyRows]:
+        """Rows of matches, beside points that are no part of them."""
         known = [self._known(m) if isinstance(m, KeypointMatched) else m for m in matched]
-        return rows_of(scene, known, self.tracker.settings, self.noise.scale)
+        points = rows_of_points(scene, [m for m in beside if m not in matched])
+        return rows_of(scene, known, self.tracker.settings, self.noise.scale, points=points)
 
     def _known(self, m: KeypointMatched) -> KeypointMatched:
         """Keypoints with the noise that is known."""
@@ -170,7 +172,7 @@ class FrameCosts:
             H, g, cost = points.matrix, points.gradient, points.cost
         if frame.surfaces:
             if frame.H is None:
-                parts = [*self._rows(frame.surfaces, scene), *self.tracker.apart(scene)]
+                parts = [*self._rows(frame.surfaces, scene, frame.points), *self.tracker.apart(scene)]
                 made = normal_equations(body, scene.state, parts)
                 frame.about, frame.H, frame.g, frame.cost = frame.state, made.matrix, made.gradient, made.cost
             assert frame.about is not None and frame.g is not None

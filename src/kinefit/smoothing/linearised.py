@@ -7,7 +7,7 @@ sensors are; the motion prior and the pixels of keypoints are taken exactly at e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.spool import Spool
 from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.smoothing import Equations, MakeEquations
@@ -35,7 +36,7 @@ class Linearised:
     ----------
     H, g, cost : (T, n, n), (T, n), (T,)
     roots, angles : (T, 4, 4), (T, D) about which
-    matched : T lists, by which correspondences
+    matched : T lists, by which correspondences; empty where these are not kept
     rows : (T,) how many rows agree
     """
 
@@ -44,13 +45,19 @@ class Linearised:
     cost: NDArray
     roots: NDArray
     angles: NDArray
-    matched: tuple[tuple[Matched, ...], ...]
+    matched: Sequence[tuple[Matched, ...]]
     rows: NDArray
 
     def part(self, frames: slice) -> Linearised:
         """A stretch of it."""
         names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
         return replace(self, **{name: getattr(self, name)[frames] for name in names})
+
+    def followed_by(self, later: Linearised) -> Linearised:
+        """With the frames after it; matches are left out."""
+        names = ("H", "g", "cost", "roots", "angles", "rows")
+        both = {name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in names}
+        return replace(self, **both, matched=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +72,21 @@ class OtherSensors:
     apart : scene -> rows that keep parts of the body from running into each other
     settings : TrackSettings
     scale : {sensor: factor on its standard deviation}, as the take shows it; 1 where none is given
+    points : (T,) int, rows of keypoints in every frame
     """
 
     times: NDArray
-    measurements: tuple[tuple[Measurement, ...], ...]
+    measurements: Sequence[tuple[Measurement, ...]]
     scene_of: SceneOf
     apart: ApartRows
     settings: TrackSettings
     scale: dict[str, float]
+    points: NDArray
 
     def part(self, frames: slice) -> OtherSensors:
         """A stretch of it."""
-        return replace(self, times=self.times[frames], measurements=self.measurements[frames])
+        names = ("times", "measurements", "points")
+        return replace(self, **{name: getattr(self, name)[frames] for name in names})
 
     def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
         """Of one frame of states (T, 4, 4), (T, D), with the velocity that they have there."""
@@ -88,22 +98,50 @@ class OtherSensors:
         scene = self.scene_of(state, float(self.times[f]))
         return scene.at(state, measurements=self.measurements[f], velocity=velocity)
 
-    def linearised(self, body: Body, roots: NDArray, angles: NDArray) -> Linearised:
-        """All frames matched and linearised about states (T, 4, 4), (T, D)."""
-        T, n = len(roots), body.tree.n_dofs
-        H, g, cost, rows, matches = np.zeros((T, n, n)), np.zeros((T, n)), np.zeros(T), np.zeros(T), []
-        for f in range(T):
+    def matched(self, scene: Scene) -> tuple[Matched, ...]:
+        """The measurements of a frame, matched at its scene."""
+        return tuple(matched_by(m, scene, self.settings.near) for m in scene.measurements)
+
+    def linearised(
+        self, body: Body, roots: NDArray, angles: NDArray, *, frames: range | None = None,
+        keep: Spool[tuple[Matched, ...]] | None = None,
+    ) -> Linearised:  # fmt: skip
+        """Frames matched and linearised about states (T, 4, 4), (T, D), all or some of them.
+
+        `keep` is where their matches go.
+        """
+        chosen = range(len(roots)) if frames is None else frames
+        F, n = len(chosen), body.tree.n_dofs
+        H, g, cost, rows = np.zeros((F, n, n)), np.zeros((F, n)), np.zeros(F), np.zeros(F)
+        for k, f in enumerate(chosen):
             scene = self.scene(f, roots, angles)
-            matched = tuple(matched_by(m, scene, self.settings.near) for m in self.measurements[f])
-            matches.append(matched)
-            parts = rows_of(scene, matched, self.settings, self.scale)
-            rows[f] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
+            matched = self.matched(scene)
+            if keep is not None:
+                keep.append(matched)
+            parts = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]))
+            rows[k] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)
             if parts:
                 equations = normal_equations(body, scene.state, parts)
-                H[f], g[f], cost[f] = equations.matrix, equations.gradient, equations.cost
-        return Linearised(H, g, cost, np.array(roots), np.array(angles), tuple(matches), rows)
+                H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
+        span = slice(chosen.start, chosen.stop)
+        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows)
+
+    def windows(
+        self, body: Body, roots: NDArray, angles: NDArray, spans: Sequence[slice],
+        keep: Spool[tuple[Matched, ...]] | None = None,
+    ) -> Iterator[Linearised]:  # fmt: skip
+        """Stretches of a take that overlap, one after the other; what two of them share is linearised once.
+
+        `keep` is where the matches of all frames go, each once.
+        """
+        last, first, done = None, 0, 0
+        for span in spans:
+            new = self.linearised(body, roots, angles, frames=range(done, span.stop), keep=keep)
+            last = new if last is None else last.part(slice(span.start - first, None)).followed_by(new)
+            first, done = span.start, span.stop
+            yield last
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.losses import Loss
-from kinefit.sensors.base import rows_at
+from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
+from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.seen_points import SeenPoints
 from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
@@ -72,11 +73,12 @@ class SmoothTake:
     others: OtherSensors | None = None
     linear: Linearised | None = None
 
-    def renewed(self) -> SmoothTake:
-        """With all other sensors matched and linearised anew about the states."""
+    def renewed(self, *, keep: bool = False) -> SmoothTake:
+        """With all other sensors matched and linearised anew about the states; `keep` keeps the matches."""
         if self.others is None:
             return self
-        return replace(self, linear=self.others.linearised(self.body, self.roots, self.angles))
+        matches = Spool[tuple[Matched, ...]]() if keep else None
+        return replace(self, linear=self.others.linearised(self.body, self.roots, self.angles, keep=matches))
 
     def part(self, frames: slice) -> SmoothTake:
         """A stretch of it."""
@@ -151,7 +153,7 @@ def estimate(
     while count < rounds:
         count += 1
         squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
-        takes = [take.renewed() for take in takes]
+        takes = [take.renewed(keep=True) for take in takes]
         for i, take in enumerate(takes):
             fit, post = take.fit(strength, tolerance=1e-3)
             of_r, of_gamma = _changes(take, fit, post)

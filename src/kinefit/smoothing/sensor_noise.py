@@ -6,6 +6,7 @@ mean residual has that is not new in every frame lasts; what all residuals of a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.frame.skin import SKIN_SHIFT, skin_of
+from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.smoothing.linearised import OtherSensors, squares_of
+from kinefit.smoothing.spool import Spool
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_EXACT = 1e-4  # [m] as good as 0
 _FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
 
@@ -37,8 +40,8 @@ class OtherNoise:
 
     Parameters
     ----------
-    information : (T, n, n) of every frame's rows
-    lasting : (T, n, n) Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e
+    information : (T, n (n + 1) / 2) of every frame's rows, the upper triangle of each
+    lasting : the same of Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e
     drift : {sensor: standard deviation [m]}
     shift : {sensor: (3,) [m]} in the world
     """
@@ -47,6 +50,15 @@ class OtherNoise:
     lasting: NDArray
     drift: dict[str, float]
     shift: dict[str, NDArray]
+
+    def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
+        """(n, n) information and lasting, each the mean over so many frames to either side."""
+        near, n = slice(max(f - half, 0), f + half + 1), int(np.sqrt(2.0 * self.information.shape[1]))
+        out = np.empty((2, n, n))
+        upper = np.triu_indices(n)
+        for square, values in zip(out, (self.information, self.lasting)):
+            square[upper] = square.T[upper] = values[near].mean(axis=0)
+        return out[0], out[1]
 
     def as_told(self) -> dict[str, Any]:
         """The same in a few numbers, by sensor."""
@@ -57,7 +69,7 @@ class OtherNoise:
 
 
 def other_noise(
-    body: Body, others: OtherSensors, matched: tuple[tuple[Matched, ...], ...], roots: NDArray, angles: NDArray
+    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray
 ) -> OtherNoise:
     """Noise of all sensors but the keypoints, from their residuals at fitted states.
 
@@ -67,11 +79,11 @@ def other_noise(
     roots, angles : (T, 4, 4), (T, D) fitted
     """
     T, n = len(roots), body.tree.n_dofs
-    pushes: list[list[tuple[str, float, NDArray]]] = []
-    information, lasting = np.zeros((T, n, n)), np.zeros((T, n, n))
+    pushes, shifts = Spool[list[tuple[str, float, NDArray]]](), Spool[list[tuple[str, NDArray]]]()
+    upper = np.triu_indices(n)
+    information, lasting = np.zeros((T, len(upper[0]))), np.zeros((T, len(upper[0])))
     channels: dict[str, dict[tuple[int, int], _Channel]] = {}
     normal: dict[str, tuple[NDArray, NDArray]] = {}
-    shifts: list[list[tuple[str, NDArray]]] = []
     counts: dict[str, list[int]] = {}
     for f in range(T):
         push, moved = list[tuple[str, float, NDArray]](), list[tuple[str, NDArray]]()
@@ -87,7 +99,7 @@ def other_noise(
                     continue
                 J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
                 weighted = J * w[:, None]
-                information[f] += J.T @ weighted
+                information[f] += (J.T @ weighted)[upper]
                 names = np.arange(len(rows))
                 counts.setdefault(m.sensor, []).append(len(np.unique(names)))
                 mine = channels.setdefault(m.sensor, {})
@@ -106,10 +118,10 @@ def other_noise(
                     normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
-            shift_m = others.settings.skin_shift or SKIN_SHIFT  # also where the fit takes surfaces for exact
-            skin = skin_of(scene, surface, shift_m, others.settings.skin_turn)
-            information[f] += skin.information
-            lasting[f] += skin.pushes.T @ skin.pushes
+            settings = others.settings  # also where the fit takes surfaces for exact
+            skin = skin_of(scene, surface, max(settings.skin_shift, _EXACT), settings.skin_turn)
+            information[f] += skin.information[upper]
+            lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
         pushes.append(push)
         shifts.append(moved)
     shift = {
@@ -121,10 +133,10 @@ def other_noise(
     }
     for f in range(T):
         for name, stated, s in pushes[f]:
-            lasting[f] += max(drift[name], stated) ** 2 * np.outer(s, s)
+            lasting[f] += max(drift[name], stated) ** 2 * np.outer(s, s)[upper]
         for name, S in shifts[f]:
             moved_by = S * shift[name]
-            lasting[f] += moved_by @ moved_by.T
+            lasting[f] += (moved_by @ moved_by.T)[upper]
     return OtherNoise(information, lasting, drift, shift)
 
 

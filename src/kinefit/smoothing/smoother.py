@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.frame.results import BLIND, FrameResult, judged
-from kinefit.multiview.observability import SHORTEST, levers, near
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
+from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.equations import inverse
 
@@ -36,14 +37,16 @@ class SmoothedTake:
 
     Parameters
     ----------
-    results : F frames
+    results : F frames, with the matches of keypoints alone
     take : SmoothTake as it was solved last
+    matched : F lists, the matches of all other sensors; None where there are none
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     provenance : what was estimated, as `Motion.provenance` has it
     """
 
     results: list[FrameResult]
     take: SmoothTake
+    matched: Sequence[tuple[Matched, ...]] | None
     weight: NDArray
     provenance: dict[str, Any]
 
@@ -72,32 +75,33 @@ def smooth_results(
     swapped = swapped_channels(channels, results)
     take = _take(body, channels, results, swapped, rate, settings, others)
     strength, take, rounds = _estimate(take, settings, window, overlap)
-    take, covariances = _solve(take, strength, window, overlap)
+    take, covariances, others_matched = _solve(take, strength, window, overlap)
     again = _swaps(take)
     if not np.array_equal(again, swapped):
         uv, confidence = exchanged(channels, again)
         take, swapped = replace(take, uv=uv, confidence=confidence), again
-        take, covariances = _solve(take, strength, window, overlap)
+        take, covariances, others_matched = _solve(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
         found = find_contacts(body, take.roots, take.angles, rate, up)
-        take, _ = _solve(replace(take, contacts=found), strength, window, overlap)
+        take, _, others_matched = _solve(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     fitted = take.fitted(take.roots, take.angles)
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
     took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
     weight = take.confidence / np.square(channels.sigma)
-    smoothed = []
+    smoothed, covariance, packed = [], np.empty((body.tree.n_dofs,) * 2), np.triu_indices(body.tree.n_dofs)
     for f, result in enumerate(results):
         state = BodyState(take.roots[f], take.angles[f])
-        matched: tuple[Matched, ...] = tuple(
+        pixels = tuple(
             replace(m, uv=np.where(weight[f][:, None] > 0, take.uv[f], np.nan), weight=weight[f], swapped=swapped[f])
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
-        matched += () if take.linear is None else take.linear.matched[f]
+        more = () if others_matched is None else others_matched[f]
+        covariance[packed] = covariance.T[packed] = covariances[f]
         scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
-        told = take.told[f]
-        smoothed.append(judged(scene, covariances[f], matched, result.iterations, observed=told))
-    return SmoothedTake(smoothed, take, took_part, _told(take, strength, rounds))
+        frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
+        smoothed.append(replace(frame, matched=pixels, measurements=()))
+    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
 
 
 def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDArray:
@@ -143,20 +147,20 @@ def _take(
 def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
     """Coordinates (F, D) that each frame observes: by all sensors, by all but keypoints; rows of the latter (F,)."""
     tree, (T, D) = take.body.tree, take.angles.shape
-    packed, _, _ = take.seen(channels.sigma).equations(take.body)(take.roots, take.angles)
-    more = np.zeros((T, tree.n_dofs, tree.n_dofs))
-    rows = np.zeros(T)
-    if others is not None:
-        linear = others.linearised(take.body, take.roots, take.angles)
-        more, rows = linear.H, linear.rows
     prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
+    more, rows = np.zeros_like(prior), np.zeros(T)
     out = [np.zeros((T, D), bool), np.zeros((T, D), bool)]
     for f in range(T):
+        one = take.part(slice(f, f + 1))
+        packed, _, _ = one.seen(channels.sigma).equations(take.body)(one.roots, one.angles)
         pixels = np.zeros_like(prior)
         for k in range(len(tree.depth)):
             above = tree.chain[k, : tree.depth[k] + 1]
-            pixels[k, above] = pixels[above, k] = packed[f, k, : tree.depth[k] + 1]
-        for which, H in enumerate((pixels + more[f], more[f])):
+            pixels[k, above] = pixels[above, k] = packed[0, k, : tree.depth[k] + 1]
+        if others is not None:
+            linear = others.linearised(take.body, take.roots, take.angles, frames=range(f, f + 1))
+            more, rows[f] = linear.H[0], linear.rows[0]
+        for which, H in enumerate((pixels + more, more)):
             if which == 0 or others is not None:
                 std = np.sqrt(np.maximum(np.diag(inverse(H + prior)), 0.0))[6:]
                 out[which][f] = std <= BLIND * tree.spread
@@ -200,19 +204,26 @@ def _estimate(
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
 
 
-def _solve(take: SmoothTake, strength: Strength, window: int, overlap: int) -> tuple[SmoothTake, NDArray]:
-    """The take at its minimum, and covariances of all frames."""
-    n = take.body.tree.n_dofs
-    for _ in range(1 if take.others is None else _PASSES):
-        take = take.renewed()
-        roots, angles = np.array(take.roots), np.array(take.angles)
-        covariances = np.empty((len(roots), n, n))
-        for whole, kept in parts(len(roots), window, overlap):
-            fit, post = take.part(whole).fit(strength)
+def _solve(
+    take: SmoothTake, strength: Strength, window: int, overlap: int
+) -> tuple[SmoothTake, NDArray, Spool[tuple[Matched, ...]] | None]:
+    """The take at its minimum; of all frames covariances, the upper triangle of each, and other sensors' matches."""
+    packed = np.triu_indices(take.body.tree.n_dofs)
+    covariances, matched, others = np.empty((len(take.roots), len(packed[0]))), None, take.others
+    windows = parts(len(take.roots), window, overlap)
+    for _ in range(1 if others is None else _PASSES):
+        roots, angles, linear = np.array(take.roots), np.array(take.angles), None
+        if others is not None:
+            matched = Spool[tuple[Matched, ...]]()
+            linear = others.windows(take.body, take.roots, take.angles, [whole for whole, _ in windows], matched)
+        for whole, kept in windows:
+            part = take.part(whole)
+            fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
-            roots[kept], angles[kept], covariances[kept] = fit.roots[inside], fit.angles[inside], post.frames[inside]
+            roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
+            covariances[kept] = post.frames[inside][:, *packed]
         take = replace(take, roots=roots, angles=angles)
-    return take, covariances
+    return take, covariances, matched
 
 
 def _swaps(take: SmoothTake) -> NDArray:

@@ -73,11 +73,11 @@ def with_lasting_errors(
         parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
     half, n = round(_TIED * rate), body.tree.n_dofs
     weights = pooled(weight, half)
-    nothing = np.zeros((len(results), n, n))
-    more = (nothing, nothing) if others is None else (pooled(others.information, half), pooled(others.lasting, half))
+    nothing = np.zeros((n, n)), np.zeros((n, n))
     out = []
     for f, result in enumerate(results):
-        add = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, more[0][f], more[1][f])
+        more = nothing if others is None else others.pooled(f, half)
+        add = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, *more)
         out.append(replace(
             result,
             dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(add.dofs), 0.0)),
@@ -87,13 +87,11 @@ def with_lasting_errors(
 
 
 def pooled(values: NDArray, half: int) -> NDArray:
-    """Values (F, ...), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
+    """Values (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
     total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     frames = np.arange(len(values))
     low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(values))
-    count = (high - low).reshape(-1, *[1] * (values.ndim - 1))
-    mean: NDArray = (total[high] - total[low]) / count
-    return np.maximum(mean, 0.0) if values.ndim == 2 else mean
+    return np.maximum((total[high] - total[low]) / (high - low)[:, None], 0.0)
 
 
 def lasting(

@@ -120,22 +120,57 @@ def adapt(damping, growth, fall, predicted):
 
 
 @jit
-def invert(C, chain, depth, out):
-    """Inverse (n, n) of H (packed, destroyed); False where some degree of freedom has no information of its own."""
+def invert_factor(C, chain, depth):
+    """H (packed) = Lᵀ L, and L⁻¹ into its place; False where some degree of freedom has no information of its own."""
     n = depth.size
-    own = np.empty(n)
+    own, x = np.empty(n), np.empty(chain.shape[1])
     for k in range(n):
         own[k] = C[k, depth[k]]
     if not factor_tree(C, chain, depth):
         return False
-    for k in range(n):
-        if not 1.0 / (C[k, depth[k]] * C[k, depth[k]]) > 1e-10 * own[k]:
+    for k in range(n - 1, -1, -1):
+        d = depth[k]
+        if not 1.0 / (C[k, d] * C[k, d]) > 1e-10 * own[k]:
             return False
-    for k in range(n):
-        for i in range(n):
-            out[k, i] = 0.0
-        out[k, k] = 1.0
-        solve_tree(C, chain, depth, out[k])
+        x[:d] = 0.0
+        x[d] = 1.0
+        for t in range(d, -1, -1):
+            row = C[chain[k, t]]
+            v = x[t] * row[t]
+            x[t] = v
+            for s in range(t):
+                x[s] -= row[s] * v
+        C[k, : d + 1] = x[: d + 1]
+    return True
+
+
+@jit
+def invert(C, chain, depth, out):
+    """Inverse (n, n) of H (packed, destroyed); False where some degree of freedom has no information of its own."""
+    if not invert_factor(C, chain, depth):
+        return False
+    for k in range(depth.size):
+        for i in range(k + 1):
+            t = min(depth[i], depth[k])
+            while t >= 0 and chain[i, t] != chain[k, t]:
+                t -= 1
+            a, b, v = C[i], C[k], 0.0
+            for s in range(t + 1):
+                v += a[s] * b[s]
+            out[k, i] = out[i, k] = v
+    return True
+
+
+@jit
+def invert_diagonal(C, chain, depth, out):
+    """Diagonal (n,) of the inverse of H (packed, destroyed); False as of `invert`."""
+    if not invert_factor(C, chain, depth):
+        return False
+    for k in range(depth.size):
+        v = 0.0
+        for t in range(depth[k] + 1):
+            v += C[k, t] * C[k, t]
+        out[k] = v
     return True
 
 

@@ -98,8 +98,12 @@ def normal_equations(
         _kernels_linear.unpack(C, chain, depth, H)
         for p in joint:
             pull = p.weight @ p.residual
-            H[np.ix_(p.index, p.index)] += p.weight
-            g[p.index] += pull
+            if len(p) == n and (np.diff(p.index) == 1).all():
+                H += p.weight
+                g += pull
+            else:
+                H[np.ix_(p.index, p.index)] += p.weight
+                g[p.index] += pull
             cost += float(p.residual @ pull)
         for q in pairs:
             cost += _kernels.add_pairs(
@@ -137,12 +141,21 @@ def dense_pattern(n: int) -> tuple[NDArray, NDArray]:
 def inverse(matrix: NDArray) -> NDArray:
     """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
     out = np.empty_like(matrix)
-    if not _kernels_linear.invert(np.array(matrix), *dense_pattern(len(matrix)), out):
-        try:
-            out = np.linalg.inv(matrix)
-        except np.linalg.LinAlgError:  # numbers so far apart that some count for nothing beside others
-            out = np.linalg.pinv(matrix, hermitian=True)
+    if _kernels_linear.invert(np.array(matrix), *dense_pattern(len(matrix)), out):
+        return out
+    try:
+        out = np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:  # numbers so far apart that some count for nothing beside others
+        out = np.linalg.pinv(matrix, hermitian=True)
     return 0.5 * (out + out.T)
+
+
+def variances(matrix: NDArray) -> NDArray:
+    """(n,) diagonal of the inverse of a symmetric positive matrix (n, n), without the rest of it."""
+    out = np.empty(len(matrix))
+    if not _kernels_linear.invert_diagonal(np.array(matrix), *dense_pattern(len(matrix)), out):
+        return np.diag(inverse(matrix))
+    return out
 
 
 def product(A: NDArray, B: NDArray) -> NDArray:

@@ -67,6 +67,8 @@ class Subject:
     unmeasured : directions that the prior alone holds, the least measured first.
     cost : float
     rounds : of match and solve
+    parameters : the kinds of them
+    prior_world : the world that they apply to
     """
 
     body: Body
@@ -82,6 +84,8 @@ class Subject:
     unmeasured: tuple[Unmeasured, ...]
     cost: float
     rounds: int
+    parameters: tuple[Parameters, ...]
+    prior_world: World
 
     @property
     def std(self) -> NDArray:
@@ -181,6 +185,7 @@ def fit_subject(
     return Subject(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),
         solved.states, solved.information, prior, told, unmeasured(names, prior, solved.information), solved.cost, used,
+        tuple(parameters), World(body, rig),
     )  # fmt: skip
 
 

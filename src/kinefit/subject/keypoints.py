@@ -34,6 +34,7 @@ class Subject:
 
     `shape` says from which frames it came, `covariance` (p, p) how sure each of its parameters is; both None for a
     body that was given. `length_share` (G,) is each scale's standard deviation over it, where other sensors gave it.
+    `sets` are the detectors' keypoint sets that it was found from.
     """
 
     body: Body
@@ -41,6 +42,7 @@ class Subject:
     shape: Shape | None = None
     covariance: NDArray | None = None
     length_share: NDArray | None = None
+    sets: tuple[str, ...] = ()
 
     @property
     def length_std(self) -> dict[str, float]:
@@ -111,7 +113,7 @@ def fit_subject(
         fitted = fitted.with_keypoints(name, moved)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
-    return Subject(fitted, shape.scales, shape, covariance)
+    return Subject(fitted, shape.scales, shape, covariance, sets=tuple(name for name in channels.sets if name))
 
 
 def _shape(

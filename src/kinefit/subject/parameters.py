@@ -124,6 +124,29 @@ class SegmentScales:
 
 
 @dataclass(frozen=True, eq=False)
+class KnownLengths(SegmentScales):
+    """The same, as sure of each as an earlier fit was.
+
+    Parameters
+    ----------
+    scales, covariance : (G,) of the body's lengths, and (G, G) of them
+    """
+
+    scales: NDArray = field(default_factory=lambda: np.ones(0))
+    covariance: NDArray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def mean(self) -> NDArray:
+        """(G,) logarithms."""
+        return np.log(self.scales)
+
+    @property
+    def information(self) -> NDArray:
+        """(G, G)."""
+        return np.linalg.inv(self.covariance / np.outer(self.scales, self.scales))
+
+
+@dataclass(frozen=True, eq=False)
 class PointOffsets:
     """Shifts [m] of a detector's keypoints or of markers from their places on the body, along their segment's axes.
 
@@ -199,6 +222,10 @@ class PointOffsets:
         out = np.asarray(values, float).reshape(-1, 3)[np.searchsorted(leaders, lead)].copy()
         out[:, 2] *= np.where(sign == 0.0, 1.0, sign)
         return out
+
+    def values_of(self, shifts: NDArray) -> NDArray:
+        """(3 L,) of shifts (K, 3) [m] of all points; mirror images are left to those that lead them."""
+        return np.asarray(shifts, float)[self._shared[2]].ravel()
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with its points shifted."""

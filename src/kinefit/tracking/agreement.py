@@ -15,7 +15,7 @@ from kinefit.sensors.scene import Scene
 FAR = 3.0
 """Standard deviations, as they are stated, that half of a sensor's residuals must exceed to be a contradiction."""
 
-_LOOKS = 12  # frames that are looked at, spread over the take
+LOOKS = 12  # frames that are looked at, spread over the take
 _TINY = 1e-6  # share of a direction that nothing measures
 
 
@@ -24,7 +24,7 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
 
     Parameters
     ----------
-    scenes : F, at the fitted states
+    scenes : of some frames, at the fitted states
     matched : of each, the matches of all sensors
 
     Returns
@@ -33,11 +33,10 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
         The worst first; none where the fit has but one sensor, whose residuals contradict no other. `shift_m` is
         where the sensor has its points, beside where all sensors together have them.
     """
-    chosen = np.unique(np.linspace(0, max(len(scenes) - 1, 0), min(_LOOKS, len(scenes))).astype(int))
     kept: dict[str, list[Rows]] = {}
-    for f in chosen:
-        for m in matched[f]:
-            kept.setdefault(m.sensor, []).extend(r for r in rows_at(m, scenes[f]) if isinstance(r, Rows))
+    for scene, several in zip(scenes, matched):
+        for m in several:
+            kept.setdefault(m.sensor, []).extend(r for r in rows_at(m, scene) if isinstance(r, Rows))
     if len(kept) < 2:
         return {}
     told = {sensor: _told(rows) for sensor, rows in kept.items() if rows}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +10,15 @@ from typing import Any
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement
+from kinefit.motion import Residuals
+from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.spool import Spool
 from kinefit.subject.keypoints import Progress
 from kinefit.tracking.recording import Recording
+from kinefit.tracking.residuals import Remains
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker
 
@@ -29,16 +33,16 @@ class Tracked:
     ----------
     results : one for each step of `steps`, with the matches of keypoints alone
     steps : numbers of the steps that were done, in order
-    measurements : of each of them what all sensors but the keypoints measured, without whole images
-    leftovers : of each of them, what the fit leaves over of every sensor
+    measurements : of each of them what all sensors but the keypoints measured, without whole images; read on demand
+    residuals : what the fit leaves over of every sensor in them
     tracker : that did it
     complete : whether all steps were done
     """
 
     results: list[FrameResult]
     steps: list[int]
-    measurements: list[tuple[Measurement, ...]]
-    leftovers: list[tuple[Leftover, ...]]
+    measurements: Sequence[tuple[Measurement, ...]]
+    residuals: Mapping[str, Residuals]
     tracker: Tracker
     complete: bool
 
@@ -72,8 +76,8 @@ def run(
         begin, state = start
         tracker.start_at(state)
     results: dict[int, FrameResult] = {}
-    kept: dict[int, tuple[Measurement, ...]] = {}
-    left: dict[int, tuple[Leftover, ...]] = {}
+    kept, place = Spool[tuple[Measurement, ...]](), dict[int, int]()
+    remains = Remains(len(times))
 
     def step(tracker: Tracker, i: int, time: float) -> FrameResult | None:
         frames = list(recording.steps(i))
@@ -85,7 +89,9 @@ def run(
             return None
         moving = {"measurements": found.measurements, "velocity": tracker.speed}
         one = KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving))
-        left[i], kept[i] = one.leftovers, one.measurements
+        remains.add(i, one.leftovers)
+        place[i] = len(kept)
+        kept.append(one.measurements)
         return one.result
 
     stopped = False
@@ -115,6 +121,6 @@ def run(
         stopped = True
     done = sorted(results)
     return Tracked(
-        [results[i] for i in done], done, [kept[i] for i in done], [left[i] for i in done], tracker,
+        [results[i] for i in done], done, kept.chosen(place[i] for i in done), remains.residuals(done), tracker,
         not stopped and len(done) == len(times),
     )  # fmt: skip

@@ -18,7 +18,9 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
+from kinefit.smoothing.spool import Spool
 from kinefit.tracking.motions import TrackedFrames
+from kinefit.tracking.residuals import Remains
 
 _Key = tuple[str, str, int]  # camera, keypoint set, and which of a layout's records of these
 
@@ -66,40 +68,54 @@ class Session:
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
-        self._kept: list[KeptFrame] = []
+        self.clear()
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._results)
 
     def clear(self) -> None:
         """Begin anew: another body, or another clock."""
-        self._kept.clear()
+        self._results: list[FrameResult] = []
+        self._measurements, self._leftovers = Spool[tuple[Measurement, ...]](), Spool[tuple[Leftover, ...]]()
+
+    def _append(self, one: KeptFrame) -> None:
+        self._results.append(one.result)
+        self._measurements.append(one.measurements)
+        self._leftovers.append(one.leftovers)
 
     def add(self, result: FrameResult, scene: Scene) -> None:
         """Keep a result; a time before that of the last frame begins anew."""
         new = KeptFrame.of(result, scene)
-        if not self._kept:
-            self._kept.append(new)
+        if not self._results:
+            self._append(new)
             return
-        last = self._kept[-1].result
+        last = self._results[-1]
         ahead = round((result.time - last.time) * self.rate)
         if result.time < last.time:
-            self._kept = [new]
+            self.clear()
+            self._append(new)
         elif ahead == 0:
             new = replace(new, result=replace(new.result, time=last.time))
-            self._kept[-1] = self._kept[-1].joined(new)
+            both = KeptFrame(last, self._measurements[-1], self._leftovers[-1]).joined(new)
+            self._results[-1], self._measurements[-1], self._leftovers[-1] = (
+                both.result, both.measurements, both.leftovers
+            )  # fmt: skip
         else:
             gap = result.time - last.time
-            times = [last.time + gap * k / ahead for k in range(1, ahead)]
-            self._kept += [KeptFrame(unseen(last, time), (), ()) for time in times] + [new]
+            for k in range(1, ahead):
+                self._append(KeptFrame(unseen(last, last.time + gap * k / ahead), (), ()))
+            self._append(new)
 
     def frames(self, body: Body, rig: Rig, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras as one list of channels."""
-        results = [k.result for k in self._kept]
+        results = self._results
+        remains = Remains(len(results))
+        for f, several in enumerate(self._leftovers):
+            remains.add(f, several)
         channels, matches = one_layout(body, rig, results, self.rate)
         return TrackedFrames(
-            channels, [replace(r, matched=m) for r, m in zip(results, matches)], [k.measurements for k in self._kept],
-            [k.leftovers for k in self._kept], np.array([r.time for r in results]), self.rate, scene_of, apart,
+            channels, [replace(r, matched=m) for r, m in zip(results, matches)], self._measurements[:],
+            remains.residuals(), np.array([r.time for r in results]), self.rate, scene_of, apart,
         )  # fmt: skip
 
 

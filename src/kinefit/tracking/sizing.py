@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.initialization.from_depth import sized_start
@@ -21,14 +20,13 @@ from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import Progress, Subject, fit_subject
-from kinefit.subject.parameters import Parameters, PointOffsets, SegmentScales
-from kinefit.subject.sensor_parameters import OwnUnknowns
-from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
+from kinefit.tracking.unknowns import unknowns_of
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
-_POSES = 8  # ... and how many of them it is found from: twice as many change no half axis by more than its deviation
+_POSES = 8  # and how many of them it is found from: twice as many change no half axis by more than its deviation
+_MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
@@ -96,7 +94,7 @@ def fitted_to_person(
     unknown = any(s.unknowns for s in recording.sensors)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
-        return _by_all(person, settings, progress, size=False) if unknown else person
+        return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         found = fit_subject(body, channels, frames=frames or 25, height=height, trial=trial, progress=progress)
         person = _wearing(person, found)
@@ -108,7 +106,7 @@ def fitted_to_person(
             person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
         if recording.depth:
             person = _by_depth(person, progress)
-    return _by_all(person, settings, progress) if others else person
+    return _by_all(person, body, settings, progress, height=height, trial=trial) if others else person
 
 
 def _others(recording: Recording) -> bool:
@@ -149,7 +147,10 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
     return person if person.start is not None else replace(person, start=(step, best.state))
 
 
-def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, *, size: bool = True) -> Person:
+def _by_all(
+    person: Person, generic: Body, settings: TrackSettings, progress: Progress | None, *, size: bool = True,
+    height: float | None = None, trial: Subject | None = None,
+) -> Person:  # fmt: skip
     """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
 
     The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
@@ -171,9 +172,12 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, 
     good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
-    chosen = [good[k] for k in spread(len(good), _POSES)]
-    parameters = _parameters(person, [m for k in chosen for m in tracked.measurements[k]], size)
-    if not chosen or not parameters:
+    surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
+    poses = _POSES if surfaces or r.keypoints else _MANY
+    chosen = [good[k] for k in spread(len(good), poses)]
+    told = [m for k in chosen for m in tracked.measurements[k]]
+    unknown = unknowns_of(r, generic, person.subject, told, size=size, height=height, trial=trial)
+    if not chosen or not unknown.parameters:
         return person
     layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
     steps: list[list[Measurement]] = []
@@ -183,57 +187,29 @@ def _by_all(person: Person, settings: TrackSettings, progress: Progress | None, 
         steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
     states = [tracked.results[k].state for k in chosen]
     found = joint.fit_subject(
-        body, r.rig, steps, states, parameters, loss=settings.loss, times=[tracked.results[k].time for k in chosen],
+        unknown.world.body, r.rig, steps, states, unknown.parameters, start=unknown.start, loss=settings.loss,
+        times=[tracked.results[k].time for k in chosen],
         velocities=[_velocity(tracked.results, k) for k in chosen], rounds=_MATCHES,
     )  # fmt: skip
-    told = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
+    shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     begin = first + tracked.steps[chosen[0]], found.states[0]
-    person = _wearing(person, replace(person.subject, body=found.body), shape=told)
+    person = _wearing(person, _sized(person.subject, found), shape=shape)
     return replace(person, start=begin, values=found.values, joint=found)
+
+
+def _sized(subject: Subject, found: joint.Subject) -> Subject:
+    """The body that all sensors found together, with its lengths where they were among what was sought."""
+    count = len(subject.scales)
+    if not (len(found.names) >= count and found.names[0].startswith("length ")):
+        return replace(subject, body=found.body)
+    base = 1.0 if found.prior_world.body is not subject.body else subject.scales
+    return replace(
+        subject, body=found.body, scales=base * np.exp(found.mean[:count]), shape=None, covariance=None,
+        length_share=found.std[:count],
+    )  # fmt: skip
 
 
 def _velocity(results: Sequence[FrameResult], k: int) -> NDArray:
     """(n,) [m/s, rad/s] of one of several results, from those beside it."""
     a, b = results[max(k - 1, 0)], results[min(k + 1, len(results) - 1)]
     return a.state.difference(b.state) / max(b.time - a.time, 1e-6)
-
-
-def _parameters(person: Person, measurements: list[Measurement], size: bool) -> list[Parameters]:
-    """What the sensors that took part can tell, beyond what the first fit found; without `size` of themselves alone."""
-    r, body = person.recording, person.subject.body
-    out: list[Parameters] = []
-    surfaces = size and any(not m.settled for m in measurements)
-    cameras = len({k.camera for k in r.keypoints})
-    landmarks = size and r.markers and not r.marker_sets[0][0]  # markers of a set have a fit of their own
-    if (surfaces or landmarks) and cameras < 2:  # a surface of simple shapes tells lengths worse than keypoints do
-        out.append(FittedLengths(body, person.subject))
-    if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
-        out.append(CylinderShape(body))
-    sets = {name: std for name, std in r.marker_sets if std is not None}
-    if size and cameras >= 2:  # else the markers' own fit has found them
-        out += [PointOffsets(body, name, std) for name, std in sets.items()]
-    unknown = [s for s in r.sensors if s.unknowns]
-    return [*out, *([OwnUnknowns.of(unknown)] if unknown else [])]
-
-
-class FittedLengths(SegmentScales):
-    """Scales of a body that was fitted already, as sure of each as that fit was."""
-
-    def __init__(self, body: Body, subject: Subject) -> None:
-        super().__init__(body)
-        object.__setattr__(self, "_known", subject)
-
-    @property
-    def mean(self) -> NDArray:
-        """(G,) logarithms: none."""
-        return np.zeros(len(self.names))
-
-    @property
-    def information(self) -> NDArray:
-        """(G, G) of the first fit, or the prior's."""
-        subject: Subject = getattr(self, "_known")  # noqa: B009
-        if subject.covariance is None:
-            return super().information
-        count = len(self.names)
-        share = subject.covariance[:count, :count] / np.outer(subject.scales, subject.scales)
-        return np.linalg.inv(share)

@@ -81,7 +81,7 @@ class Tracker:
 
     def _wear(self, body: Body) -> None:
         s = self.settings
-        self.body, self._known = body, np.zeros(len(body.tree.coordinates), bool)
+        self.body, self._seen = body, np.full(len(body.tree.coordinates), -np.inf)  # [s] when each was last observed
         self._fit = FrameFit(body, s)
         self._scene = Scene(
             body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples
@@ -125,7 +125,7 @@ class Tracker:
             problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
-        self._known[:] = False
+        self._seen[:] = -np.inf
 
     def backwards(self, state: BodyState) -> Tracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
@@ -135,14 +135,14 @@ class Tracker:
         )  # fmt: skip
         out.sensors, out._direction = self.sensors.anew(), -1.0
         out.start_at(state)
-        out._known = self._known.copy()
+        out._seen = self._seen.copy()
         return out
 
     def change_body(self, body: Body) -> None:
         """Go on with another size, another surface, a part more or less (`bodies.parts`); pose and speed are kept."""
-        old, before, known = self.body, self._prediction, np.concatenate([np.ones(6), self._known])
+        old, before, seen = self.body, self._prediction, np.concatenate([np.zeros(6), self._seen])
         self._wear(body)
-        self._known = carry_dofs(known, old, body)[6:] > 0.5
+        self._seen = carry_dofs(seen, old, body, missing=-np.inf)[6:]
         if before.state is not None:
             state = carry_state(before.state, old, body)
             std = carry_dofs(before.std, old, body, missing=np.inf)
@@ -205,13 +205,13 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
-        kept = copy(self._prediction), self._last, self._known.copy()
+        kept = copy(self._prediction), self._last, self._seen.copy()
         before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self._others = self.sensors.learnt(), tuple(others)
         try:
             return self._updated(frames, time)
         except BaseException:  # as if they had never come
-            self._time, clocks, self.dropped, self._prediction, self._last, self._known = before
+            self._time, clocks, self.dropped, self._prediction, self._last, self._seen = before
             self._recovery.set_clocks(clocks)
             self.sensors.unlearn(learnt)
             raise
@@ -227,8 +227,8 @@ class Tracker:
                 self._prediction.halt()
             held = self._prediction.ahead(steps)
             scene, measurements = self._scene_of(frames, held[0], time)
-            fitted = self._fit.run(scene, held, measurements, self._known)
-            self._take(fitted)
+            fitted = self._fit.run(scene, held, measurements, self._known(time))
+            self._take(fitted, time)
             result = fitted.result
         result = self._recovery.run(self, time, frames, measurements, result)
         self._last = result
@@ -247,7 +247,7 @@ class Tracker:
     def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:
         """What comes of a fit that begins at a state; nothing of it is remembered."""
         scene, measurements = self._scene_of(frames, state, time)
-        return self._fit.run(scene, held, measurements, None if held is None else self._known)
+        return self._fit.run(scene, held, measurements, None if held is None else self._known(time))
 
     def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
         """The tracker's body in a state."""
@@ -275,23 +275,27 @@ class Tracker:
             self._recovery.forget()
             if self._prediction.state is not None:
                 self._prediction.start(self._prediction.state)
-                self._known[:] = False
+                self._seen[:] = -np.inf
             steps = 1.0 if steps < 0 else steps
         self.dropped += max(round(steps) - 1, 0)
         return min(steps, 10.0)
 
-    def _take(self, fitted: Fitted) -> None:
+    def _known(self, time: float) -> NDArray:
+        """(D,) bool: coordinates that were observed so shortly before a time [s] that they are predicted."""
+        return np.abs(time - self._seen) <= self.settings.smooth_memory
+
+    def _take(self, fitted: Fitted, time: float) -> None:
         """Go on from a fit that took its prediction into account."""
         state = fitted.result.state
         self._prediction.correct(state, fitted.filtered)
-        self._known = fitted.observed
+        self._seen = np.where(fitted.seen, time, np.where(fitted.known, self._seen, -np.inf))
         chart = off_the_limits(self.body.tree, state.angles)
         if chart is not None:
             self._prediction.change_chart(*chart)
 
     def restart(self, result: FrameResult, velocity: NDArray | None = None) -> None:
         """Go on from a result that was found without a prediction; its velocity (n,) [m, rad] a frame, or unknown."""
-        self._known = np.isfinite(result.dof_std[6:])
+        self._seen = np.where(np.isfinite(result.dof_std[6:]), result.time, -np.inf)
         if velocity is None:
             self._prediction.start(result.state, result.dof_std)
         else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
-from kinefit.frame.skin import SKIN_SHIFT
 from kinefit.motion import Motion
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import lag_frames
@@ -77,7 +76,7 @@ def track(
         raise ObservationError(problem, remedy="Smooth the whole take instead: leave the lag out.")
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
-    settings = settings or _settings_of(recording)
+    settings = settings or TrackSettings()
     person = fitted_to_person(
         recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
         progress=progress,
@@ -88,7 +87,7 @@ def track(
     )  # fmt: skip
     steps, tracker = tracked.steps, tracked.tracker
     frames = TrackedFrames(
-        person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
+        person.channels.part(steps), tracked.results, tracked.measurements, tracked.residuals,
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
     told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
@@ -100,8 +99,3 @@ def track(
         raise TrackingInterrupted(motion, len(recording))
     return motion
 
-
-def _settings_of(recording: Recording) -> TrackSettings:
-    """Settings as they are; beside keypoints of several cameras surfaces tell of bones only where these lie below."""
-    several = len({k.camera for k in recording.keypoints}) >= 2
-    return TrackSettings(skin_shift=SKIN_SHIFT) if several else TrackSettings()

@@ -34,11 +34,10 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.fit import Subject, fit_subject
 from kinefit.subject.keypoints import Subject as Person
 from kinefit.subject.keypoints import fit_subject as fit_person
-from kinefit.subject.parameters import Parameters, PointOffsets
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
-from kinefit.tracking.sizing import FittedLengths
 from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import track
 
@@ -262,7 +261,10 @@ class _Problem:
 
     def parameters(self, frames: Sequence[Sequence[Any]]) -> list[Parameters]:
         """What else is unknown: the surface where depth is seen, places of markers and of detectors' points."""
-        out: list[Parameters] = [FittedLengths(self.body, self.person)]
+        scales, covariance = self.person.scales, self.person.covariance
+        assert covariance is not None  # of a fit
+        known = covariance[: len(scales), : len(scales)] / np.outer(scales, scales)
+        out: list[Parameters] = [KnownLengths(self.body, scales=np.ones(len(scales)), covariance=known)]
         surfaces = self.body.surfaces if any(isinstance(f, DepthFrame) for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
             out.append(CylinderShape(self.body))

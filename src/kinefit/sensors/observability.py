@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.sensors import _kernels_observability
 
 # A detector's point stands about a centimetre away from where the body has it, the same way in every frame: a joint
 # that moves no point by more than twice that for a radian only follows this error.
@@ -20,19 +21,12 @@ def levers(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, 
     points : PointSet of K points; seen : (F, K) bool.
     Ts_world_root, angles : (F, 4, 4), (F, D)
     """
-    tree = body.tree
-    x = body.trajectories(Ts_world_root, angles, points) - Ts_world_root[:, None, :3, 3]
-    moved = np.zeros((len(points), len(tree.coordinates)), bool)
-    for k, s in enumerate(points.segments):
-        d = tree.last_dof[s]
-        while d >= 6:
-            moved[k, d - 6] = True
-            d = tree.dof_parent[d]
-    out = np.zeros(angles.shape)
+    tree, rest, out = body.tree, body.points_rest(points), np.empty(angles.shape)
     for f in range(len(angles)):
-        _, screws = tree.forward(Ts_world_root[f], angles[f])
-        arm = np.linalg.norm(screws[:, :3] + np.cross(screws[:, 3:], x[f][:, None]), axis=2)
-        out[f] = np.max(arm * (moved & seen[f][:, None]), axis=0, initial=0.0)
+        frames, screws = tree.forward(Ts_world_root[f], angles[f])
+        _kernels_observability.longest_levers(
+            frames, screws, points.segments, rest, seen[f], Ts_world_root[f], tree.last_dof, tree.dof_parent, out[f]
+        )
     return np.where(tree.prismatic, np.inf, out)
 
 

@@ -1,0 +1,76 @@
+"""What a time's measurements observe, and what they only contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.tree import KinematicTree
+from kinefit.frame.results import ANYWHERE, BLIND
+from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
+from kinefit.sensors.evidence import AGREES
+from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.observability import SHORTEST, levers
+from kinefit.sensors.scene import Scene
+from kinefit.solvers.equations import variances
+
+_MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and has no prior
+
+
+def observed(tree: KinematicTree, information: NDArray) -> NDArray:
+    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`."""
+    prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])
+    return np.asarray(np.sqrt(np.maximum(variances(information), 0.0)) <= BLIND * prior)
+
+
+def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
+    """(D,) bool: coordinates that move a keypoint that is seen where it should be."""
+    out, state = np.zeros(len(scene.body.tree.coordinates), bool), scene.state
+    for m in pixels:
+        inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREES**2)
+        points = m.measurement.layout.points_of(scene.body)
+        out |= levers(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0] > SHORTEST
+    return out
+
+
+def moving(tree: KinematicTree, segments: NDArray) -> NDArray:
+    """(n,) bool: degrees of freedom that move some segment of (S,) bool."""
+    out = np.zeros(tree.n_dofs, bool)
+    for s in np.flatnonzero(segments):
+        last = int(tree.last_dof[s])
+        out[tree.chain[last, : tree.depth[last] + 1]] = True
+    out[:6] &= tree.root_free
+    return out
+
+
+def holding(tree: KinematicTree, segments: NDArray) -> NDArray:
+    """(n,) bool: coordinates of the joints of some segments (S,) bool, and of those that they hang on."""
+    away = np.array(segments)
+    parents = tree.parents[segments]
+    away[parents[parents >= 0]] = True
+    return np.concatenate([np.zeros(6, bool), away[tree.owners]])
+
+
+def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
+    """A covariance (n, n) that knows of some degrees of freedom (n,) bool no more than the prior does."""
+    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.spread, _MOST)])
+    out = np.where(gone[:, None] | gone[None, :], 0.0, covariance)
+    out[gone, gone] = prior[gone] ** 2
+    return out
+
+
+def left_out(rows: AnyRows, segments: NDArray) -> AnyRows:
+    """The same rows; those on some segments (S,) bool weigh nothing."""
+    if isinstance(rows, ParameterRows):
+        return rows
+    of = rows.segments if isinstance(rows, PairRows) else rows.segment
+    if of is None:
+        return rows
+    off = segments[of] if of.ndim == 1 else segments[of].any(axis=1)
+    weight = np.where(off, 0.0, rows.weight)
+    if isinstance(rows, Rows):
+        return Rows(np.concatenate([rows.data[:7], weight[None]]), rows.segment, rows.group, rows.loss)
+    return replace(rows, weight=weight)

@@ -1,0 +1,31 @@
+"""How far the degrees of freedom of a tree move points that are seen."""
+
+from __future__ import annotations
+
+import math
+
+from kinefit._jit import jit
+
+
+@jit
+def longest_levers(frames, screws, segments, rest, seen, root, last_dof, dof_parent, out):
+    """out (D,) [m/rad]: how far each coordinate moves the point, of those seen, that it moves furthest."""
+    out[:] = 0.0
+    for k in range(segments.size):
+        if seen[k]:
+            f, p = frames[segments[k]], rest[k]
+            x = f[0] * p[0] + f[1] * p[1] + f[2] * p[2] + f[9] - root[0, 3]
+            y = f[3] * p[0] + f[4] * p[1] + f[5] * p[2] + f[10] - root[1, 3]
+            z = f[6] * p[0] + f[7] * p[1] + f[8] * p[2] + f[11] - root[2, 3]
+            d = last_dof[segments[k]]
+            while d >= 6:
+                t = screws[d - 6]
+                a = t[0] + t[4] * z - t[5] * y
+                b = t[1] + t[5] * x - t[3] * z
+                c = t[2] + t[3] * y - t[4] * x
+                far = a * a + b * b + c * c
+                if far > out[d - 6]:
+                    out[d - 6] = far
+                d = dof_parent[d]
+    for d in range(out.size):
+        out[d] = math.sqrt(out[d])

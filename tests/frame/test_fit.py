@@ -1,0 +1,144 @@
+"""One frame's fit: a limb far from where it is expected is found, or told to be lost; what is not seen is not known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kinefit import load_body
+from kinefit.bodies import BodyState
+from kinefit.frame.fit import FrameFit
+from kinefit.frame.trust import forgotten, holding, left_out, moving, observed
+from kinefit.observations import KeypointFrame
+from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
+from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.simulation import squat_and_wave, studio_rig
+
+BODY = load_body("humanoid")
+TREE = BODY.tree
+TRUTH = squat_and_wave(BODY, rate=30)
+RIG = studio_rig(TRUTH)
+SETTINGS = TrackSettings()
+SIGMA = 3.0
+
+
+def state_of(**turned):
+    """Upright, some coordinates turned [rad]."""
+    angles = np.array(TRUTH.angles[0])
+    for name, angle in turned.items():
+        angles[TREE.coordinate(name)] = angle
+    return BodyState(TRUTH.Ts_world_root[0], angles)
+
+
+def seen(state, move=None):
+    """Keypoints of all cameras, with a little noise; `move` (camera, name) -> (2,) [px] shifts some."""
+    points, random = BODY.keypoints("BODY_25B"), np.random.default_rng(0)
+    x, frames = BODY.positions(state, points), []
+    for camera in RIG:
+        uv = camera.project(x) + random.normal(0.0, 1.0, (len(x), 2))
+        if move is not None:
+            uv = uv + np.array([move(camera.name, n) for n in points.names])
+        frames.append(KeypointFrame(camera.name, 0.0, points.names, uv, np.ones(len(x)), "BODY_25B"))
+    return frames
+
+
+def fitted(frames, predicted, sigma, known=None):
+    """A fit that begins where a body was predicted, with one standard deviation [m, rad] of all of it."""
+    sensor = KeypointSensor(RIG, {}, SIGMA, SETTINGS.loss, SETTINGS.near)
+    scene = Scene(BODY, predicted, RIG)
+    held = predicted, np.eye(TREE.n_dofs) / sigma**2
+    return FrameFit(BODY, SETTINGS).run(scene, held, [sensor.prepare(frames, scene)], known)
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.3, 0.6])
+@pytest.mark.parametrize("predicted", [(0.3, 0.1), (-0.3, 0.1), (0.3, 1.8)])
+def test_a_leg_that_swung_unseen_is_found(predicted, sigma):
+    """Hip and knee were predicted elsewhere, up to half a metre; the loss at its final width leaves the leg there."""
+    truth = state_of(hip_flexion_r=-0.3, knee_angle_r=1.2)
+    result = fitted(seen(truth), state_of(hip_flexion_r=predicted[0], knee_angle_r=predicted[1]), sigma).result
+    a, b = (TREE.segment_poses(s.T_world_root[None], s.angles[None])[0, :, :3, 3] for s in (truth, result.state))
+    assert np.linalg.norm(a - b, axis=1).max() < 0.02
+    assert not result.lost.any() and result.joint_std[TREE.segment("shank_r")].max() < 0.02
+
+
+def test_an_elbow_that_cameras_agree_on_elsewhere_is_lost():
+    """The hand and the shoulder agree, the elbow does not: no bend of the arm brings it there."""
+    truth, there = state_of(), BODY.keypoints("BODY_25B")
+    elbow = BODY.positions(truth, there.select(("RElbow",)))[0]
+    moved = {c.name: (c.project(elbow + [0.0, 0.0, 0.25]) - c.project(elbow)).ravel() for c in RIG}
+    forearm = TREE.segment("forearm_r")
+
+    def together(camera, name):
+        return moved[camera] if name == "RElbow" else np.zeros(2)
+
+    def apart(camera, name):  # each camera to another side: no place in space
+        side = np.array([1.0, 1.0]) * (1 if camera in RIG.names[:2] else -1) * (1 + RIG.names.index(camera))
+        return 150.0 * side if name == "RElbow" else np.zeros(2)
+
+    result = fitted(seen(truth, move=together), truth, 0.05).result
+    assert result.lost[forearm] and result.segment_quality[forearm] > 0.4
+    assert np.isinf(result.joint_std[forearm]).all()
+    assert np.isinf(result.dof_std[6 + TREE.coordinate("elbow_flex_r")])
+    assert np.isfinite(result.joint_std[TREE.segment("shank_r")]).all()
+    noise = fitted(seen(truth, move=apart), truth, 0.05).result
+    assert np.isfinite(noise.joint_std[forearm]).all()
+
+
+def test_what_contradicts_a_segment_makes_it_no_more_certain():
+    """Every camera puts the leg somewhere else: the prediction's deviation is what is left."""
+    off = dict(zip(RIG.names, ([300.0, 0.0], [0.0, -300.0], [-280.0, 150.0], [150.0, 290.0])))
+    leg = ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")
+    truth = state_of()
+    frames = seen(truth, move=lambda camera, name: np.array(off[camera] if name in leg else (0.0, 0.0)))
+    fit = fitted(frames, truth, 0.1)
+    knee = 6 + TREE.coordinate("knee_angle_r")
+    assert fit.result.lost[TREE.segment("shank_r")]
+    assert np.sqrt(fit.filtered[knee, knee]) == pytest.approx(0.1, rel=0.05)
+    assert np.isinf(fit.result.dof_std[knee]) and not fit.known[knee - 6]
+    assert np.sqrt(np.diag(fit.filtered)[6 + TREE.coordinate("knee_angle_l")]) < 0.05
+
+
+def test_a_joint_that_hardly_moves_a_point_is_not_seen_by_it():
+    fit = fitted(seen(state_of()), state_of(), 0.05)  # BODY_25B has nothing beyond the wrist
+    unseen = [TREE.coordinate(c) for c in ("pro_sup_r", "wrist_flex_r", "wrist_dev_l")]
+    assert not fit.seen[unseen].any() and fit.seen[TREE.coordinate("elbow_flex_r")]
+    assert np.isinf(fit.result.dof_std[6:][unseen]).all()
+    known = fitted(seen(state_of()), state_of(), 0.05, np.ones(len(TREE.coordinates), bool))
+    assert np.isfinite(known.result.dof_std).all() and not known.seen[unseen].any()
+
+
+def test_information_observes_what_it_makes_narrower_than_the_prior():
+    spread = np.concatenate([np.full(6, 1.0), TREE.spread])
+    information = np.diag(1.0 / np.square(spread))
+    knee = 6 + TREE.coordinate("knee_angle_r")
+    information[knee, knee] *= 1.2
+    assert np.flatnonzero(observed(TREE, information)).tolist() == [knee]
+
+
+def test_degrees_of_freedom_of_a_lost_segment():
+    lost = np.zeros(len(TREE.segments), bool)
+    lost[TREE.segment("shank_r")] = True
+    names = np.array(["root"] * 6 + list(TREE.coordinates))
+    leg = {"hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r"}
+    assert set(names[moving(TREE, lost)]) == leg | {"root"}
+    assert set(names[holding(TREE, lost)]) == leg
+    gone = holding(TREE, lost)
+    covariance = forgotten(TREE, np.full((TREE.n_dofs,) * 2, 0.01), gone)
+    assert not covariance[np.ix_(gone, ~gone)].any() and (covariance[np.ix_(~gone, ~gone)] == 0.01).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.spread[gone[6:]])
+
+
+def test_rows_of_segments_that_are_left_out_weigh_nothing():
+    lost, one = np.array([False, True]), np.ones(2)
+    segment, x = np.array([0, 1]), np.eye(3)[:2]
+    rows = Rows.of(segment, x, x, one, one)
+    assert left_out(rows, lost).weight.tolist() == [1.0, 0.0] and rows.weight.tolist() == [1.0, 1.0]
+    pairs = PairRows(np.array([[0, 1], [0, 0]]), x, x, x, one, one)
+    assert left_out(pairs, lost).weight.tolist() == [0.0, 1.0]
+    dense = DofRows(np.ones((2, 8)), one, one, segment, segment=segment)
+    assert left_out(dense, lost).weight.tolist() == [1.0, 0.0]
+    assert left_out(DofRows(np.ones((2, 8)), one, one, segment), lost).weight.tolist() == [1.0, 1.0]
+    parameters = ParameterRows(segment, one, one)
+    assert left_out(parameters, lost) is parameters
