@@ -249,7 +249,7 @@ def run(quick: bool = False, first: int = 1) -> None:
 
 
 def _figures(name: str, own: Sequence[Outcome], goals: tuple[float, float]) -> None:
-    reason = "no Anny model"
+    reason = "left out of the quick form, or no Anny model"
     figure(f"{name}_found", float(np.mean([o.found for o in own])) if own else None, "of the takes", ">= 1", reason)
     for k, (what, unit, goal) in enumerate(zip(("turn", "shift"), ("deg", "mm"), goals)):
         left = [o.left[k] for o in own]
