@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 
-_POSES, _LIMBS, _NEAR = amount(16, 2), amount(16, 4), 0.1  # [m] a joint this near its true place is found
+_POSES, _NEAR = amount(16, 2), 0.1  # [m] a joint this near its true place is found
 _PEOPLE = amount(20, 1)
 _NEARLY, _MOST = 0.15, 0.8  # [m] of a start that tracking can go on from, this share of joints is so near
 _UP = np.array([0.0, 1.0, 0.0])
@@ -25,7 +25,6 @@ def run() -> None:
     _recovered(body)
     for name in ("tof", "kinect"):
         _movements(name)
-    _limbs(body)
     _size(body)
 
 
@@ -142,30 +141,6 @@ def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
         camera = in_front(truth, kind.camera(), azimuth=person.azimuth, near=kind.near, far=kind.far)
         depth = measured_depth(Scene.of(truth, camera), frame, camera, kind, np.random.default_rng([k, frame]))
         yield person.body, truth.state(frame), camera, depth
-
-
-def _limbs(body: Any) -> None:
-    """One limb put anywhere, the rest as it is."""
-    from kinefit.bodies import BodyState
-    from kinefit.initialization.from_depth import restart_limb
-    from kinefit.simulation.sensors import KINECT
-
-    camera, good, spent = camera_in_front(KINECT), [], []
-    truth = [random_state(body, np.random.default_rng(300 + i), sitting=False) for i in range(_LIMBS)]
-    for k, (depth, state) in enumerate(zip(seen(body, truth, camera, KINECT, room=False), truth)):
-        rng, end = np.random.default_rng(k), ("forearm_r", "forearm_l", "shank_r", "shank_l")[k % 4]
-        limb = [body.tree.segment(end), int(body.tree.parents[body.tree.segment(end)])]
-        moved = np.isin(body.tree.owners, limb)
-        angles = np.where(moved, rng.uniform(body.tree.lower, body.tree.upper), state.angles)
-        begin = time.process_time()
-        lost = BodyState(state.T_world_root, angles)
-        start = restart_limb(body, lost, [end], None, camera, depth, up=_UP)[0]
-        spent.append(time.process_time() - begin)
-        names = ("elbow", "wrist") if "arm" in end else ("knee", "ankle")
-        tips = body.landmarks.select(tuple(f"{end[-1]}_{name}" for name in names))
-        good.append(np.linalg.norm(body.positions(start.state, tips) - body.positions(state, tips), axis=1) < _NEAR)
-    figure("restart_recovered", float(np.mean(good)), f"of joints within 100 mm, {_LIMBS} limbs", ">= 0.9")
-    figure("restart_seconds", float(np.median(spent)), "s CPU", "<= 0.3")
 
 
 def _size(body: Any) -> None:

@@ -39,7 +39,8 @@ def rows(text):
 @pytest.mark.parametrize(
     ("page", "heading", "record"),
     [
-        (TAKE, "## `[take]`", takes._Head), (TAKE, "## `[calibration]`", takes.CalibrationEntry),
+        (TAKE, "## `[take]`", takes._Head), (TAKE, "## `[start]`", takes.StartEntry),
+        (TAKE, "## `[calibration]`", takes.CalibrationEntry),
         (TAKE, "## `[[camera]]`", takes.CameraEntry), (TAKE, "## `[[keypoints]]`", takes.KeypointsEntry),
         (TAKE, "## `[[markers]]`", takes.MarkersEntry), (TAKE, "## `[[depth]]`", takes.DepthEntry),
         (TAKE, "## `[[stereo]]`", takes.StereoEntry), (TAKE, "## `[[silhouette]]`", takes.SilhouetteEntry),

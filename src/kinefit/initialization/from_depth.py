@@ -19,7 +19,6 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, noise_of
 from kinefit.images.depth_scene import Blob, find_floor, people
-from kinefit.initialization.depth_score import limbs
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.depth_view import DepthView, splat, view_of
 from kinefit.subject.depth import SurfaceFit, fit_surfaces
@@ -107,47 +106,6 @@ def _meant(search: Search, state: BodyState) -> float:
     """Score of a person among several: one of whom little is seen (less than head and shoulders) counts for less."""
     area = float(np.sum((search.view.observed / search.view.lens[0]) ** 2))
     return search.value(state) * min(area / (0.1 * max(search.body.stature, 0.1) ** 2), 1.0)
-
-
-def restart_limb(
-    body: Body,
-    state: BodyState,
-    segments: Sequence[str],
-    points: ArrayLike | None,
-    camera: Camera,
-    depth: NDArray | None = None,
-    *,
-    up: ArrayLike = (0.0, 1.0, 0.0),
-    count: int = 3,
-    tries: int = 400,
-    seed: int = 0,
-) -> list[Start]:
-    """Poses of lost limbs, all else of the body kept; the best first, the given pose among them.
-
-    Parameters
-    ----------
-    state : BodyState that holds but for the limbs
-    segments : names; the whole limb of each is sought, from the joint at the trunk to its end.
-    points, camera, depth, up, count, seed : see `start_from_points`
-    tries : int, random poses of each limb
-
-    Raises
-    ------
-    ObservationError, TrackingError, BodyError
-        As `start_from_points`; and a segment that the body does not have, or that is no limb's.
-    """
-    lost = {body.tree.segment(name) for name in segments}
-    chosen = [limb for limb in limbs(body) if lost & set(limb)]
-    if lost - {s for limb in chosen for s in limb}:
-        names = ", ".join(body.tree.segments[s] for limb in limbs(body) for s in limb)
-        raise BodyError("a segment of the trunk cannot be sought alone", remedy=f"Choose among: {names}.")
-    views = [view for some in _views(body, points, camera, depth, up) for view in some]
-    search = max(_searches(body, views, up, seed), key=lambda s: s.score.of(state))
-    ends = search.ends(state)
-    found = [(state, search.score.of(state))]
-    for limb in chosen:
-        found = search.limb(found[0][0], limb, None, ends, tries)
-    return [Start(s, value, search.score.visible(s)) for s, value in found[:count]]
 
 
 def sized_start(

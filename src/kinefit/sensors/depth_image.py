@@ -24,7 +24,7 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.occlusion import DepthSeen
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_match import FreePairs, SurfacePairs
+from kinefit.sensors.surface_match import FreePairs, SurfacePairs, along
 from kinefit.sensors.visibility import judge_segments
 
 AGREES = 3.0  # standard deviations of a measurement that agrees
@@ -146,7 +146,7 @@ class DepthImageMeasurement(Measurement):
         self._matches += 1
         if not due and self._shown is not None:
             return self._shown, self._space
-        shown = scene.surface.depth(scene.surface.posed(scene.state), self.camera).copy()
+        shown = scene.surface.depth(scene.surface.posed(scene.state), scene.placed(self.camera)).copy()
         space = self._free(shown)
         if not self.is_compact:
             self._shown, self._space = shown, space
@@ -155,15 +155,15 @@ class DepthImageMeasurement(Measurement):
     def match(self, scene: Scene, reach: float) -> DepthImageMatched:
         """Nearest points of the surface, the visible samples' pixels, and where samples in free space should go."""
         body, state, samples, s, sigma = scene.body, scene.state, scene.surface.samples, self.of.settings, self.sigma
-        bound, depth = max(reach, AGREES * sigma), self.depth
+        bound, depth, camera = max(reach, AGREES * sigma), self.depth, scene.placed(self.camera)
         shown, space = self._drawn(scene)
-        measured = np.ascontiguousarray(self._points.T, float)
+        measured = along(np.ascontiguousarray(self._points.T, float), self.camera, scene)
         points = surface_rows(
             body, state, measured, max_distance=bound, sigma=sigma / np.sqrt(self._share / 2.0),
-            viewpoint=self.camera.centre_world, frames=scene.frames,
+            viewpoint=camera.centre_world, frames=scene.frames,
         )  # fmt: skip
         pixels = depth_image_rows(
-            body, state, samples, self.camera, depth, shown, before=bound, behind=bound, sigma=self._sample_sigma,
+            body, state, samples, camera, depth, shown, before=bound, behind=bound, sigma=self._sample_sigma,
             frames=scene.frames,
         )  # fmt: skip
         # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
@@ -172,16 +172,17 @@ class DepthImageMeasurement(Measurement):
         free = None
         if space is not None:
             sigma = s.through * space.cell
-            free = FreePairs.found(scene, samples, space, self.camera, tolerance=self._astray, sigma=sigma)
+            free = FreePairs.found(scene, samples, space, camera, tolerance=self._astray, sigma=sigma)
         return DepthImageMatched(
-            self, SurfacePairs.nearest(points, measured, scene, bound / 2.0, blur),
-            SurfacePairs.seen(pixels, samples, scene, bound / 2.0), free,
+            self, SurfacePairs.nearest(points, measured, scene, bound / 2.0, blur, camera),
+            SurfacePairs.seen(pixels, samples, scene, bound / 2.0, camera), free,
         )  # fmt: skip
 
     def evidence(self, scene: Scene) -> Evidence:
         """Pixels for and against each segment; see `judge_segments`."""
-        layers, vertices = scene.surface.layers(self.camera), scene.surface.posed(scene.state)
-        told = judge_segments(vertices, layers, self.depth, self.camera, noise=(self.sigma / 2.0, 0.0))
+        camera, vertices = scene.placed(self.camera), scene.surface.posed(scene.state)
+        layers = scene.surface.layers(camera)
+        told = judge_segments(vertices, layers, self.depth, camera, noise=(self.sigma / 2.0, 0.0))
         self._judged = None if self.is_compact else (scene.state, layers.front.copy())
         return told.evidence
 
@@ -189,7 +190,7 @@ class DepthImageMeasurement(Measurement):
         """(h, w) [m] the body's own depth at a scene's state, small; what evidence has drawn is not drawn twice."""
         if self._judged is not None and self._judged[0] is scene.state:
             return self._judged[1]
-        return scene.surface.depth(scene.surface.posed(scene.state), self.camera)
+        return scene.surface.depth(scene.surface.posed(scene.state), scene.placed(self.camera))
 
     def depth_image(self) -> DepthSeen:
         """For other sensors, what stands still among it."""

@@ -69,7 +69,8 @@ def hidden_points(scene: Scene, points: PointSet, camera: NDArray, sure: NDArray
     points : PointSet of N channels; camera (N,) int, index in the rig of each
     sure : (N,) bool, those that are surely seen
     """
-    seen = [d for m in scene.measurements if (d := m.depth_image()) is not None]
+    told = (d for m in scene.measurements if (d := m.depth_image()) is not None)
+    seen = [d._replace(camera=scene.placed(d.camera)) for d in told]
     if not seen:
         return
     root = scene.state.T_world_root[:3, 3]

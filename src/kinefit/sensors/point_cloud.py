@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit.correspondences import surface_rows
+from kinefit.geometry.camera import Camera
 from kinefit.observations import PointCloud
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
@@ -16,7 +18,7 @@ from kinefit.sensors.depth_view import camera_at, splat, view_of
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_match import SurfacePairs
+from kinefit.sensors.surface_match import SurfacePairs, along
 
 _PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
 
@@ -29,10 +31,11 @@ class PointCloudSensor(Sensor):
     name : as its frames are named
     sigma : float [m] standard deviation of a point.
     settings : TrackSettings
+    camera : Camera, where the scanner is one of the rig's: its points go with it.
     """
 
-    def __init__(self, name: str, sigma: float, settings: TrackSettings) -> None:
-        self.name, self.sigma, self.settings = name, sigma, settings
+    def __init__(self, name: str, sigma: float, settings: TrackSettings, camera: Camera | None = None) -> None:
+        self.name, self.sigma, self.settings, self.camera = name, sigma, settings, camera
 
     def prepare(self, frame: PointCloud, scene: Scene) -> PointCloudMeasurement:
         """The points about the body.
@@ -64,6 +67,7 @@ class PointCloudMeasurement(Measurement):
     def __init__(self, of: PointCloudSensor, frame: PointCloud, scene: Scene) -> None:
         s = of.settings
         self.sensor, self.time, self.sigma, self._eye = of.name, frame.time, of.sigma, frame.viewpoint
+        self._camera = of.camera
         self._segment = None if frame.segment is None else np.int64(scene.body.tree.segment(frame.segment))
         self._certain = frame.on_body or frame.segment is not None
         x, vertices = frame.points, scene.surface.posed(scene.state)
@@ -78,11 +82,22 @@ class PointCloudMeasurement(Measurement):
     def match(self, scene: Scene, reach: float) -> PointCloudMatched:
         """Nearest points of the surface; for points known to be the body's twice as far."""
         bound = max(2.0 * reach if self._certain else reach, AGREES * self.sigma)
-        return PointCloudMatched(self, SurfacePairs.nearest(self._near(scene, bound), self.points, scene, bound / 2.0))
+        points, _ = self._seen(scene)
+        camera = None if self._camera is None else scene.placed(self._camera)
+        near = self._near(scene, bound)
+        return PointCloudMatched(self, SurfacePairs.nearest(near, points, scene, bound / 2.0, camera=camera))
+
+    def _seen(self, scene: Scene) -> tuple[NDArray, NDArray | None]:
+        """(N, 3) [m] its points and (3,) [m] where the sensor stood, where a scene's rig has it."""
+        if self._camera is None:
+            return self.points, self._eye
+        eye = None if self._eye is None else along(self._eye[None], self._camera, scene)[0]
+        return along(self.points, self._camera, scene), eye
 
     def _near(self, scene: Scene, reach: float) -> Rows:
+        points, eye = self._seen(scene)
         return surface_rows(
-            scene.body, scene.state, self.points, max_distance=reach, sigma=self._point_sigma, viewpoint=self._eye,
+            scene.body, scene.state, points, max_distance=reach, sigma=self._point_sigma, viewpoint=eye,
             segment=self._segment, frames=scene.frames,
         )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.morphing import MorphedPose, Morphing
 from kinefit.correspondences import targets
 from kinefit.correspondences.morphed import on_moved_joints
-from kinefit.geometry.camera import Rig
+from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.surface import Surface
 
@@ -58,10 +59,10 @@ class Scene:
     def at(self, state: BodyState, **changes: Any) -> Scene:
         """The same scene with the body in another state; `changes` are other arguments of a scene."""
         given: dict[str, Any] = {
-            "time": self.time, "velocity": self.velocity, "values": self.values, "measurements": self.measurements,
-            "others": self.others, "samples": self._samples, **changes,
+            "rig": self.rig, "time": self.time, "velocity": self.velocity, "values": self.values,
+            "measurements": self.measurements, "others": self.others, "samples": self._samples, **changes,
         }  # fmt: skip
-        out = Scene(self.body, state, self.rig, **given)
+        out = Scene(self.body, state, **given)
         out._shared = self._shared
         return out
 
@@ -77,6 +78,16 @@ class Scene:
     def value(self, sensor: str, name: str, default: float) -> float:
         """What is thought of a sensor's own unknown: the default where nothing is."""
         return self.values.get(sensor, {}).get(name, default)
+
+    def placed(self, camera: Camera) -> Camera:
+        """A sensor's camera where the scene's rig has it; where it is if the rig has none of its name.
+
+        So rows of every sensor follow a rig whose extrinsics are estimated. Asked again it gives the same camera.
+        """
+        if camera.name not in self.rig:
+            return camera
+        there = self.rig[camera.name]
+        return camera if np.array_equal(there.T_camera_world, camera.T_camera_world) else _placed(camera, there)
 
     @property
     def surface(self) -> Surface:
@@ -152,3 +163,8 @@ class Scene:
         weight = np.broadcast_to(1.0 / np.square(np.asarray(sigma, float)), len(points))
         rows = Rows.of(points.segments, x, n, np.broadcast_to(residual, len(points)), weight, **options)
         return rows if self.morphing is None else on_moved_joints(self.morphing.pose(self.state), rows)
+
+
+@lru_cache(maxsize=64)
+def _placed(camera: Camera, there: Camera) -> Camera:
+    return camera.with_pose(there.T_camera_world)

@@ -79,7 +79,7 @@ class SilhouetteMeasurement(Measurement):
 
     Attributes
     ----------
-    camera : Camera of the small image in which outlines are compared
+    camera : Camera of the small image in which outlines are compared; rows see it where the scene's rig has it
     mask : (h, w) uint8 of that image
     outline : (4, M) u, v [px] and unit normals of its outline
     sigma : float [px] there
@@ -97,12 +97,13 @@ class SilhouetteMeasurement(Measurement):
             mask = cv2.resize(mask, self.camera.size, interpolation=cv2.INTER_AREA)
         vertices = scene.pose.vertices
         focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
-        z = vertices @ self.camera.T_camera_world[2, :3] + self.camera.T_camera_world[2, 3]
+        T = scene.placed(self.camera).T_camera_world
+        z = vertices @ T[2, :3] + T[2, 3]
         self.pixels_per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
-        self._last: tuple[NDArray, Rim] | None = None
+        self._last: tuple[NDArray, Camera, Rim] | None = None
         self.rim(scene, stale=0.0)
         size = 2 * int(np.ceil(of.settings.reach * self.pixels_per_metre)) + 1  # as far about it as it may have moved
-        seen = scene.surface.rims(self.camera).drawn(self.camera) >= 0
+        seen = scene.surface.rims(scene.placed(self.camera)).drawn(self.camera) >= 0
         self.mask = choose_person(mask, cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
         self.outline = np.ascontiguousarray(outline(self.mask)[:, :: max(round(1.3 * _SPACING), 1)])
         # Over a patch of the surface the errors of an outline are alike, and every place is measured from both sides.
@@ -111,12 +112,11 @@ class SilhouetteMeasurement(Measurement):
 
     def rim(self, scene: Scene, stale: float = _STALE) -> Rim:
         """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""
-        vertices = scene.pose.vertices
-        if self._last is None or self._last[0] is not vertices or stale == 0.0:
-            finder = scene.surface.rims(self.camera)
-            rim = finder.find(vertices, self.camera, spacing=_SPACING, inner=False, stale=stale)
-            self._last = vertices, rim
-        return self._last[1]
+        vertices, camera = scene.pose.vertices, scene.placed(self.camera)
+        if self._last is None or self._last[0] is not vertices or self._last[1] is not camera or stale == 0.0:
+            rim = scene.surface.rims(camera).find(vertices, camera, spacing=_SPACING, inner=False, stale=stale)
+            self._last = vertices, camera, rim
+        return self._last[2]
 
     def match(self, scene: Scene, reach: float) -> SilhouetteMatched:
         """Points of both outlines that are near each other and look the same way."""
@@ -139,7 +139,7 @@ class SilhouetteMeasurement(Measurement):
     def overlap(self, scene: Scene) -> float:
         """Intersection over union of the body's own silhouette at a scene's state and the image's, 0..1."""
         self.rim(scene, stale=0.0)
-        body, image = scene.surface.rims(self.camera).drawn(self.camera) >= 0, self.mask > 127
+        body, image = scene.surface.rims(scene.placed(self.camera)).drawn(self.camera) >= 0, self.mask > 127
         return float((body & image).sum() / max((body | image).sum(), 1))
 
     def compact(self) -> SilhouetteMeasurement:
@@ -177,7 +177,7 @@ class SilhouetteMatched(Matched):
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a pair: the pixel of the body's point should lie on the tangent of the image's outline."""
-        numbers, camera = np.arange(len(self.rim)), self.measurement.camera
+        numbers, camera = np.arange(len(self.rim)), scene.placed(self.measurement.camera)
         pairs = numbers, numbers
         if scene.surface.morphing.is_rigid:
             rows = outline_rows(
@@ -194,7 +194,7 @@ class SilhouetteMatched(Matched):
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Distances [px], in the camera's own image, of the image's outline from the body's, by segments."""
-        uv = self.measurement.camera.project(self.rim.on(scene.pose.vertices))
+        uv = scene.placed(self.measurement.camera).project(self.rim.on(scene.pose.vertices))
         away = np.sum(self.tangents[2:].T * (self.tangents[:2].T - uv), axis=1) / self.measurement.of.scale
         seen = np.isfinite(away)
         return [by_segments(self.sensor, scene.body, away[seen], self.rim.segment[seen], "px")]

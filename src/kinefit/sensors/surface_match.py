@@ -29,6 +29,7 @@ class SurfacePairs:
     weight : (N,) [1/m²]
     scale : float [m] of the loss (Geman-McClure): at this distance a pair has a quarter of its weight.
     at_surface : bool, see `anchored_rows`.
+    camera : Camera that measured them, where `x_world` has it; they go with it where a scene's rig has it elsewhere.
     """
 
     anchors: SurfaceAnchors
@@ -36,9 +37,13 @@ class SurfacePairs:
     weight: NDArray
     scale: float
     at_surface: bool
+    camera: Camera | None = None
 
     @classmethod
-    def nearest(cls, rows: Rows, x_world: NDArray, scene: Scene, scale: float, factor: float = 1.0) -> SurfacePairs:
+    def nearest(
+        cls, rows: Rows, x_world: NDArray, scene: Scene, scale: float, factor: float = 1.0,
+        camera: Camera | None = None,
+    ) -> SurfacePairs:  # fmt: skip
         """Pairs of measured points (M, 3) [m] and their nearest points: `surface_rows` of them in the scene's state.
 
         `factor` multiplies the weights.
@@ -49,20 +54,23 @@ class SurfacePairs:
         R = f[:, :9].reshape(-1, 3, 3)
         rest, normal = np.einsum("nji,nj->ni", R, foot - f[:, 9:]), np.einsum("nji,nj->ni", R, n)
         anchors = SurfaceAnchors(scene.body, rows.segment, rest, normal)
-        return cls(anchors, np.ascontiguousarray(x), factor * rows.weight, scale, True)
+        return cls(anchors, np.ascontiguousarray(x), factor * rows.weight, scale, True, camera)
 
     @classmethod
-    def seen(cls, rows: Rows, samples: SurfaceSamples, scene: Scene, scale: float) -> SurfacePairs:
+    def seen(
+        cls, rows: Rows, samples: SurfaceSamples, scene: Scene, scale: float, camera: Camera
+    ) -> SurfacePairs:
         """Pairs of visible samples and what was measured at their pixels: `depth_image_rows` in the scene's state."""
         rest, normal = samples.point[:, rows.group].T, samples.normal[:, rows.group].T
         anchors = SurfaceAnchors(scene.body, rows.segment, np.ascontiguousarray(rest), np.ascontiguousarray(normal))
-        return cls(anchors, np.ascontiguousarray(rows.point), rows.weight.copy(), scale, False)
+        return cls(anchors, np.ascontiguousarray(rows.point), rows.weight.copy(), scale, False, camera)
 
     def on_segments(self, scene: Scene) -> Rows:
         """The rows, as if no joint moved with an angle."""
         points, normals = self.anchors.on(scene.body)
+        measured = self.x_world if self.camera is None else along(self.x_world, self.camera, scene)
         made = anchored_rows(
-            scene.body, scene.state, self.anchors.segment, points, normals, self.x_world, weight=self.weight,
+            scene.body, scene.state, self.anchors.segment, points, normals, measured, weight=self.weight,
             at_surface=self.at_surface, frames=scene.frames,
         )  # fmt: skip
         return replace(made, loss=geman_mcclure(self.scale * np.sqrt(self.weight)))
@@ -109,10 +117,19 @@ class FreePairs:
         """One row a sample at a scene's state."""
         points, _ = self.anchors.on(scene.body)
         made = target_rows(
-            scene.body, scene.state, self.anchors.segment, points, self.camera, self.target, slack=self.slack,
-            sigma=self.sigma, frames=scene.frames,
+            scene.body, scene.state, self.anchors.segment, points, scene.placed(self.camera), self.target,
+            slack=self.slack, sigma=self.sigma, frames=scene.frames,
         )  # fmt: skip
         return _on_joints(scene, replace(made, loss=SQUARED))
+
+
+def along(x_world: NDArray, camera: Camera, scene: Scene) -> NDArray:
+    """(N, 3) [m] what a camera measured, moved with it to where a scene's rig has it."""
+    there = scene.placed(camera)
+    if there is camera:
+        return x_world
+    T = there.T_world_camera @ camera.T_camera_world
+    return np.ascontiguousarray(x_world @ T[:3, :3].T + T[:3, 3])
 
 
 def _on_joints(scene: Scene, rows: Rows) -> Rows | DofRows:

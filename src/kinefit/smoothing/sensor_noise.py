@@ -22,6 +22,7 @@ from kinefit.smoothing.spool import Spool
 from kinefit.solvers.equations import design
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0
 _FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
 
@@ -119,7 +120,8 @@ def other_noise(
                     moved += [(m.sensor, weighted.T @ d)]
         if surface:
             settings = others.settings  # also where the fit takes surfaces for exact
-            skin = skin_of(scene, surface, max(settings.skin_shift, _EXACT), settings.skin_turn)
+            beside = max(settings.skin_shift, _EXACT), settings.skin_turn
+            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID))
             information[f] += skin.information[upper]
             lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
         pushes.append(push)

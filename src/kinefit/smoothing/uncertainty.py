@@ -12,7 +12,7 @@ camera, or of another sensor, as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,9 +24,13 @@ from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
+from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
 from kinefit.solvers.equations import inverse, product
 from kinefit.solvers.shape import ShapeParameters, shape_parameters
 from kinefit.subject.keypoints import Subject
+
+Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
+"""(frames, covariance of each on its own) -> what an uncertain shape adds to them."""
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
 _TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
@@ -40,15 +44,17 @@ class Lasting:
     ----------
     dofs : (n, n) [m, rad] covariance of the degrees of freedom.
     joints : (S, 3) [m²] variance of the joint centres along the world's axes.
+    alone : (n, n) covariance of the frame on its own, prior included.
     """
 
     dofs: NDArray
     joints: NDArray
+    alone: NDArray
 
 
 def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
-    others: OtherNoise | None = None,
+    others: OtherNoise | None = None, answers: Answers | None = None,
 ) -> tuple[list[FrameResult], DetectorNoise]:  # fmt: skip
     """The same results with the standard deviations that lasting errors and the shape add; and the detectors' noise.
 
@@ -59,6 +65,7 @@ def with_lasting_errors(
     take : the pixels as they were used, and the states
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors
+    answers : what a shape adds that was found from all sensors together, where it was
     """
     body, channels = subject.body, take.channels
     fitted = take.fitted(take.roots, take.angles)
@@ -74,14 +81,22 @@ def with_lasting_errors(
     half, n = round(_TIED * rate), body.tree.n_dofs
     weights = pooled(weight, half)
     nothing = np.zeros((n, n)), np.zeros((n, n))
-    out = []
+    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
+    added, alone = [], []
     for f, result in enumerate(results):
         more = nothing if others is None else others.pooled(f, half)
-        add = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, *more)
+        one = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, *more)
+        added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
+        if f in sampled:
+            alone.append(one.alone)
+    shape = answers([int(f) for f in sampled], alone) if answers is not None else None
+    out = []
+    for f, (result, (dofs, joints)) in enumerate(zip(results, added)):
+        if shape is not None:
+            dofs, joints = (mine + of_shape for mine, of_shape in zip((dofs, joints), shape.at(f)))
         out.append(replace(
-            result,
-            dof_std=np.sqrt(np.square(result.dof_std) + np.maximum(np.diag(add.dofs), 0.0)),
-            joint_std=np.sqrt(np.square(result.joint_std) + add.joints),
+            result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),
+            joint_std=np.sqrt(np.square(result.joint_std) + joints),
         ))  # fmt: skip
     return out, noise
 
@@ -125,4 +140,4 @@ def lasting(
     whole = product(moves, answer) + stretch
     joints = np.sum(product(moves, dofs) * moves, axis=-1) + np.sum(product(whole, Sigma_shape) * whole, axis=-1)
     shape = product(product(answer, Sigma_shape), answer.T)
-    return Lasting(dofs + shape, np.maximum(joints, 0.0))
+    return Lasting(dofs + shape, np.maximum(joints, 0.0), alone)

@@ -27,7 +27,7 @@ class Worlds:
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
-        self._scenes: dict[tuple[int, int], tuple[World, Scene]] = {}
+        self._scenes: dict[int, tuple[Body, Scene]] = {}
 
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
@@ -52,13 +52,13 @@ class Worlds:
         return tuple(out)
 
     def scene(self, world: World, state: BodyState) -> Scene:
-        """A scene of a world; those of one body and rig share what was made for them."""
-        key = id(world.body), id(world.rig)
+        """A scene of a world; those of one body share what was made for it."""
+        key = id(world.body)
         if key not in self._scenes:
             if len(self._scenes) >= 4:
                 self._scenes.pop(next(iter(self._scenes)))
-            self._scenes[key] = world, Scene(world.body, state, world.rig)
-        return self._scenes[key][1].at(state, values=world.values)
+            self._scenes[key] = world.body, Scene(world.body, state, world.rig)
+        return self._scenes[key][1].at(state, rig=world.rig, values=world.values)
 
 
 class MatchedFrames:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.anny import AnnyFamily, AnnyModel
+from kinefit.bodies.flesh import with_flesh
 from kinefit.bodies.surfaces import Surface, TaperedCylinder
 from kinefit.errors import BodyError
-from kinefit.subject.parameters import World
+from kinefit.subject.parameters import Parameters, World
 
 GIRTH, OFFSET = 0.2, 0.015
 """Standard deviations between people: of the logarithm of a half axis (ANSUR II: girths by 10 %; a body of cylinders
@@ -109,28 +111,35 @@ def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
 class AnnyShape:
     """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a mean shape.
 
-    It makes the body anew, so it goes before all other parameters; lengths beside the shape's are `SegmentScales` after
-    it, and the body that is fitted is one of the model's.
+    By itself it makes the body anew, so it goes before all other parameters; lengths beside the shape's are
+    `SegmentScales` after it, and the body that is fitted is one of the model's. With `flesh` it leaves bones and points
+    as it finds them, and changes what lies on them.
 
     Parameters
     ----------
     model : AnnyModel
     usual : (6,) shape parameters at zero.
     std : standard deviation of each: about a quarter of its range.
+    flesh : whether bones and points stay.
     """
 
     model: AnnyModel
     usual: NDArray
     std: float = 0.25
+    flesh: bool = False
 
     @cached_property
     def _family(self) -> AnnyFamily:
-        return AnnyFamily(self.model, np.asarray(self.usual, float), lengths=False)
+        return AnnyFamily(self.model, np.asarray(self.usual, float))
+
+    @cached_property
+    def _made(self) -> Callable[[bytes], Body]:
+        return lru_cache(maxsize=16)(lambda values: self._family.at(np.frombuffer(values)))
 
     @property
     def names(self) -> tuple[str, ...]:
         """(5,)."""
-        return self._family.names
+        return tuple(f"anny {name}" for name in self._family.names)
 
     @property
     def mean(self) -> NDArray:
@@ -149,4 +158,17 @@ class AnnyShape:
 
     def apply(self, world: World, values: NDArray) -> World:
         """The world with a body of this shape."""
-        return replace(world, body=self._family.at(values))
+        made, usual = (self._made(np.asarray(v, float).tobytes()) for v in (values, self.mean))
+        return replace(world, body=with_flesh(world.body, made, usual) if self.flesh else made)
+
+
+def shape_of(body: Body) -> list[Parameters]:
+    """What a take with surfaces tells of a body beside its lengths: Anny's shape, or girths of cylinders; or nothing.
+
+    A mesh, or a skin of another make, is taken as it is.
+    """
+    family = body.family
+    if isinstance(family, AnnyFamily) and family.model.segments == body.tree.segments:
+        return [AnnyShape(family.model, family.usual, flesh=True)]
+    cylinders = any(isinstance(s, TaperedCylinder) for s in body.surfaces)
+    return [CylinderShape(body)] if cylinders and not body.skin else []

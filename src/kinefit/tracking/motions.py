@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,12 @@ from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Followed
 from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
+from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
+from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import Subject
 from kinefit.tracking.agreement import LOOKS, contradictions
 from kinefit.tracking.recording import spread
@@ -60,7 +63,7 @@ class TrackedFrames:
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", name: str = "motion",
-    told: Mapping[str, Any] | None = None,
+    told: Mapping[str, Any] | None = None, found: joint.Subject | None = None,
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 
@@ -75,6 +78,7 @@ def motion_of(
     noise : that is known beforehand, for a lag
     up, name : of the motion
     told : what else there is to tell, for `Motion.provenance`
+    found : the shape that all sensors together were fitted with, with its covariance
     """
     body, rate, channels = subject.body, frames.rate, frames.channels
     results: Sequence[FrameResult] = frames.results
@@ -115,7 +119,8 @@ def motion_of(
     if others is not None and matched is not None:
         noise_of_others = other_noise(body, others, matched, take.roots, take.angles)
         provenance["sensor noise"] = noise_of_others.as_told()
-    results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others)
+    answers = None if found is None else partial(shape_errors, found, settings, seen)
+    results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others, answers)
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)
     provenance["length_std_m"] = subject.length_std

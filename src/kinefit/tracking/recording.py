@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,19 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
-from kinefit.observations import DepthFrame, KeypointFrame, Keypoints, LineFrame, Markers, SilhouetteFrame
+from kinefit.observations import (
+    DepthFrame,
+    Frame,
+    KeypointFrame,
+    Keypoints,
+    LineFrame,
+    MarkerFrame,
+    Markers,
+    SilhouetteFrame,
+)
 from kinefit.sensors.base import Sensor
+
+_PARTS = ("keypoint_set", "marker_set", "segment")  # of which one sensor may have several frames at one time
 
 Steps = Callable[[int], Sequence[Any]]
 """Number of a step of time -> what the sensors saw then; nothing where none did."""
@@ -74,8 +85,10 @@ class Recording:
             raise ObservationError(problem, remedy="Start at a step of the recording.")
         for name in (*self.on_body, *self.backgrounds):
             self.rig.index(name)
-        if len({s.name for s in self.sensors}) < len(self.sensors):
-            raise ObservationError("two sensors of one name", remedy="Give each its own name.")
+        names = [s.name for s in self.sensors]
+        for name in names:
+            if names.count(name) > 1:
+                raise ObservationError(f"two sensors are named '{name}'", remedy="Give each its own name.")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -137,15 +150,17 @@ class Recording:
         Raises
         ------
         ObservationError
-            No steps, or steps without any frame; a standard deviation of no sensor.
+            No steps, or steps without any frame; two frames of one sensor in a step; a standard deviation of no sensor.
         """
+        for i, seen in enumerate(steps):
+            _check_names(i, seen)
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
-        known = np.flatnonzero(np.isfinite(told))
-        if not len(known):
+        timed = np.flatnonzero(np.isfinite(told))
+        if not len(timed):
             raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
-        times = np.interp(np.arange(len(told)), known, np.array(told)[known])
-        if len(known) < len(told):  # evenly beyond the ends
-            times = np.where(np.isfinite(told), times, times[known[0]] + (np.arange(len(told)) - known[0]) / rate)
+        times = np.interp(np.arange(len(told)), timed, np.array(told)[timed])
+        if len(timed) < len(told):  # evenly beyond the ends
+            times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
         sigma = dict(sigma or {})
         there = {*rig.names, *(_name(f) for seen in steps for f in seen)}
         for name in sigma:
@@ -155,10 +170,12 @@ class Recording:
         records = _records(steps, times, rate)
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
         accuracy = tuple(sigma.get(r.camera, 4.0) for r in records)
+        worn = _marker_records(steps, rate)
+        known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
         return cls(
             times, rate, rig, steps=lambda i: others[i], keypoints=records,
             people=tuple(np.where((r.confidence > 0).any(axis=(1, 2)), 0, -1) for r in records),
-            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **more,
+            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **{**known, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -174,6 +191,15 @@ def _name(frame: Any) -> str:
     """Of the sensor that a frame is of."""
     kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
     return kind + str(frame.sensor)
+
+
+def _check_names(step: int, seen: Sequence[Any]) -> None:
+    """Refuse two frames of one sensor in a step that are of the same points."""
+    told = [(type(f), f.sensor, *(getattr(f, part, "") for part in _PARTS)) for f in seen]
+    for one in told:
+        if isinstance(seen[told.index(one)], get_args(Frame)) and told.count(one) > 1:
+            problem = f"two frames of sensor '{one[1]}' in step {step}"
+            raise ObservationError(problem, remedy="Give each sensor its own name, or each time its own step.")
 
 
 def _cut(record: Keypoints, frames: slice) -> Keypoints:
@@ -206,6 +232,23 @@ def _records(steps: Sequence[Sequence[Any]], times: NDArray, rate: float) -> tup
             points[i, 0], confidence[i, 0] = f.uv, f.confidence
         out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=float(times[0])))
     return tuple(out)
+
+
+def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> list[tuple[Markers, str]]:
+    """Markers of single frames as whole recordings, one for each sensor and marker set, which is named beside it."""
+    seen: dict[tuple[str, str], dict[int, MarkerFrame]] = {}
+    for i, frames in enumerate(steps):
+        for f in frames:
+            if isinstance(f, MarkerFrame):
+                seen.setdefault((f.sensor, f.marker_set), {})[i] = f
+    out = []
+    for (sensor, marker_set), frames_of in seen.items():
+        names = tuple(dict.fromkeys(n for f in frames_of.values() for n in f.names))
+        positions = np.full((len(steps), len(names), 3), np.nan)
+        for i, f in frames_of.items():
+            positions[i, [names.index(n) for n in f.names]] = f.positions
+        out.append((Markers(names, rate, positions, source=sensor), marker_set))
+    return out
 
 
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]

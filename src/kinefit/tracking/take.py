@@ -16,7 +16,7 @@ from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import Subject, fit_subject
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
 _USUAL = "humanoid"  # body of a take that names none
@@ -41,11 +41,12 @@ def track_take(
     take = take if isinstance(take, Take) else read_take(take)
     seen = with_names(take, load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    alone = take.start or seen.keypoints or take.markers or take.depth or take.stereo or take.lines or take.skin
+    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    alone = take.start or take.pose or any(sensors)
     if take.silhouettes and not alone:
         raise TakeError(
             "silhouettes alone do not show where the body is to begin with", file=take.path, place="[[silhouette]]",
-            remedy='Add [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
+            remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
         raise TakeError(
@@ -59,9 +60,11 @@ def track_take(
             file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
         )  # fmt: skip
     recording, body = recording_of(take, seen, body)
+    if take.pose is not None:
+        recording = from_afar(recording, body, settings)
     motion = track(
-        recording, body, trial=trial_of(take), height=take.height, size=take.start is None, smooth=smooth,
-        contacts=contacts, lag=lag, noise=noise, settings=settings, progress=progress,
+        recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
+        size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings, progress=progress,
     )  # fmt: skip
     return motion, seen
 

@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
-from kinefit.errors import BodyError, KinefitError, ObservationError
+from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
-from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers
+from kinefit.initialization.from_silhouettes import coarse_to_fine
+from kinefit.motion import UP_AXES
+from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers, SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
+from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.recording import Recording, spread
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
@@ -69,7 +72,7 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
     stereo = load_stereo(take, seen)
     depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
     rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
-    start = None if take.start is None else _start(take, body)
+    start = _motion_start(take, body) if take.start is not None else _posed_start(take, body, seen.frames)
     marked, body = _markers(take, seen, body)
     first, rate = seen.frames[0], seen.rate
     times = np.arange(*seen.frames) / rate
@@ -105,6 +108,18 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
     return recording, body
 
 
+def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) -> Recording:
+    """A recording whose start, which may be tens of degrees off, is fitted to the silhouettes of its step."""
+    if recording.start is None:
+        return recording
+    step, state = recording.start
+    shown = [f for f in recording.steps(step) if isinstance(f, SilhouetteFrame)]
+    if not shown:
+        return recording
+    found = coarse_to_fine(body, recording.rig, shown, state, accuracy=recording.sigma, settings=settings)
+    return replace(recording, start=(step, found.result.state))
+
+
 def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict[str, float]:
     """Standard deviation of every sensor, [m] or [px]."""
     out = {entry.name: entry.sigma for entry in take.depth}
@@ -119,7 +134,42 @@ def _sensor(take: Take, k: int) -> str:
     return "markers" if len(take.markers) == 1 else f"markers {k + 1}"
 
 
-def _start(take: Take, body: Body) -> tuple[int, BodyState]:
+def _posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, BodyState] | None:
+    """Step and state of `[start]`; None where there is none."""
+    pose, tree = take.pose, body.tree
+    if pose is None:
+        return None
+    step = frames[0] if pose.step is None else pose.step
+
+    def wrong(problem: str, remedy: str | None = None) -> TakeError:
+        return TakeError(problem, file=take.path, place="[start]", remedy=remedy)
+
+    if not frames[0] <= step < frames[1]:
+        problem = f"step = {step}, and the take has the steps [{frames[0]}, {frames[1]}]"
+        raise wrong(problem, "Name one of these, or leave it out: the first.")
+    y, x = np.array(pose.upward or UP_AXES[take.up], float), np.array(pose.forward, float)
+    if pose.upward is None:  # upright: forward as far as it is level
+        x = x - (x @ y) * y
+    T = np.eye(4)
+    T[:3, 0] = x / np.linalg.norm(x)
+    z = np.cross(T[:3, 0], y)
+    T[:3, 2] = z / np.linalg.norm(z)
+    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+    T[:3, 3] = pose.at
+    angles = np.array(body.usual_state(T).angles)
+    for name, value in pose.angles.items():
+        if name not in tree.coordinates:
+            raise wrong(choices(f"angle of body '{body.name}'", name, tree.coordinates))
+        k = tree.coordinates.index(name)
+        unit = 1.0 if tree.prismatic[k] else np.pi / 180.0
+        angles[k] = value * unit
+        if not tree.lower[k] - 1e-9 <= angles[k] <= tree.upper[k] + 1e-9:
+            problem = f"{name} = {value:g}, which the body lets go from {tree.lower[k] / unit:g} to"
+            raise wrong(f"{problem} {tree.upper[k] / unit:g}", "Give an angle that it can have.")
+    return step - frames[0], BodyState(T, angles)
+
+
+def _motion_start(take: Take, body: Body) -> tuple[int, BodyState]:
     assert take.start is not None
     motion = read_motion(take.start)
     if len(motion.body.tree.coordinates) != len(body.tree.coordinates):

@@ -199,8 +199,8 @@ class Tracker:
         Raises
         ------
         ObservationError
-            No frame, or a time that is not finite; an image of another size than its camera's; a sensor of one's own
-            whose rows are none of this body.
+            No frame, or a time that is not finite, or farther from the frames' than `TrackSettings.pause`; an image of
+            another size than its camera's; a sensor of one's own whose rows are none of this body.
         CalibrationError, BodyError
             A camera, segment or keypoint set that is not known.
         """

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.sensors.base import Measurement
 from kinefit.subject.keypoints import Subject
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import OwnUnknowns
-from kinefit.subject.surfaces import CylinderShape
+from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording
 
 _SEAT = 0.01  # [m] how far a marker of the body's own set sits from its place on a person
@@ -70,9 +69,8 @@ def unknowns_of(
         elif surfaces or recording.markers:
             found.append((SegmentScales(body), np.zeros(len(body.scale_groups))))
         found += list(keypoints.values())
-        if surfaces and any(isinstance(s, TaperedCylinder) for s in body.surfaces) and not body.skin:
-            shape = CylinderShape(body)
-            found.append((shape, shape.mean))
+        if surfaces:
+            found += [(shape, shape.mean) for shape in shape_of(body)]
         scaled = generic.scaled(subject.scales)
         for name, std in sets.items():
             offsets = PointOffsets(generic, name, std)

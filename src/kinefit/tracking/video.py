@@ -91,9 +91,12 @@ def track(
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
     told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
+    if (family := person.subject.body.family) is not None:
+        told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     motion = motion_of(
         frames, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
         lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
+        found=person.joint,
     )  # fmt: skip
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))

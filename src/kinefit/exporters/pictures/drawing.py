@@ -10,9 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.exporters.skeletons.tubes import side_colour
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
+from kinefit.rendering import Canvas
 
 LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
@@ -59,6 +62,37 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         _line(image, uv[b], LOST if lost else colours[b], width)
     for b in range(len(uv)):
         _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
+
+
+@lru_cache(maxsize=8)
+def _outlined(body: Body) -> Morphing | None:
+    """What draws the outline of a body with a skin or a mesh; None for one of simple shapes."""
+    return Morphing(body) if body.skin or any(isinstance(s, MeshSurface) for s in body.surfaces) else None
+
+
+def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
+    """Draw the fitted body into an image (H, W, 3) uint8 RGB: its bones, and the outlines of a skin or of meshes."""
+    outlined, segments = _outlined(motion.body), motion.body.tree.segments
+    if outlined is None or len(segments) > 1:
+        draw_bones(image, motion, frame, camera, image_frame)
+    if outlined is None:
+        return
+    mesh, vertices = outlined.mesh, outlined.pose(motion.state(frame)).vertices
+    drawn = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True, labels=mesh.face_segment).segment
+    edge, lost = max(1, round(image.shape[0] / 480)), motion.segment_quality[frame] <= 0
+    for s in np.unique(drawn[drawn >= 0]):
+        rims, _ = cv2.findContours((drawn == s).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        for rim in rims:
+            uv = image_frame.from_calibration(np.vstack([rim[:, 0], rim[:1, 0]]).astype(float))
+            _line(image, uv, DARK, 3 * edge)
+            _line(image, uv, LOST if lost[s] else side_colour(segments[s]), edge)
+
+
+def drawn_points(motion: Motion, frame: int) -> NDArray:
+    """(N, 3) [m] in the world what `draw_body` fills: ends of bones, and nodes of a skin or of meshes."""
+    state, outlined = motion.state(frame), _outlined(motion.body)
+    ends = motion.body.positions(state, bones(motion.body)[0])
+    return ends if outlined is None else np.vstack([ends, outlined.pose(state).vertices])
 
 
 def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame: ImageFrame) -> None:

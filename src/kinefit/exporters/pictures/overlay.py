@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_bones, draw_residuals, write_lines
+from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -37,8 +37,9 @@ def write_overlay(
 ) -> None:
     """Write a video (H.264 where the codec is there, else MPEG-4) of every picture with the fit drawn on it.
 
-    Left is blue, right orange, the middle green, a lost segment thin and grey; measured keypoints are yellow rings,
-    those left out as outliers red crosses; pink lines lead to the fitted keypoints.
+    Left is blue, right orange, the middle green, a lost segment thin and grey; of bodies with a skin or a mesh outlines
+    are drawn. Measured keypoints are yellow rings, those left out as outliers red crosses; pink lines lead to the
+    fitted keypoints.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ def draw_overlay(
     if frame is None:
         write_lines(out, [*lines, ("no motion here", _NOTE)])
         return out
-    draw_bones(out, motion, frame, camera, image_frame)
+    draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None:
         draw_residuals(out, residuals, frame, image_frame)
         lines.append((_told(residuals, frame), WHITE))

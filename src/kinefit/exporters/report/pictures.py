@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.pictures.drawing import bones, draw_bones, draw_residuals
+from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report.moments import doubtful_moments
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
@@ -37,11 +37,10 @@ def close_up(
     """The part of a picture (H, W, 3) uint8 RGB that shows the person, with the fit and the keypoints drawn on it."""
     image_frame = image_frame or ImageFrame.identity()
     out = np.array(image, order="C")
-    draw_bones(out, motion, frame, camera, image_frame)
+    draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None and residuals.unit == "px":
         draw_residuals(out, residuals, frame, image_frame)
-    points, _, _ = bones(motion.body)
-    uv = image_frame.from_calibration(camera.project(motion.body.positions(motion.state(frame), points)))
+    uv = image_frame.from_calibration(camera.project(drawn_points(motion, frame)))
     uv = uv[np.isfinite(uv).all(axis=1)]
     size = np.array([out.shape[1], out.shape[0]], float)
     if not len(uv) or np.any(uv.max(axis=0) < 0) or np.any(uv.min(axis=0) > size):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from kinefit.errors import FileError, TakeError, choices
+from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.markers import UNITS
-from kinefit.readers.take.entries import SKIN_SETS
+from kinefit.readers.take.entries import SKIN_SETS, StartEntry
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -53,9 +56,13 @@ def _values(take: Take) -> None:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
         refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
-    if take.start is not None and (take.height is not None or take.subject is not None):
-        key = "height" if take.height is not None else "subject"
-        refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
+    for key in ("height", "subject", "size"):
+        if take.start is not None and getattr(take, key) is not None:
+            refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
+        if take.size is False and key != "size" and getattr(take, key) is not None:
+            refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Leave one of both out.")
+    if take.pose is not None:
+        _pose(take, take.pose, refuse)
     if take.frames is not None and not take.frames[0] < take.frames[1]:
         refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
     for camera in take.cameras:
@@ -107,6 +114,22 @@ def _values(take: Take) -> None:
             refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
     for problem, place, remedy in _odd_depth(take):
         refuse(problem, place, remedy)
+
+
+def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:
+    """Refuse a start that is none."""
+    if take.start is not None:
+        refuse("[start] has no use with start = ... in [take]", "[start]", "Leave one of both out.")
+    up = np.array(pose.upward or UP_AXES[take.up], float)
+    numbers = np.concatenate([pose.at, pose.forward, up, list(pose.angles.values())])
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e6:
+        refuse("numbers that are no place, direction or angle", "[start]", "Give metres, directions and degrees.")
+    lengths = float(np.linalg.norm(pose.forward)) * float(np.linalg.norm(up))
+    if not float(np.linalg.norm(np.cross(pose.forward, up))) > 1e-6 * max(lengths, 1e-12):
+        refuse(
+            f"forward = {list(pose.forward)} and upward = {up.tolist()} are along one line", "[start]",
+            "Give two directions that differ: where the root's x and y look in the world.",
+        )  # fmt: skip
 
 
 def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:

@@ -25,6 +25,16 @@ RENAMED: dict[str, dict[str, str]] = {
 """{table: {old key: new key}}: old keys are read with a warning in this version, and are unknown in the next."""
 
 
+class StartEntry(_Entry, frozen=True, kw_only=True):
+    """`[start]`: where the body is at one step, for sensors that alone cannot find it."""
+
+    at: tuple[float, float, float]  # [m] of the root's origin in the world
+    forward: tuple[float, float, float]  # direction in the world in which the root's x looks
+    upward: tuple[float, float, float] | None = None  # and its y; default: the take's `up`
+    angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
+    step: int | None = None  # of the common time; default: the first
+
+
 class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
@@ -143,4 +153,5 @@ class _Head(_Entry, frozen=True, kw_only=True):
     height: float | None = None
     subject: Path | None = None
     start: Path | None = None
+    size: bool | None = None
     frames: tuple[int, int] | None = None

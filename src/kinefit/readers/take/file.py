@@ -23,6 +23,7 @@ from kinefit.readers.take.entries import (
     LinesEntry,
     MarkersEntry,
     SilhouetteEntry,
+    StartEntry,
     StereoEntry,
     _Entry,
     _Head,
@@ -36,6 +37,7 @@ __all__ = [
     "LinesEntry",
     "MarkersEntry",
     "SilhouetteEntry",
+    "StartEntry",
     "StereoEntry",
     "Take",
     "read_take",
@@ -44,6 +46,7 @@ __all__ = [
 
 class _File(_Entry, frozen=True, kw_only=True):
     take: _Head = _Head()
+    start: StartEntry | None = None
     calibration: CalibrationEntry | None = None
     camera: tuple[CameraEntry, ...] = ()
     keypoints: tuple[KeypointsEntry, ...] = ()
@@ -55,11 +58,13 @@ class _File(_Entry, frozen=True, kw_only=True):
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
-    "take": _Head, "calibration": CalibrationEntry, "camera": CameraEntry, "keypoints": KeypointsEntry,
-    "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry, "silhouette": SilhouetteEntry,
-    "lines": LinesEntry,
+    "take": _Head, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
+    "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
+    "silhouette": SilhouetteEntry, "lines": LinesEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
+
+_ONCE = ("take", "start", "calibration")
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,10 @@ class Take:
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
         Motion file (`motion.npz`) that gives body and pose of the first step; None: they are sought.
+    pose : StartEntry or None
+        Where the body is at one step.
+    size : bool or None
+        Whether the body is fitted to the person's size and shape; None: unless `start` tells it.
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
@@ -107,6 +116,8 @@ class Take:
     stereo: tuple[StereoEntry, ...] = ()
     silhouettes: tuple[SilhouetteEntry, ...] = ()
     start: Path | None = None
+    pose: StartEntry | None = None
+    size: bool | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
 
@@ -150,6 +161,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
+        pose=content.start, size=head.size,
     )  # fmt: skip
     check_take(take)
     return take
@@ -185,7 +197,7 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
     for table, content in raw.items():
         if table not in TABLES:
             raise TakeError(choices("sensor or table", table, TABLES), file=path, place=f"[{table}]")
-        many = table not in ("take", "calibration")
+        many = table not in _ONCE
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
             raise TakeError(f"'{table}' is not a table {wanted}", file=path, place=table, remedy=f"Write {wanted}.")

@@ -1,0 +1,61 @@
+"""Extrinsics that silhouettes, depth images and clouds of points tell, beside markers that hold the world."""
+
+import numpy as np
+import pytest
+from tests.sensors.scenes import ring
+from tests.subject import measured
+
+from kinefit.bodies.surfaces import sample
+from kinefit.frame.routing import Sensors
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.observations import DepthFrame, PointCloud, SilhouetteFrame
+from kinefit.rendering import render_body
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.subject.fit import fit_subject
+from kinefit.subject.sensor_parameters import CameraExtrinsics
+
+BODY = measured.HUMANOID
+
+
+def turned(rig, degrees=0.5):
+    """Every camera turned about an axis of its own."""
+    random = np.random.default_rng(4)
+    twists = np.zeros((len(rig), 6))
+    axes = random.normal(size=(len(rig), 3))
+    twists[:, 3:] = np.radians(degrees) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    return Rig(tuple(c.with_pose(se3.exp(t) @ c.T_camera_world) for c, t in zip(rig, twists))), twists
+
+
+def frame(kind, state, camera, known, time):
+    """What a camera sees where it stands, told as if it stood where it is `known`."""
+    if kind == "cloud":
+        x, n, segment = (np.asarray(a) for a in sample(BODY, 1500))
+        f = Scene(BODY, state, Rig(())).frames[segment]
+        R = f[:, :9].reshape(-1, 3, 3)
+        x, n = np.einsum("nij,nj->ni", R, x) + f[:, 9:], np.einsum("nij,nj->ni", R, n)
+        x = x[np.sum(n * (camera.centre_world - x), axis=1) > 0]
+        T = known.T_world_camera @ camera.T_camera_world
+        return PointCloud(camera.name, time, x @ T[:3, :3].T + T[:3, 3], known.centre_world, on_body=True)
+    drawn = render_body(BODY, state, camera)
+    if kind == "silhouette":
+        return SilhouetteFrame(camera.name, time, drawn.seen.copy())
+    return DepthFrame(camera.name, time, np.where(np.isfinite(drawn.depth), drawn.depth, 0.0))
+
+
+@pytest.mark.parametrize("kind", ["silhouette", "depth", "cloud"])
+def test_cameras_that_are_turned_by_half_a_degree_come_back(kind):
+    known = ring(2, away=2.5)
+    known = Rig(tuple(c.with_pose(c.T_camera_world @ se3.exp([0, 0.9, 0, 0, 0, 0])) for c in known))
+    rig, twists = turned(known)
+    states = measured.people(4)
+    sensors = Sensors(known, 10.0, {f"silhouette {n}": 1.0 for n in known.names}, TrackSettings(), on_body=known.names)
+    steps = measured.markers(BODY, states, points="HANIM_45")
+    for k, (state, step) in enumerate(zip(states, steps)):
+        frames = [frame(kind, state, *pair, k / 10) for pair in zip(rig, known)]
+        step += sensors.measurements(frames, Scene(BODY, state, known, time=k / 10))
+    found = fit_subject(BODY, known, steps, states, [CameraExtrinsics(known, None, (1e-3, 0.01))], rounds=4)
+    away = np.abs(found.mean - twists.ravel()).reshape(-1, 6)[:, 3:]
+    assert np.degrees(away).max() < 0.1
+    assert np.degrees(found.std.reshape(-1, 6)[:, 3:]).max() < 0.2
