@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kinefit.calibration.check.check import Check
-from kinefit.calibration.check.sensor_verdicts import marker_index, marker_lines, misfits, moved_cameras, told
-from kinefit.calibration.check.sensors import SensorFit, fit_sensors
+from kinefit.calibration.check.sensor_fit import SensorFit, marker_index
+from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, told
+from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
 from kinefit.geometry.camera import Rig
 
@@ -24,15 +25,22 @@ class Refined:
     Parameters
     ----------
     cameras : Refinement of the cameras with keypoints; None where they stay as they are.
-    sensors : depth cameras and marker systems that are moved.
+    sensors : depth cameras and marker systems that do not fit.
     """
 
     cameras: Refinement | None
     sensors: tuple[SensorFit, ...]
 
+    @property
+    def moved(self) -> tuple[SensorFit, ...]:
+        """Sensors of which it is sure where they belong: they alone are moved."""
+        return tuple(fit for fit in self.sensors if not fit.doubts)
+
     def told(self) -> list[str]:
         """The result in plain words, a line each."""
-        stay = "The videos' cameras stay: nothing is wrong with them, and the sensors below are moved to fit them."
+        stay = "The videos' cameras stay: nothing is wrong with them."
+        if self.moved:
+            stay = f"{stay[:-1]}, and {' and '.join(f.sensor for f in self.moved)} is moved to fit them."
         lines = self.cameras.told() if self.cameras is not None else [stay]
         return [*lines, *(told(fit) for fit in self.sensors)]
 
@@ -89,8 +97,8 @@ def write_refined(found: Check, refined: Refined, path: Path, *, copy: bool) -> 
 
     assert found.take is not None and found.take.calibration is not None and found.observations is not None
     take, old, text = found.take, found.take.calibration, path.read_text("utf-8")
-    markers = {marker_index(fit): marker_lines(fit, take) for fit in refined.sensors if fit.kind == "markers"}
-    moved = moved_cameras(refined.sensors, take, found.observations.rig or Rig(()))
+    markers = {marker_index(fit.sensor): marker_lines(fit, take) for fit in refined.moved if fit.kind == "markers"}
+    moved = moved_cameras(refined.moved, take, found.observations.rig or Rig(()))
     rig = Rig((*(refined.cameras.rig if refined.cameras is not None else ()), *moved))
     new = free_name(old.file)
     if len(rig):
@@ -111,7 +119,7 @@ def write_refined(found: Check, refined: Refined, path: Path, *, copy: bool) -> 
             value = f"{entry.time_offset + late[entry.name]:.6f}"
             _screen.say(f"And time_offset = {value} into [[camera]] {entry.name}.")
             text = with_keys(text, "camera", number, {"time_offset": value})
-    if copy:
+    if copy and (len(rig) or refined.moved):
         beside = free_name(path)
         write_text(beside, text)
         _screen.say(f"Written: {beside}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,11 +87,13 @@ class SensorFrames:
     Parameters
     ----------
     sensors : names
-    std : (3,) standard deviations of the shift [m] of a frame's centre, of its turn [rad] and of its clock [s].
+    std : (3,) standard deviations of the shift [m] of a frame's origin, of its turn [rad] and of its clock [s].
+    arms : {sensor: (3,) [m]} from the centre about which its frame turns to that origin; default: it is the centre.
     """
 
     sensors: tuple[str, ...]
-    std: tuple[float, float, float] = (0.3, 0.09, 0.02)
+    std: tuple[float, float, float] = (0.1, 0.087, 0.02)
+    arms: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not min(self.std) > 0:
@@ -110,7 +112,12 @@ class SensorFrames:
     @property
     def information(self) -> NDArray:
         """(7 S, 7 S)."""
-        return np.diag(np.tile(np.repeat(self.std, (3, 3, 1)), len(self.sensors)) ** -2.0)
+        out = np.zeros((len(self.names), len(self.names)))
+        for k, sensor in enumerate(self.sensors):
+            A = np.eye(7)
+            A[:3, 3:6] = -se3.hat(self.arms.get(sensor, np.zeros(3)))  # shift of the origin
+            out[7 * k : 7 * k + 7, 7 * k : 7 * k + 7] = A.T @ np.diag(np.repeat(self.std, (3, 3, 1)) ** -2.0) @ A
+        return out
 
     @property
     def step(self) -> NDArray:

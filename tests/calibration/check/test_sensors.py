@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from kinefit.calibration.check.sensor_fit import SensorFit
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
-from kinefit.calibration.check.sensors import SensorFit
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.take.entries import DepthEntry, MarkersEntry

@@ -17,8 +17,9 @@ from kinefit.calibration.check.frames import frame_findings
 from kinefit.calibration.check.loading import load_leniently
 from kinefit.calibration.check.person import size_findings, stature, upright_findings
 from kinefit.calibration.check.scene import Coverage, coverage, coverage_findings, lens_findings, placement_findings
+from kinefit.calibration.check.sensor_fit import SensorFit
 from kinefit.calibration.check.sensor_verdicts import sensor_findings
-from kinefit.calibration.check.sensors import SensorFit, fit_sensors
+from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.calibration.check.timing import TimeOffsets, fast_pixels, shifted, time_offsets
 from kinefit.calibration.check.verdicts import bias_findings, explained, side_findings, time_findings
 from kinefit.calibration.check.views import Views, make_views, meet, with_sides_right

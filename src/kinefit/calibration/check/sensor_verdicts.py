@@ -8,26 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit.calibration.check.findings import Finding
-from kinefit.calibration.check.sensors import SensorFit
+from kinefit.calibration.check.sensor_fit import SURE, SensorFit, marker_index
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import Take
-
-SURE = 3.0
-"""Standard deviations, per degree of freedom, from which a sensor does not fit: chance alone exceeds it in fewer than
-one of 10^8 takes, and those of the benchmark without misfit reach half of it."""
-
-MATTERS = np.radians(0.5), 0.015
-"""[rad], [m] of which one must be exceeded: less is what calibrations usually are off by. Two cameras, each wrong by
-0.1 degree about and 3 mm along each axis, see a person 4 m away 8 mm off, and hardly ever 15 mm."""
 
 _LATE = 0.01  # [s] by which a clock must be off: 1 cm of somebody who walks
 
 
 def misfits(fits: Iterable[SensorFit]) -> tuple[SensorFit, ...]:
     """Those that surely do not fit, by more than is usual."""
-    return tuple(f for f in fits if f.deviations > SURE and (f.turn > MATTERS[0] or f.shift > MATTERS[1]))
+    return tuple(f for f in fits if f.misfit)
 
 
 def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
@@ -36,7 +28,13 @@ def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
     for fit in fits:
         told = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
         sure = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
-        if fit in wrong and fit.kind == "depth":
+        if fit in wrong and fit.doubts:
+            may = "does not fit the videos" if fit.falls else "may not fit the videos"
+            text = f"{fit.sensor} {may}: it seems off by {told} at the person."
+            unsure = f"Where it belongs is not sure, because {'; '.join(fit.doubts)}."
+            remedy = "Calibrate it together with the videos, or record a person who walks and turns nearer to it."
+            out.append(Finding("fault" if fit.falls else "doubt", "sensor", text, (fit.sensor,), unsure, remedy))
+        elif fit in wrong and fit.kind == "depth":
             text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {told} at the person."
             remedy = f"Run: kinefit check {file} --refine --take (moves it), or calibrate it together with the videos."
             out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
@@ -63,7 +61,9 @@ def amount(fit: SensorFit) -> str:
 
 
 def told(fit: SensorFit) -> str:
-    """What a refinement does to a sensor, in one line."""
+    """What a refinement does to a sensor, or why it does nothing, in one line."""
+    if fit.doubts:
+        return f"{fit.sensor}: not refined, because {'; '.join(fit.doubts)}."
     turn, bar = np.degrees(fit.turn), np.degrees(fit.bars[1])
     return f"{fit.sensor}: turned {turn:.2f} ± {bar:.2f}°, moved {amount(fit)} at the person (95 %)"
 
@@ -86,13 +86,7 @@ def moved_cameras(fits: Iterable[SensorFit], take: Take, rig: Rig) -> Rig:
 
 def marker_entry(fit: SensorFit, take: Take) -> MarkersEntry:
     """The table of a marker system in the take."""
-    return take.markers[marker_index(fit)]
-
-
-def marker_index(fit: SensorFit) -> int:
-    """Which of the take's [[markers]] it is."""
-    number = fit.sensor.removeprefix("markers").strip()
-    return int(number) - 1 if number else 0
+    return take.markers[marker_index(fit.sensor)]
 
 
 def marker_lines(fit: SensorFit, take: Take) -> tuple[str, str]:

@@ -6,9 +6,8 @@ and detectors' places and the frames of the other sensors are then fitted togeth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
+from kinefit.calibration.check.sensor_fit import PRIOR, SensorFit, doubts_of, marker_index
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
@@ -25,9 +26,9 @@ from kinefit.motion import Motion
 from kinefit.observations import DepthFrame, MarkerFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.sensors.base import Measurement, matched_by, rows_at
+from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.displaced import AXES, CLOCK, Displaced, displacement
+from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -55,56 +56,8 @@ _DETECTOR = 0.005  # [m] by which a detector's points may stand elsewhere than t
 # alike: RMS errors of three simulated Anny people (draws 100 to 102 of `benchmarks.mixed_misfit`).
 _SURFACE, _UPRIGHT = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0]), 0.01
 _SETTINGS = TrackSettings(through=np.inf)  # with free space two heights were off by 8 and 21 mm, without by 7 and 17
-_HEIGHTS, _NEAR = np.linspace(-0.06, 0.06, 9), 0.05  # [m] that are tried, and at which a distance counts in full
-_INSIDE, _DRAWS = 0.95, 4000  # share of errors within the bars that are stated; numbers drawn for that
-
-
-@dataclass(frozen=True, eq=False)
-class SensorFit:
-    """How a sensor's frame lies against the world of the videos.
-
-    Parameters
-    ----------
-    sensor : name
-    kind : "depth" or "markers"
-    twist : (7,) [m, rad, s] shift of the centre, rotation vector, and clock: what must be done to the sensor.
-    covariance : (7, 7) of them
-    centre : (3,) [m] about which it turns, the middle of where the person was
-    """
-
-    sensor: str
-    kind: str
-    twist: NDArray
-    covariance: NDArray
-    centre: NDArray
-
-    @property
-    def T(self) -> NDArray:
-        """(4, 4) x_world = T x, of a point x as the sensor's frame is stated to place it."""
-        return displacement(dict(zip(AXES, self.twist)), self.centre)
-
-    @property
-    def shift(self) -> float:
-        """[m] in the middle of where the person was."""
-        return float(np.linalg.norm(self.twist[:3]))
-
-    @property
-    def turn(self) -> float:
-        """[rad]."""
-        return float(np.linalg.norm(self.twist[3:6]))
-
-    @cached_property
-    def bars(self) -> tuple[float, float]:
-        """[m], [rad] within which 95 % of the errors of shift and turn have their length."""
-        z = np.random.default_rng(0).standard_normal((_DRAWS, 7)) @ np.linalg.cholesky(self.covariance).T
-        shift, turn = (np.linalg.norm(z[:, part], axis=1) for part in (slice(3), slice(3, 6)))
-        return float(np.quantile(shift, _INSIDE)), float(np.quantile(turn, _INSIDE))
-
-    @property
-    def deviations(self) -> float:
-        """How many standard deviations the six of shift and turn are from none, per degree of freedom."""
-        moved, C = self.twist[:6], self.covariance[:6, :6]
-        return float(np.sqrt(moved @ np.linalg.solve(C, moved) / 6.0))
+_WIDE = replace(_SETTINGS, reach=0.45, render_every=1)  # [m] about the person where a sensor may be 3 of 10 cm off
+_CLOCK = 0.02  # [s] standard deviation of a clock
 
 
 def fit_sensors(
@@ -140,21 +93,12 @@ def fit_sensors(
     channels = make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
     person = fit_person(body, channels, height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
-    problem = _Problem(recording, motion, person, frozenset(depth))
+    systems = {f.sensor for step in map(recording.steps, range(len(recording.times))) for f in step} - depth
+    origins = {name: recording.rig[name].centre_world for name in depth}
+    origins |= {name: take.markers[marker_index(name)].T_world_file[:3, 3] for name in systems}
+    problem = _Problem(recording, motion, person, frozenset(depth), origins)
     chosen = problem.chosen(frames)
-    if len(chosen) < _FEWEST:
-        return ()
-    found, centre = problem.fitted(chosen)
-    out = []
-    for sensor in problem.names:
-        k = found.names.index(f"{sensor} {AXES[0]}")
-        own = slice(k, k + 7)
-        C, kind = found.covariance[own, own], "depth" if sensor in depth else "markers"
-        if sensor in depth:
-            up = np.append(recording.up_axis, np.zeros(4))
-            C = C + np.diag(_SURFACE**2) + _UPRIGHT**2 * np.outer(up, up)
-        out.append(SensorFit(sensor, kind, found.mean[own], C, centre))
-    return tuple(out)
+    return problem.fits(chosen) if len(chosen) >= _FEWEST else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,21 +115,34 @@ class _Look:
 class _Problem:
     """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
 
-    def __init__(self, recording: Recording, motion: Motion, person: Person, depth: frozenset[str]) -> None:
+    def __init__(
+        self, recording: Recording, motion: Motion, person: Person, depth: frozenset[str], origins: dict[str, NDArray]
+    ) -> None:
         self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
-        self.person = person
+        self.person, self.origins, self.centre = person, origins, np.zeros(3)
         self.body: Body = motion.body
         channels = make_channels(
             self.body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma
         )
         self.layout = Layout(channels, self.body)
         self.first = round((motion.times[0] - recording.times[0]) * recording.rate)
+        self.sensors, self.wide = self.prepared(_SETTINGS), self.prepared(_WIDE)
         s = self.settings
-        self.sensors = Sensors(recording.rig, recording.rate, recording.sigma, s, on_body=recording.on_body)
-        for name, empty in recording.backgrounds.items():
-            self.sensors.know_background(name, empty)
         self.pixels = KeypointSensor(recording.rig, {}, s.pixel, s.loss, s.near)
         self.names: tuple[str, ...] = ()
+
+    def prepared(self, settings: TrackSettings) -> Sensors:
+        """The sensors, who know what is seen without the person."""
+        of = self.recording
+        out = Sensors(of.rig, of.rate, of.sigma, settings, on_body=of.on_body)
+        for name, empty in of.backgrounds.items():
+            out.know_background(name, empty)
+        return out
+
+    def look(self, frame: int) -> _Look:
+        """A frame of the motion."""
+        time = float(self.recording.times[frame + self.first])
+        return _Look(frame, self.seen(frame), self.motion.state(frame), time, self.velocity(frame))
 
     def seen(self, frame: int) -> list[Any]:
         """What the sensors saw in a frame of the motion."""
@@ -200,61 +157,94 @@ class _Problem:
         some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
         return some[spread(len(some), most)]
 
-    def fitted(self, chosen: NDArray) -> tuple[Subject, NDArray]:
-        """The fit of everything, and the centre (3,) [m] of the sensors' frames."""
-        motion = self.motion
-        states = [motion.state(int(f)) for f in chosen]
-        velocities = [self.velocity(int(f)) for f in chosen]
-        times = [float(self.recording.times[int(f) + self.first]) for f in chosen]
-        frames = [self.seen(int(f)) for f in chosen]
-        self.names = tuple(dict.fromkeys(f.sensor for seen in frames for f in seen))
-        centre = np.mean([motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
-        place = SensorFrames(self.names)
-        looks = [_Look(*each) for each in zip(chosen.tolist(), frames, states, times, velocities)]
-        few = [looks[k] for k in spread(len(looks), _COARSE)]
-        nothing = np.zeros(len(place.names))
-        coarse = self.fit(few, centre, {}, [place], nothing, reach=_FAR, rounds=len(_FAR), looks=1.0)
-        few = [replace(look, state=state) for look, state in zip(few, coarse.states)]
-        values = {name: dict(own) for name, own in coarse.values.items()}
-        for sensor in self.depth & set(self.names):
-            raised = self.height(sensor, few, centre, values) * self.recording.up_axis
-            for axis, shift in zip(AXES, raised):
-                values[sensor][axis] += float(shift)
-        parameters = [*self.parameters(frames), place]
-        moved = [values[name][what] for name in self.names for what in (*AXES, CLOCK)]
-        start = np.concatenate([*(p.mean for p in parameters[:-1]), moved])
-        return self.fit(looks, centre, values, parameters, start, rounds=_ROUNDS), centre
+    def fits(self, chosen: NDArray) -> tuple[SensorFit, ...]:
+        """How the sensors lie, by frames of the motion; those that do not fit by each half of the frames too."""
+        looks = [self.look(int(f)) for f in chosen]
+        self.names = tuple(dict.fromkeys(f.sensor for look in looks for f in look.seen))
+        self.centre = np.mean([self.motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
+        self.place = SensorFrames(
+            self.names, (*PRIOR, _CLOCK), {name: self.origins[name] - self.centre for name in self.names}
+        )
+        near, ends = self.coarse(looks)
+        out = [self.with_surface(fit) for fit in self.fitted(looks, near)]
+        if any(fit.misfit for fit in out):
+            a, b = (self.fitted(looks[k::2], near) for k in range(2))
+            out = [self.judged(looks, fit, (a[k], b[k]), ends.get(fit.sensor)) for k, fit in enumerate(out)]
+        return tuple(out)
 
-    def height(self, sensor: str, looks: Sequence[_Look], centre: NDArray, values: Any) -> float:
-        """[m] by which a depth sensor is to be raised, so that its points lie nearest to the surface.
+    def with_surface(self, fit: SensorFit) -> SensorFit:
+        """A fit whose covariance counts what the surface leaves wrong in all frames alike."""
+        if fit.kind != "depth":
+            return fit
+        up = np.append(self.recording.up_axis, np.zeros(4))
+        return replace(fit, covariance=fit.covariance + np.diag(_SURFACE**2) + _UPRIGHT**2 * np.outer(up, up))
 
-        Correspondences slide along a standing person: matched and solved in turn, heights come 3 % nearer in a round.
-        So heights are tried, and the smallest truncated distances of all points, with new correspondences, are found.
-        """
+    def judged(
+        self, looks: Sequence[_Look], fit: SensorFit, halves: tuple[SensorFit, SensorFit], ends: Ends | None
+    ) -> SensorFit:
+        """A fit whose bars hold what two halves of the frames disagree by, and why it is not to be used."""
+        if not fit.misfit:
+            return fit
+        half = 0.5 * apart(*(each.twist for each in halves))
+        falls = self.registration(fit.sensor, looks).above(np.zeros(7), fit.twist)
+        wide = replace(fit, covariance=fit.covariance + np.outer(half, half), falls=falls)
+        rivals = ends.rivals if ends is not None else ()
+        return replace(wide, doubts=doubts_of(wide, self.origins[fit.sensor], halves, rivals))
+
+    def coarse(self, looks: Sequence[_Look]) -> tuple[dict[str, NDArray], dict[str, Ends]]:
+        """Twists (7,) of all sensors near the truth; of depth sensors where all starts ended."""
+        ends = {}
+        for sensor in self.names:
+            if sensor in self.depth:
+                own = self.registration(sensor, looks)
+                first = starts(self.origins[sensor], self.centre, PRIOR)
+                ends[sensor] = Ends(own, tuple(own.settled(twist, (*FAR, *FINE)) for twist in first))
+        near = {sensor: end.best for sensor, end in ends.items()}
+        named = tuple(name for name in self.names if name not in near)
+        if named:
+            few = [looks[k] for k in spread(len(looks), _COARSE)]
+            few = [replace(look, seen=[f for f in look.seen if f.sensor in named]) for look in few]
+            place = replace(self.place, sensors=named)
+            found = self.fit(few, {}, [place], np.zeros(len(place.names)), reach=_FAR, rounds=len(_FAR), looks=1.0)
+            near |= {name: twist_of(found.values[name]) for name in named}
+        return near, ends
+
+    def registration(self, sensor: str, looks: Sequence[_Look]) -> Registration:
+        """What one sensor saw in frames, with the poses of the keypoints alone."""
         own = [replace(look, seen=[f for f in look.seen if f.sensor == sensor]) for look in looks]
-        steps = self.measured(own, centre, values)
-        cost = np.zeros(len(_HEIGHTS))
-        for k, raised in enumerate(_HEIGHTS):
-            shift = dict(zip(AXES, raised * self.recording.up_axis))
-            there = {sensor: {what: v + shift.get(what, 0.0) for what, v in values[sensor].items()}}
-            for several, look in zip(steps, own):
-                scene = Scene(self.body, look.state, self.recording.rig, time=look.time, values=there)
-                for m in several:
-                    if m.sensor == sensor:
-                        r = rows_at(matched_by(m, scene, _NEAR), scene)[0].residual
-                        cost[k] += float(np.sum(np.minimum(np.square(r), _NEAR**2) - _NEAR**2))
-        least = int(np.clip(np.argmin(cost), 2, len(_HEIGHTS) - 3))
-        a, b, _ = np.polyfit(_HEIGHTS[least - 2 : least + 3], cost[least - 2 : least + 3], 2)
-        best = -0.5 * b / a if a > 0.0 else _HEIGHTS[least]
-        return float(np.clip(best, _HEIGHTS[0], _HEIGHTS[-1]))
+        own = [look for look in own if look.seen]
+        scenes = [
+            Scene(self.body, look.state, self.recording.rig, time=look.time, velocity=look.velocity,
+                  samples=self.settings.samples) for look in own
+        ]  # fmt: skip
+        place = replace(self.place, sensors=(sensor,))
+        return Registration(sensor, self.measured(own, {}, self.wide), scenes, self.centre, place.information[:6, :6])
+
+    def fitted(self, looks: Sequence[_Look], near: Mapping[str, NDArray]) -> list[SensorFit]:
+        """The fit of everything in some frames, from twists (7,) of the sensors."""
+        twists = dict(near)
+        for sensor in self.depth & set(self.names):
+            own = self.registration(sensor, looks)
+            twists[sensor] = own.height(own.settled(twists[sensor], FINE), self.recording.up_axis)
+        parameters = [*self.parameters([look.seen for look in looks]), self.place]
+        start = np.concatenate([*(p.mean for p in parameters[:-1]), *(twists[name] for name in self.names)])
+        values = {name: values_of(twist) for name, twist in twists.items()}
+        found = self.fit(looks, values, parameters, start, rounds=_ROUNDS)
+        out = []
+        for sensor in self.names:
+            k = found.names.index(f"{sensor} {AXES[0]}")
+            part = slice(k, k + 7)
+            C, kind = found.covariance[part, part], "depth" if sensor in self.depth else "markers"
+            out.append(SensorFit(sensor, kind, found.mean[part], C, self.centre))
+        return out
 
     def fit(
-        self, some: Sequence[_Look], centre: NDArray, values: Any, parameters: Sequence[Parameters], start: NDArray,
-        **options: Any,
+        self, some: Sequence[_Look], values: Mapping[str, Mapping[str, float]], parameters: Sequence[Parameters],
+        start: NDArray, **options: Any,
     ) -> Subject:  # fmt: skip
         """Parameters of some frames from a start, at which the sensors have `values`."""
         return fit_subject(
-            self.body, self.recording.rig, self.measured(some, centre, values), [look.state for look in some],
+            self.body, self.recording.rig, self.measured(some, values, self.sensors), [look.state for look in some],
             parameters, start=start, times=[look.time for look in some],
             velocities=[look.velocity for look in some], loss=self.settings.loss, **options,
         )  # fmt: skip
@@ -272,16 +262,16 @@ class _Problem:
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         return out + [PointOffsets(self.body, name, _DETECTOR) for name in self.layout.channels.sets]
 
-    def measured(self, looks: Sequence[_Look], centre: NDArray, values: Any) -> list[list[Measurement]]:
+    def measured(self, looks: Sequence[_Look], values: Any, sensors: Sensors) -> list[list[Measurement]]:
         """What was measured in each frame, prepared about the body where the sensors' frames have it."""
         channels, out = self.layout.channels, []
         for look in looks:
             several: list[Measurement] = []
             for frame in look.seen:
-                T = displacement(values.get(frame.sensor, {}), centre)
+                T = displacement(values.get(frame.sensor, {}), self.centre)
                 there = BodyState(se3.inverse(T) @ look.state.T_world_root, look.state.angles)
                 scene = Scene(self.body, there, self.recording.rig, time=look.time, samples=self.settings.samples)
-                several += [Displaced(m, centre) for m in self.sensors.measurements([frame], scene)]
+                several += [Displaced(m, self.centre) for m in sensors.measurements([frame], scene)]
             k = look.frame + self.first
             pixels = channels.uv[k], channels.confidence[k]
             several.append(KeypointMeasurement(self.pixels, self.layout, *pixels, look.time))
