@@ -90,3 +90,13 @@ def test_a_fit_finds_the_frame_where_another_sensor_holds_the_world():
 def test_standard_deviations_above_zero_are_asked_for():
     with pytest.raises(ObservationError, match="above 0"):
         SensorFrames(("markers",), std=(0.3, 0.0, 0.02))
+
+
+def test_a_prior_about_the_origin_holds_what_lies_far_away_less_firmly():
+    arm = np.array([0.0, 0.0, 3.0])
+    place = SensorFrames(("markers",), std=(0.1, 0.087, 0.02), arms={"markers": arm})
+    C = np.linalg.inv(place.information)
+    np.testing.assert_allclose(np.sqrt(np.diag(C)[:3]), [np.hypot(0.1, 3.0 * 0.087)] * 2 + [0.1])
+    turn = np.array([0.02, 0.0, 0.0])
+    twist = np.concatenate([-np.cross(turn, arm), turn, [0.0]])  # the origin stays
+    assert twist @ place.information @ twist == pytest.approx((0.02 / 0.087) ** 2)

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.sensor_fit import SensorFit
+from kinefit.calibration.check.sensor_fit import SensorFit, doubts_of
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
+from kinefit.cli._check_refine import Refined
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.take.entries import DepthEntry, MarkersEntry
@@ -69,6 +70,30 @@ def test_a_moved_camera_has_the_calibrations_name_and_sees_where_it_should():
     x = np.array([0.3, 0.2, 2.0])
     assert moved.name == "kinect"
     np.testing.assert_allclose(moved.project(se3.apply(one.T, x)), camera.project(x), atol=1e-9)
+
+
+def test_a_sensor_is_moved_only_where_nothing_speaks_against_it():
+    one, origin = fit(x=0.03, ry=0.05), np.array([0.0, 1.0, 3.0])
+    halves = one, fit(x=0.031, ry=0.05)
+    why = lambda *args: "; ".join(doubts_of(*args))
+    assert why(one, origin, halves, (np.zeros(7),)) == ""
+    assert "another place, 1.1° and 0 mm from there" in why(one, origin, halves, (fit(ry=0.02).twist,))
+    assert "no nearer" in why(replace(one, falls=False), origin, halves)
+    assert "more than 30 cm or 15°" in why(fit(x=0.31), origin, halves)
+    assert "more than 30 cm or 15°" in why(fit(ry=0.11), origin, halves)  # 3 m from what it sees
+    assert "two halves of the frames disagree by 5.2" in why(one, origin, (one, fit(x=0.06, z=0.02, ry=0.05)))
+    assert "it may fit" in why(replace(one, covariance=1e2 * one.covariance), origin, halves)
+
+
+def test_a_doubtful_sensor_is_named_and_not_refined():
+    for falls, severity in ((True, "fault"), (False, "doubt")):
+        one = replace(fit(x=0.03), falls=falls, doubts=("two halves disagree",))
+        (found,) = sensor_findings([one], DEPTH)
+        assert (found.severity, found.cameras) == (severity, ("depth",))
+        assert "--refine" not in found.remedy
+        assert "because two halves disagree." in found.confidence
+        assert told(one) == "depth: not refined, because two halves disagree."
+        assert Refined(None, (one, fit("markers", "markers", x=0.03))).moved[0].sensor == "markers"
 
 
 def test_lines_of_markers_go_on_from_those_that_are_there():

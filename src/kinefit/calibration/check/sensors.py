@@ -198,7 +198,8 @@ class _Problem:
             if sensor in self.depth:
                 own = self.registration(sensor, looks)
                 first = starts(self.origins[sensor], self.centre, PRIOR)
-                ends[sensor] = Ends(own, tuple(own.settled(twist, (*FAR, *FINE)) for twist in first))
+                rest = [own.settled(twist, (*FAR, *FINE)) for twist in first]
+                ends[sensor] = Ends(own, tuple(own.height(twist, self.recording.up_axis) for twist in rest))
         near = {sensor: end.best for sensor, end in ends.items()}
         named = tuple(name for name in self.names if name not in near)
         if named:
