@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
-from kinefit.calibration.check.sensor_fit import PRIOR, SensorFit, doubts_of, marker_index
+from kinefit.calibration.check.sensor_fit import PRIOR, SensorFit, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
@@ -39,7 +39,7 @@ from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.take_recording import marker_sensor, recording_of
 from kinefit.tracking.video import track
 
 FRAMES = 12
@@ -93,9 +93,8 @@ def fit_sensors(
     channels = make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
     person = fit_person(body, channels, height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
-    systems = {f.sensor for step in map(recording.steps, range(len(recording.times))) for f in step} - depth
     origins = {name: recording.rig[name].centre_world for name in depth}
-    origins |= {name: take.markers[marker_index(name)].T_world_file[:3, 3] for name in systems}
+    origins |= {marker_sensor(take, k): entry.T_world_file[:3, 3] for k, entry in enumerate(take.markers)}
     problem = _Problem(recording, motion, person, frozenset(depth), origins)
     chosen = problem.chosen(frames)
     return problem.fits(chosen) if len(chosen) >= _FEWEST else ()
