@@ -170,10 +170,12 @@ def record(draw: int, frames: int = round(RATE * SECONDS)) -> Recording:
     return Recording(truth, both, told, detected(truth, both, draw), masks, depth, empty, _markers(truth, random))
 
 
-def detected(truth: Motion, rig: Rig, draw: int, outliers: float = 0.1) -> NDArray:
-    """(4, F, 33, 3) points and visibility, as MediaPipe gives them."""
-    cameras = Rig(tuple(rig[name] for name in CAMERAS))
-    seen = simulate_keypoints(truth, cameras, DETECTOR, drift_px=2.0, outliers=outliers, seed=draw)
+def detected(
+    truth: Motion, rig: Rig, draw: int, outliers: float = 0.1, cameras: Sequence[str] = CAMERAS
+) -> NDArray:
+    """(C, F, 33, 3) points and visibility, as MediaPipe gives them."""
+    chosen = Rig(tuple(rig[name] for name in cameras))
+    seen = simulate_keypoints(truth, chosen, DETECTOR, drift_px=2.0, outliers=outliers, seed=draw)
     arrays = [np.concatenate([k.points[:, 0], k.confidence[:, 0, :, None]], axis=-1) for k in seen]
     return np.nan_to_num(np.array(arrays)).astype(np.float32)
 

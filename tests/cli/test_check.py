@@ -2,15 +2,22 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kinefit.cli.check import check, free_name, with_calibration
+from kinefit.bodies import load_body
+from kinefit.cli._check_refine import free_name, with_calibration, with_keys
+from kinefit.cli.check import check
 from kinefit.errors import KinefitError
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.exporters.marker_files import write_markers
+from kinefit.geometry import se3
+from kinefit.observations import Markers
+from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
+from kinefit.simulation import known_motion, movement, simulate_keypoints, studio_rig
 
 
 def run(*args):
@@ -148,12 +155,46 @@ def test_a_refined_calibration_never_takes_a_name_that_is_there(tmp_path):
 
 def test_a_copy_of_the_take_differs_in_what_was_refined_only(take):
     text = take.read_text()
-    new = with_calibration(text, "calibration_refined.toml", {"cam02": 0.0125})
+    new = with_keys(with_calibration(text, "calibration_refined.toml"), "camera", 1, {"time_offset": "0.0125"})
     shutil.copy(take.with_name("calibration.toml"), take.with_name("calibration_refined.toml"))
     take.write_text(new)
     read = read_take(take)
     assert read.calibration.file.name == "calibration_refined.toml"
     assert [camera.time_offset for camera in read.cameras] == [0.0, 0.0125, 0.0, 0.0]
-    again = with_calibration(new, "calibration.toml", {"cam02": 0.02})
+    again = with_keys(with_calibration(new, "calibration.toml"), "camera", 1, {"time_offset": "0.02"})
     assert again.count("time_offset") == 1
     assert text.splitlines()[0] == new.splitlines()[0]
+
+
+def walker():
+    """Two cameras that see a person walk a metre and turn, 45 markers."""
+    steps = movement("walk", load_body("humanoid"), rate=15.0, speed=2.0)
+    T, u = np.array(steps.Ts_world_root), np.linspace(0.0, 1.0, len(steps))
+    T[:, :3, :3] = se3.exp_so3(np.outer(np.pi * u, (0.0, 1.0, 0.0))) @ T[:, :3, :3]
+    motion = known_motion(steps.body, steps.rate, T, steps.angles, up="y")
+    points = motion.body.markers("HANIM_45")
+    return motion, Markers(points.names, motion.rate, motion.positions(points), up="y", unit="m")
+
+
+def test_a_marker_system_that_does_not_fit_the_videos_is_named_and_moved(tmp_path):
+    motion, markers = walker()
+    rig = studio_rig(motion, cameras=2)
+    for seen in simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=2.0, outliers=0.0, missing=0.0):
+        values = np.concatenate([seen.points[:, 0], seen.confidence[:, 0, :, None]], axis=-1)
+        np.save(tmp_path / f"mediapipe_{seen.camera}.npy", np.nan_to_num(values))
+    write_calibration(rig, tmp_path / "calibration.toml")
+    wrong = se3.transform(se3.exp_so3(np.radians([0.0, 2.0, 0.0])), np.array([0.03, 0.0, 0.0]))
+    write_markers(replace(markers, positions=se3.apply(wrong, markers.positions)), tmp_path / "markers.trc")
+    names = "".join(f'[[camera]]\nname = "{c}"\n' for c in rig.names)
+    table = '[[keypoints]]\ncamera = "{0}"\nfile = "mediapipe_{0}.npy"\nformat = "mediapipe"\n'
+    head = '[take]\nrate = 15.0\nup = "y"\n[calibration]\nfile = "calibration.toml"\n'
+    take = tmp_path / "take.toml"
+    take.write_text(head + names + "".join(map(table.format, rig.names)) + '[[markers]]\nfile = "markers.trc"\n')
+    told = run(take, "--refine", "--take", "--strict")
+    assert told.exit_code == 2, told.output
+    assert re.search(r"fault: markers does not fit the videos: its frame is off by (1\.[89]|2\.[01])", told.stdout)
+    assert not tmp_path.joinpath("calibration_refined.toml").exists()  # the videos' cameras stay
+    left = read_take(tmp_path / "take_refined.toml").markers[0].T_world_file @ wrong
+    assert np.degrees(np.linalg.norm(se3.log_so3(left[:3, :3]))) < 0.2
+    middle = markers.positions.mean(axis=(0, 1))
+    assert np.linalg.norm(se3.apply(left, middle) - middle) < 0.005

@@ -14,14 +14,14 @@ from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES
 
 if TYPE_CHECKING:
-    from kinefit.calibration.refine.result import Refinement
+    from kinefit.cli._check_refine import Refined
 
 _LOOKS = {"fault": "bad", "doubt": "warning", "note": "note", "good": "good"}
 _TITLES = {"fault": "Fault", "doubt": "Doubt", "note": "Note", "good": "In order"}
 _DOTS = 1500  # of the person's points in the plan
 
 
-def check_page(check: Check, *, refinement: Refinement | None = None, up: str = "z") -> str:
+def check_page(check: Check, *, refinement: Refined | None = None, up: str = "z") -> str:
     """The whole page as text."""
     sections = [_findings(check)]
     if refinement is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from kinefit.cli import _screen
 
 if TYPE_CHECKING:
     from kinefit.calibration.check.check import Check
-    from kinefit.calibration.refine.result import Refinement
+    from kinefit.cli._check_refine import Refined
 
 _EXAMPLES = """\b
 Examples:
@@ -47,19 +46,20 @@ def check(
 
     TAKE is the recording's take file. Looked at are the calibration (which camera moved, lens, unit, poses), the order
     of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
-    up, and what each camera sees.
+    up, what each camera sees, and whether depth cameras and marker systems fit the videos.
     """
     if (focal or distortion or time_offsets or copy or points) and not refine:
         raise click.UsageError("--focal, --distortion, --time-offsets, --points and --take only go with --refine.")
     from kinefit.calibration.check.check import check_take
     from kinefit.cli._check_page import check_page
+    from kinefit.cli._check_refine import refined_of, write_refined
     from kinefit.cli._detecting import with_detections
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.take.file import read_take
 
     entry, out = read_take(take), out or take.with_name(f"{take.stem}-check.html")
-    refined: Refinement | None = None
+    refined: Refined | None = None
     failed: KinefitError | None = None
     with _screen.bars() as step:
         try:
@@ -69,7 +69,9 @@ def check(
         found = check_take(entry, progress=step)
         if refine:
             try:
-                refined = _refine(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
+                refined = refined_of(
+                    found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets
+                )
             except KinefitError as error:
                 failed = error
     _print(found, verbose)
@@ -78,33 +80,9 @@ def check(
     if failed is not None:
         raise failed
     if refined is not None:
-        _write_refined(found, refined, take, copy=copy)
+        write_refined(found, refined, take, copy=copy)
     if strict and found.faults:
         ctx.exit(2)
-
-
-def _refine(
-    found: Check, step: _screen.Step, points: Path | None, *, focal: bool, distortion: bool, time_offsets: bool
-) -> Refinement:
-    from kinefit.bodies import load_body
-    from kinefit.calibration.refine.refine import refine
-    from kinefit.errors import CalibrationError
-    from kinefit.readers.static_points import read_static_points
-
-    seen, take = found.observations, found.take
-    if found.views is None or not found.biases or seen is None or take is None:
-        raise CalibrationError(
-            "the calibration cannot be refined before the faults are fixed",
-            remedy="Mend what is named as a fault first.",
-        )
-    static = read_static_points(points, found.views.rig.names) if points else None
-    accuracy = min(entry.sigma for entry in take.keypoints)
-    return refine(
-        found.views.rig, [k for k in seen.keypoints if k.camera in found.views.rig], load_body(take.body), focal=focal,
-        distortion=distortion, time_offsets=time_offsets, static_points=static, height=take.height, up=take.up,
-        accuracy=accuracy,
-        progress=step,
-    )  # fmt: skip
 
 
 def _print(found: Check, verbose: bool) -> None:
@@ -136,58 +114,3 @@ def _print(found: Check, verbose: bool) -> None:
             table.add_row(*(row[at] for at in shown))
         _screen.say()
         _screen.console().print(table)
-
-
-def _write_refined(found: Check, refined: Refinement, path: Path, *, copy: bool) -> None:
-    from kinefit.exporters.atomic import write_text
-    from kinefit.readers.calibration.write import write_calibration_like
-
-    assert found.take is not None and found.take.calibration is not None
-    old = found.take.calibration
-    new = free_name(old.file)
-    write_calibration_like(refined.rig, old.file, new, unit=old.unit)
-    _screen.say(f"Written: {new}\n")
-    for line in refined.told():
-        _screen.say(line)
-    told = _relative(new, path.absolute().parent)
-    _screen.say(f'\nTo use it, write file = "{told}" into [calibration] of {path.name}.')
-    entries = {entry.name: entry.time_offset for entry in found.take.cameras}
-    offsets = {name: entries[name] + late for name, late in refined.time_offsets.items() if abs(late) > 1e-5}
-    for name, value in offsets.items():
-        _screen.say(f"And time_offset = {value:.5f} into [[camera]] {name}.")
-    if copy:
-        beside = free_name(path)
-        write_text(beside, with_calibration(path.read_text("utf-8"), told, offsets))
-        _screen.say(f"Written: {beside}")
-
-
-def _relative(path: Path, folder: Path) -> str:
-    path = path.absolute()
-    return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
-
-
-def free_name(path: Path) -> Path:
-    """The name with "_refined" before its endings, numbered where that is taken."""
-    stem, dot, endings = path.name.partition(".") if path.is_file() else (path.name, "", "")
-    number, candidate = 1, path.with_name(f"{stem}_refined{dot}{endings}")
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{stem}_refined{number}{dot}{endings}")
-    return candidate
-
-
-def with_calibration(text: str, file: str, offsets: dict[str, float]) -> str:
-    """The text of a take file with another calibration file, and time offsets [s] of some cameras."""
-    quoted = '"' + file.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    text = re.sub(
-        r"(?ms)(^\[calibration\][^\[]*?^\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda m: m[1] + quoted, text
-    )
-    for name, value in offsets.items():
-        head = rf"^\[\[camera\]\][^\[]*?^\s*name\s*=\s*[\"']{re.escape(name)}[\"'][^\n]*\n"
-        tables = re.split(r"(?m)(?=^\[)", text)
-        for i, table in enumerate(tables):
-            if re.search("(?ms)" + head, table):
-                table = re.sub(r"(?m)^\s*time_offset\s*=[^\n]*\n", "", table)
-                tables[i] = re.sub("(?ms)" + head, lambda m: f"{m[0]}time_offset = {value:.6f}\n", table)  # noqa: B023
-        text = "".join(tables)
-    return text

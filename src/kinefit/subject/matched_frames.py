@@ -16,6 +16,7 @@ from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World
 
 _KEPT = 64  # worlds that are remembered
+_SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
 
 
 class Worlds:
@@ -114,7 +115,7 @@ class MatchedFrames:
         """Rows of one measurement; those of a world that differs in nothing that it can know of are not made again."""
         kept = self._latest.get(key)
         same = kept is not None and kept[0] is scene.state
-        if same and kept is not None and _alike(kept[1], world, sensor):
+        if same and kept is not None and _alike(kept[1], world, sensor, matched.shows_surface):
             return kept[2]
         rows = rows_at(matched, scene)
         if not same:
@@ -135,6 +136,7 @@ def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
     return told[0].names if len(told) == 1 and told[0].rms is None else None
 
 
-def _alike(a: World, b: World, sensor: str) -> bool:
-    """Whether a sensor's rows are the same in two worlds."""
-    return a.body is b.body and a.rig is b.rig and a.values.get(sensor) == b.values.get(sensor)
+def _alike(a: World, b: World, sensor: str, of_surface: bool) -> bool:
+    """Whether a sensor's rows are the same in two worlds; those of a surface do not know of a body's points."""
+    same = a.body is b.body or (of_surface and all(getattr(a.body, p) is getattr(b.body, p) for p in _SURFACE))
+    return same and a.rig is b.rig and a.values.get(sensor) == b.values.get(sensor)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.sensors.base import Sensor, Unknown
+from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.subject.parameters import World
 
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
@@ -75,6 +76,59 @@ class CameraExtrinsics:
 
 def _moved(camera: Camera, twist: NDArray) -> Camera:
     return camera.with_pose(se3.exp(twist) @ camera.T_camera_world)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFrames:
+    """Seven parameters a sensor: how its frame lies in the world, and its clock; of `Displaced` measurements.
+
+    Something else must hold the world, such as keypoints of calibrated cameras.
+
+    Parameters
+    ----------
+    sensors : names
+    std : (3,) standard deviations of the shift [m] of a frame's origin, of its turn [rad] and of its clock [s].
+    arms : {sensor: (3,) [m]} from the centre about which its frame turns to that origin; default: it is the centre.
+    """
+
+    sensors: tuple[str, ...]
+    std: tuple[float, float, float] = (0.1, 0.087, 0.02)
+    arms: Mapping[str, NDArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not min(self.std) > 0:
+            raise ObservationError(f"standard deviations of {self.std}", remedy="Give m, rad and s above 0.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(7 S,)."""
+        return tuple(f"{sensor} {what}" for sensor in self.sensors for what in (*AXES, CLOCK))
+
+    @property
+    def mean(self) -> NDArray:
+        """(7 S,) zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(7 S, 7 S)."""
+        out = np.zeros((len(self.names), len(self.names)))
+        for k, sensor in enumerate(self.sensors):
+            A = np.eye(7)
+            A[:3, 3:6] = -se3.hat(self.arms.get(sensor, np.zeros(3)))  # shift of the origin
+            out[7 * k : 7 * k + 7, 7 * k : 7 * k + 7] = A.T @ np.diag(np.repeat(self.std, (3, 3, 1)) ** -2.0) @ A
+        return out
+
+    @property
+    def step(self) -> NDArray:
+        """(7 S,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The world with the sensors' frames there."""
+        own = np.asarray(values, float).reshape(-1, 7)
+        frames = {s: dict(zip((*AXES, CLOCK), row.tolist())) for s, row in zip(self.sensors, own)}
+        return replace(world, values={**world.values, **frames})
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,10 +127,11 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
-    return out | {_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
+    return out | {marker_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
 
 
-def _sensor(take: Take, k: int) -> str:
+def marker_sensor(take: Take, k: int) -> str:
+    """Name of the sensor of the k-th [[markers]] of a take."""
     return "markers" if len(take.markers) == 1 else f"markers {k + 1}"
 
 
@@ -204,7 +205,7 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
         named = replace(
             markers, names=tuple(names[i] for i in here), positions=markers.positions[:, here]
         )
-        out.append(NamedMarkers(_sensor(take, k), named, own, entry.time_offset, std))
+        out.append(NamedMarkers(marker_sensor(take, k), named, own, entry.time_offset, std))
     return out, body
 
 

@@ -3,11 +3,15 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kinefit.errors import TakeError
+from kinefit.exporters.marker_files import write_markers
+from kinefit.observations import Markers
 from kinefit.readers.take.entries import RENAMED
 from kinefit.readers.take.file import TABLES, Take, read_take
+from kinefit.readers.take.load import load_observations
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "take-file.md").read_text("utf-8")
 KEYS = [(table, key) for table, entry in TABLES.items() for key in entry.__struct_fields__]
@@ -76,3 +80,23 @@ CAMERA = '[calibration]\nfile = "c"\n[[camera]]\nname = "a"\nvideo = "v"\n'
 def test_a_key_without_use_is_refused(tmp_path, entry, key):
     with pytest.raises(TakeError, match=f"'{key}' has no use with format"):
         take(tmp_path, CAMERA + entry, files=("c", "v"))
+
+
+def test_markers_are_put_into_the_world_by_shift_and_turn(tmp_path):
+    x = np.random.default_rng(0).normal(size=(3, 4, 3))
+    write_markers(Markers(("a", "b", "c", "d"), 100.0, x, up="y", unit="mm"), tmp_path / "m.trc")
+    file = tmp_path / "take.toml"
+    file.write_text('[[markers]]\nfile = "m.trc"\nshift = [1.0, 2.0, 3.0]\nturn = [90.0, 0.0, 0.0]\n')
+    (markers,) = load_observations(read_take(file)).markers
+    expected = x[..., [0, 2, 1]] * [1.0, -1.0, 1.0] + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(markers.positions, expected, atol=1e-5)
+    assert markers.up is None
+
+
+@pytest.mark.parametrize("line", ["shift = [1e5, 0, 0]", "turn = [0, 0, 500]", "turn = [0, 0, nan]"])
+def test_shifts_and_turns_that_cannot_be_are_refused(line, tmp_path):
+    (tmp_path / "m.trc").touch()
+    file = tmp_path / "take.toml"
+    file.write_text(f'[[markers]]\nfile = "m.trc"\n{line}\n')
+    with pytest.raises(TakeError, match="Give metres and degrees"):
+        read_take(file)

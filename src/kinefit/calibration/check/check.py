@@ -17,6 +17,9 @@ from kinefit.calibration.check.frames import frame_findings
 from kinefit.calibration.check.loading import load_leniently
 from kinefit.calibration.check.person import size_findings, stature, upright_findings
 from kinefit.calibration.check.scene import Coverage, coverage, coverage_findings, lens_findings, placement_findings
+from kinefit.calibration.check.sensor_fit import SensorFit
+from kinefit.calibration.check.sensor_verdicts import sensor_findings
+from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.calibration.check.timing import TimeOffsets, fast_pixels, shifted, time_offsets
 from kinefit.calibration.check.verdicts import bias_findings, explained, side_findings, time_findings
 from kinefit.calibration.check.views import Views, make_views, meet, with_sides_right
@@ -52,6 +55,7 @@ class Check:
     times : TimeOffsets or None
     frames_late : {camera: int}
         By how many frames a camera's views were moved to bring them in step; none where empty.
+    sensors : of each depth camera and marker system, how it lies against the videos.
     """
 
     name: str
@@ -64,6 +68,7 @@ class Check:
     coverage: tuple[Coverage, ...] = ()
     times: TimeOffsets | None = None
     frames_late: Mapping[str, int] = field(default_factory=dict)
+    sensors: tuple[SensorFit, ...] = ()
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -102,11 +107,31 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     accuracy: dict[str, float] = {}
     for entry in loaded.take.keypoints:
         accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
-    return check_keypoints(
+    check = check_keypoints(
         seen.rig.select(tuple(n for n in seen.rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
         height=take.height, accuracy=accuracy, name=take.name, take=loaded.take, observations=seen,
         found=loaded.findings, progress=progress,
     )  # fmt: skip
+    return _with_sensors(check, progress)
+
+
+def _with_sensors(check: Check, progress: Progress | None) -> Check:
+    """The check with how depth cameras and marker systems lie against the videos, where these have no fault."""
+    take, seen = check.take, check.observations
+    if take is None or seen is None or not (take.depth or take.markers):
+        return check
+    fits: tuple[SensorFit, ...] = ()
+    if check.faults:
+        text = "Whether other sensors fit the videos was not looked at: first the faults must be fixed."
+        found = [Finding("note", "sensor", text)]
+    else:
+        try:
+            fits = fit_sensors(take, seen, progress=progress)
+            found = sensor_findings(fits, take)
+        except KinefitError as error:
+            text = f"Whether other sensors fit the videos cannot be told: {error.problem}."
+            found = [Finding("note", "sensor", text, remedy=error.remedy or "")]
+    return replace(check, findings=ranked([*check.findings, *found]), sensors=fits)
 
 
 def check_keypoints(

@@ -110,6 +110,8 @@ def _values(take: Take) -> None:
             refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
         if entry.unit is not None and entry.unit.lower() not in UNITS:
             refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+        if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
+            refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
     for problem, place, remedy in _odd_depth(take):
         refuse(problem, place, remedy)
 

@@ -6,6 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry import se3
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,6 +102,13 @@ class MarkersEntry(_Entry, frozen=True, kw_only=True):
     model: Path | None = None  # of the subject, for markers without names; default: they have names
     time_offset: float = 0.0  # [s]
     sigma: float = 0.005  # [m] standard deviation
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
+
+    @property
+    def T_world_file(self) -> NDArray:
+        """(4, 4) [m] from the frame of the file to the world."""
+        return se3.transform(se3.exp_so3(np.radians(self.turn)), np.array(self.shift))
 
 
 class DepthEntry(_Entry, frozen=True, kw_only=True):

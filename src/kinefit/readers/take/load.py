@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
+from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
     CloudVideo,
@@ -25,11 +26,14 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.depth import load_depth
+from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
 from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, check_rates, common_frames
+
+_LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +117,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
                 rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
                 sizes[entry.name] = video.size
     images = {entry.name: _image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
-    keypoints, markers = [], tuple(read_markers(entry.file, unit=entry.unit) for entry in take.markers)
+    keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
         keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
@@ -241,6 +245,15 @@ def _read_keypoints(
         image_frame=image if source.frame == "video" and not same else None,
         time_offset=offset, **options,
     )
+
+
+def _read_markers(entry: MarkersEntry) -> Markers:
+    """A marker recording in the take's world."""
+    markers = read_markers(entry.file, unit=entry.unit)
+    if not (any(entry.shift) or any(entry.turn)):
+        return markers
+    up = markers.up if max(abs(v) for v in entry.turn) < _LEVEL else None
+    return replace(markers, positions=se3.apply(entry.T_world_file, markers.positions), up=up)
 
 
 def _cut(keypoints: Keypoints, frames: tuple[int, int], used: tuple[int, int] | None) -> Keypoints:

@@ -1,0 +1,97 @@
+"""What a check says of sensors that do not fit the videos, and the lines of a take that set them right."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kinefit.calibration.check.findings import Finding
+from kinefit.calibration.check.sensor_fit import SURE, SensorFit, marker_index
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.readers.take.entries import MarkersEntry
+from kinefit.readers.take.file import Take
+
+_LATE = 0.01  # [s] by which a clock must be off: 1 cm of somebody who walks
+
+
+def misfits(fits: Iterable[SensorFit]) -> tuple[SensorFit, ...]:
+    """Those that surely do not fit, by more than is usual."""
+    return tuple(f for f in fits if f.misfit)
+
+
+def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
+    """A fault for each sensor that does not fit, a doubt for each clock that is off, good news of all others."""
+    out, wrong, file = [], misfits(fits), take.path.name
+    for fit in fits:
+        told = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
+        sure = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
+        if fit in wrong and fit.doubts:
+            may = "does not fit the videos" if fit.falls else "may not fit the videos"
+            text = f"{fit.sensor} {may}: it seems off by {told} at the person."
+            unsure = f"Where it belongs is not sure, because {'; '.join(fit.doubts)}."
+            remedy = "Calibrate it together with the videos, or record a person who walks and turns nearer to it."
+            out.append(Finding("fault" if fit.falls else "doubt", "sensor", text, (fit.sensor,), unsure, remedy))
+        elif fit in wrong and fit.kind == "depth":
+            text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {told} at the person."
+            remedy = f"Run: kinefit check {file} --refine --take (moves it), or calibrate it together with the videos."
+            out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
+        elif fit in wrong:
+            text = f"{fit.sensor} does not fit the videos: its frame is off by {told} at the person."
+            remedy = f"Write {' and '.join(marker_lines(fit, take))} into [[markers]] of {file}."
+            out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
+        else:
+            told = f"{np.degrees(fit.turn):.2f}° and {1e3 * fit.shift:.0f} mm at the person"
+            out.append(Finding("good", "sensor", f"{fit.sensor} fits the videos to {told}."))
+        late, std = fit.twist[6], float(np.sqrt(fit.covariance[6, 6]))
+        if abs(late) > max(SURE * std, _LATE):
+            text = f"The clock of {fit.sensor} is off by {1e3 * late:+.0f} ± {1e3 * std:.0f} ms against the videos."
+            entry = next((e for e in take.depth if e.name == fit.sensor), None) or marker_entry(fit, take)
+            table = "depth" if fit.kind == "depth" else "markers"
+            remedy = f"Write time_offset = {entry.time_offset + late:.4f} into [[{table}]] of {file}."
+            out.append(Finding("doubt", "sensor", text, (fit.sensor,), remedy=remedy))
+    return out
+
+
+def amount(fit: SensorFit) -> str:
+    """Its shift in millimetres, with the bar."""
+    return f"{1e3 * fit.shift:.1f} ± {1e3 * fit.bars[0]:.1f} mm"
+
+
+def told(fit: SensorFit) -> str:
+    """What a refinement does to a sensor, or why it does nothing, in one line."""
+    if fit.doubts:
+        return f"{fit.sensor}: not refined, because {'; '.join(fit.doubts)}."
+    turn, bar = np.degrees(fit.turn), np.degrees(fit.bars[1])
+    return f"{fit.sensor}: turned {turn:.2f} ± {bar:.2f}°, moved {amount(fit)} at the person (95 %)"
+
+
+def moved_cameras(fits: Iterable[SensorFit], take: Take, rig: Rig) -> Rig:
+    """The depth cameras among the sensors where they belong, named as in the calibration.
+
+    Parameters
+    ----------
+    rig : Rig with the depth cameras under their sensors' names
+    """
+    out, of = [], {entry.name: entry.camera or entry.name for entry in take.depth}
+    for fit in fits:
+        if fit.kind == "depth":
+            camera = rig[fit.sensor]
+            placed = camera.with_pose(camera.T_camera_world @ se3.inverse(fit.T))
+            out.append(replace(placed, name=of[fit.sensor]))
+    return Rig(tuple(out))
+
+
+def marker_entry(fit: SensorFit, take: Take) -> MarkersEntry:
+    """The table of a marker system in the take."""
+    return take.markers[marker_index(fit.sensor)]
+
+
+def marker_lines(fit: SensorFit, take: Take) -> tuple[str, str]:
+    """The two lines of [[markers]] that put a marker system where it belongs."""
+    T = fit.T @ marker_entry(fit, take).T_world_file
+    turn, shift = np.degrees(se3.log_so3(T[:3, :3])), T[:3, 3]
+    numbers = lambda values, digits: ", ".join(f"{v:.{digits}f}" for v in values)
+    return f"shift = [{numbers(shift, 5)}]", f"turn = [{numbers(turn, 4)}]"

@@ -1,0 +1,287 @@
+"""How every other sensor lies against the cameras of the videos: by the person whom they all see.
+
+The person is tracked in the keypoints alone. In some frames spread over the walk, poses, the person's surface, markers'
+and detectors' places and the frames of the other sensors are then fitted together, from all that was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
+from kinefit.calibration.check.sensor_fit import PRIOR, SensorFit, doubts_of
+from kinefit.errors import ObservationError
+from kinefit.frame.routing import Sensors
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.identification.take.named import with_names
+from kinefit.motion import Motion
+from kinefit.observations import DepthFrame, MarkerFrame
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+from kinefit.sensors.base import Measurement
+from kinefit.sensors.channels import make_channels
+from kinefit.sensors.displaced import AXES, Displaced, displacement
+from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.subject.fit import Subject, fit_subject
+from kinefit.subject.keypoints import Subject as Person
+from kinefit.subject.keypoints import fit_subject as fit_person
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
+from kinefit.subject.sensor_parameters import SensorFrames
+from kinefit.subject.surfaces import CylinderShape
+from kinefit.tracking.recording import Recording, spread
+from kinefit.tracking.take_recording import marker_sensor, recording_of
+from kinefit.tracking.video import track
+
+FRAMES = 12
+"""Frames that are fitted, spread over those in which the person was tracked."""
+
+Progress = Callable[[str, int, int], None]
+
+_TRACKED = 0.3  # quality of a frame that counts
+_FEWEST = 4  # frames in which a sensor must have seen the person
+_FAR = (0.3, 0.2, 0.12, 0.08)  # [m] of correspondences while only the frames of the sensors move
+_COARSE, _ROUNDS = 5, 3  # frames of the first fit; rounds of match and solve of the second
+_DETECTOR = 0.005  # [m] by which a detector's points may stand elsewhere than the fit of the keypoints has them
+# [m, rad, s], and [m] upwards: what a surface of simple shapes leaves wrong on a person of another shape, in all frames
+# alike: RMS errors of three simulated Anny people (draws 100 to 102 of `benchmarks.mixed_misfit`).
+_SURFACE, _UPRIGHT = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0]), 0.01
+_SETTINGS = TrackSettings(through=np.inf)  # with free space two heights were off by 8 and 21 mm, without by 7 and 17
+_WIDE = replace(_SETTINGS, reach=0.45, render_every=1)  # [m] about the person where a sensor may be 3 of 10 cm off
+_CLOCK = 0.02  # [s] standard deviation of a clock
+
+
+def fit_sensors(
+    take: Take, seen: Observations, rig: Rig | None = None, *, frames: int = FRAMES, progress: Progress | None = None
+) -> tuple[SensorFit, ...]:
+    """How the depth cameras and marker systems of a take lie against the cameras with keypoints.
+
+    Parameters
+    ----------
+    seen : of the take
+    rig : Rig, better one of cameras with keypoints; default: as the take has them.
+
+    Returns
+    -------
+    tuple of SensorFit
+        None where there is no such sensor, or no frames in which it and two cameras saw the person.
+
+    Raises
+    ------
+    KinefitError
+        What tracking the keypoints and reading the sensors raise.
+    """
+    videos = {k.camera for k in seen.keypoints}
+    depth = {e.name for e in take.depth if (e.camera or e.name) not in videos} & {v.sensor for v in seen.depth}
+    if not (depth or seen.markers) or len(videos) < 2 or seen.rig is None:
+        return ()
+    if rig is not None:
+        cameras = (rig[c.name] if c.name in rig else c for c in seen.rig)
+        seen = replace(seen, rig=Rig(tuple(cameras)))
+    seen = with_names(take, seen)
+    recording, body = recording_of(replace(take, start=None), seen, load_body(take.body))
+    alone = replace(recording, steps=lambda i: (), markers=(), marker_sets=(), depth={}, on_body=(), backgrounds={})
+    channels = make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
+    person = fit_person(body, channels, height=take.height, progress=progress)
+    motion = track(alone, body, subject=person, progress=progress)
+    origins = {name: recording.rig[name].centre_world for name in depth}
+    origins |= {marker_sensor(take, k): entry.T_world_file[:3, 3] for k, entry in enumerate(take.markers)}
+    problem = _Problem(recording, motion, person, frozenset(depth), origins)
+    chosen = problem.chosen(frames)
+    return problem.fits(chosen) if len(chosen) >= _FEWEST else ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """One frame of the motion: what the sensors saw, the body's state, time [s] and velocity (n,)."""
+
+    frame: int
+    seen: Sequence[Any]
+    state: BodyState
+    time: float
+    velocity: NDArray
+
+
+class _Problem:
+    """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
+
+    def __init__(
+        self, recording: Recording, motion: Motion, person: Person, depth: frozenset[str], origins: dict[str, NDArray]
+    ) -> None:
+        self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
+        self.person, self.origins, self.centre = person, origins, np.zeros(3)
+        self.body: Body = motion.body
+        channels = make_channels(
+            self.body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma
+        )
+        self.layout = Layout(channels, self.body)
+        self.first = round((motion.times[0] - recording.times[0]) * recording.rate)
+        self.sensors, self.wide = self.prepared(_SETTINGS), self.prepared(_WIDE)
+        s = self.settings
+        self.pixels = KeypointSensor(recording.rig, {}, s.pixel, s.loss, s.near)
+        self.names: tuple[str, ...] = ()
+
+    def prepared(self, settings: TrackSettings) -> Sensors:
+        """The sensors, who know what is seen without the person."""
+        of = self.recording
+        out = Sensors(of.rig, of.rate, of.sigma, settings, on_body=of.on_body)
+        for name, empty in of.backgrounds.items():
+            out.know_background(name, empty)
+        return out
+
+    def look(self, frame: int) -> _Look:
+        """A frame of the motion."""
+        time = float(self.recording.times[frame + self.first])
+        return _Look(frame, self.seen(frame), self.motion.state(frame), time, self.velocity(frame))
+
+    def seen(self, frame: int) -> list[Any]:
+        """What the sensors saw in a frame of the motion."""
+        every = self.recording.steps(frame + self.first)
+        return [
+            f for f in every if isinstance(f, MarkerFrame) or (isinstance(f, DepthFrame) and f.sensor in self.depth)
+        ]
+
+    def chosen(self, most: int) -> NDArray:
+        """Frames to fit, in which the person was tracked and a sensor saw something."""
+        good = np.flatnonzero(self.motion.quality > _TRACKED)
+        some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
+        return some[spread(len(some), most)]
+
+    def fits(self, chosen: NDArray) -> tuple[SensorFit, ...]:
+        """How the sensors lie, by frames of the motion; those that do not fit by each half of the frames too."""
+        looks = [self.look(int(f)) for f in chosen]
+        self.names = tuple(dict.fromkeys(f.sensor for look in looks for f in look.seen))
+        self.centre = np.mean([self.motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
+        self.place = SensorFrames(
+            self.names, (*PRIOR, _CLOCK), {name: self.origins[name] - self.centre for name in self.names}
+        )
+        near, ends = self.coarse(looks)
+        out = [self.with_surface(fit) for fit in self.fitted(looks, near)]
+        if any(fit.misfit for fit in out):
+            a, b = (self.fitted(looks[k::2], near) for k in range(2))
+            out = [self.judged(looks, fit, (a[k], b[k]), ends.get(fit.sensor)) for k, fit in enumerate(out)]
+        return tuple(out)
+
+    def with_surface(self, fit: SensorFit) -> SensorFit:
+        """A fit whose covariance counts what the surface leaves wrong in all frames alike."""
+        if fit.kind != "depth":
+            return fit
+        up = np.append(self.recording.up_axis, np.zeros(4))
+        return replace(fit, covariance=fit.covariance + np.diag(_SURFACE**2) + _UPRIGHT**2 * np.outer(up, up))
+
+    def judged(
+        self, looks: Sequence[_Look], fit: SensorFit, halves: tuple[SensorFit, SensorFit], ends: Ends | None
+    ) -> SensorFit:
+        """A fit whose bars hold what two halves of the frames disagree by, and why it is not to be used."""
+        if not fit.misfit:
+            return fit
+        half = 0.5 * apart(*(each.twist for each in halves))
+        falls = self.registration(fit.sensor, looks).above(np.zeros(7), fit.twist)
+        wide = replace(fit, covariance=fit.covariance + np.outer(half, half), falls=falls)
+        rivals = ends.rivals if ends is not None else ()
+        return replace(wide, doubts=doubts_of(wide, self.origins[fit.sensor], halves, rivals))
+
+    def coarse(self, looks: Sequence[_Look]) -> tuple[dict[str, NDArray], dict[str, Ends]]:
+        """Twists (7,) of all sensors near the truth; of depth sensors where all starts ended."""
+        ends = {}
+        for sensor in self.names:
+            if sensor in self.depth:
+                own = self.registration(sensor, looks)
+                first = starts(self.origins[sensor], self.centre, PRIOR)
+                rest = [own.settled(twist, (*FAR, *FINE)) for twist in first]
+                ends[sensor] = Ends(own, tuple(own.height(twist, self.recording.up_axis) for twist in rest))
+        near = {sensor: end.best for sensor, end in ends.items()}
+        named = tuple(name for name in self.names if name not in near)
+        if named:
+            few = [looks[k] for k in spread(len(looks), _COARSE)]
+            few = [replace(look, seen=[f for f in look.seen if f.sensor in named]) for look in few]
+            place = replace(self.place, sensors=named)
+            found = self.fit(few, {}, [place], np.zeros(len(place.names)), reach=_FAR, rounds=len(_FAR), looks=1.0)
+            near |= {name: twist_of(found.values[name]) for name in named}
+        return near, ends
+
+    def registration(self, sensor: str, looks: Sequence[_Look]) -> Registration:
+        """What one sensor saw in frames, with the poses of the keypoints alone."""
+        own = [replace(look, seen=[f for f in look.seen if f.sensor == sensor]) for look in looks]
+        own = [look for look in own if look.seen]
+        scenes = [
+            Scene(self.body, look.state, self.recording.rig, time=look.time, velocity=look.velocity,
+                  samples=self.settings.samples) for look in own
+        ]  # fmt: skip
+        place = replace(self.place, sensors=(sensor,))
+        return Registration(sensor, self.measured(own, {}, self.wide), scenes, self.centre, place.information[:6, :6])
+
+    def fitted(self, looks: Sequence[_Look], near: Mapping[str, NDArray]) -> list[SensorFit]:
+        """The fit of everything in some frames, from twists (7,) of the sensors."""
+        twists = dict(near)
+        for sensor in self.depth & set(self.names):
+            own = self.registration(sensor, looks)
+            twists[sensor] = own.height(own.settled(twists[sensor], FINE), self.recording.up_axis)
+        parameters = [*self.parameters([look.seen for look in looks]), self.place]
+        start = np.concatenate([*(p.mean for p in parameters[:-1]), *(twists[name] for name in self.names)])
+        values = {name: values_of(twist) for name, twist in twists.items()}
+        found = self.fit(looks, values, parameters, start, rounds=_ROUNDS)
+        out = []
+        for sensor in self.names:
+            k = found.names.index(f"{sensor} {AXES[0]}")
+            part = slice(k, k + 7)
+            C, kind = found.covariance[part, part], "depth" if sensor in self.depth else "markers"
+            out.append(SensorFit(sensor, kind, found.mean[part], C, self.centre))
+        return out
+
+    def fit(
+        self, some: Sequence[_Look], values: Mapping[str, Mapping[str, float]], parameters: Sequence[Parameters],
+        start: NDArray, **options: Any,
+    ) -> Subject:  # fmt: skip
+        """Parameters of some frames from a start, at which the sensors have `values`."""
+        return fit_subject(
+            self.body, self.recording.rig, self.measured(some, values, self.sensors), [look.state for look in some],
+            parameters, start=start, times=[look.time for look in some],
+            velocities=[look.velocity for look in some], loss=self.settings.loss, **options,
+        )  # fmt: skip
+
+    def parameters(self, frames: Sequence[Sequence[Any]]) -> list[Parameters]:
+        """What else is unknown: the surface where depth is seen, places of markers and of detectors' points."""
+        scales, covariance = self.person.scales, self.person.covariance
+        assert covariance is not None  # of a fit
+        known = covariance[: len(scales), : len(scales)] / np.outer(scales, scales)
+        out: list[Parameters] = [KnownLengths(self.body, scales=np.ones(len(scales)), covariance=known)]
+        surfaces = self.body.surfaces if any(isinstance(f, DepthFrame) for seen in frames for f in seen) else ()
+        if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
+            out.append(CylinderShape(self.body))
+        sets = {name: std for name, std in self.recording.marker_sets if std is not None}
+        out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
+        return out + [PointOffsets(self.body, name, _DETECTOR) for name in self.layout.channels.sets]
+
+    def measured(self, looks: Sequence[_Look], values: Any, sensors: Sensors) -> list[list[Measurement]]:
+        """What was measured in each frame, prepared about the body where the sensors' frames have it."""
+        channels, out = self.layout.channels, []
+        for look in looks:
+            several: list[Measurement] = []
+            for frame in look.seen:
+                T = displacement(values.get(frame.sensor, {}), self.centre)
+                there = BodyState(se3.inverse(T) @ look.state.T_world_root, look.state.angles)
+                scene = Scene(self.body, there, self.recording.rig, time=look.time, samples=self.settings.samples)
+                several += [Displaced(m, self.centre) for m in sensors.measurements([frame], scene)]
+            k = look.frame + self.first
+            pixels = channels.uv[k], channels.confidence[k]
+            several.append(KeypointMeasurement(self.pixels, self.layout, *pixels, look.time))
+            out.append(several)
+        return out
+
+    def velocity(self, frame: int) -> NDArray:
+        """(n,) [m/s, rad/s] of the body, from the frames beside one."""
+        a, b = max(frame - 1, 0), min(frame + 1, len(self.motion) - 1)
+        if a == b:
+            raise ObservationError("a motion of one frame", remedy="Record the person for some seconds.")
+        seconds = float(self.motion.times[b] - self.motion.times[a])
+        return self.motion.state(a).difference(self.motion.state(b)) / seconds
