@@ -112,3 +112,21 @@ def test_markers_beside_keypoints_count(tmp_path):
 
     assert off(fused) < 0.003
     assert off(fused) < 0.75 * off(without)
+
+
+REAL_MARKERS = {
+    "momentum/momentum__examples__process_markers_app__02_01.c3d": 0.004,
+    "nimblephysics/data__c3d__JA1Gait35.c3d": 0.012,
+}
+
+
+@pytest.mark.parametrize("name", REAL_MARKERS)
+def test_real_labelled_markers_choose_the_set_that_knows_most_of_them(tmp_path, data_dir, name):
+    """One label may be a marker of the body's own set by chance."""
+    take = tmp_path / "take.toml"
+    take.write_text(f'[take]\nframes = [0, 60]\n[[markers]]\nfile = "{data_dir("markers") / name}"\n', encoding="utf-8")
+    motion, _ = track_take(take)
+    residuals = motion.residuals["markers"]
+    assert len(residuals.names) >= 30
+    assert np.nanmedian(np.linalg.norm(residuals.values, axis=-1)) < REAL_MARKERS[name]
+    assert np.isfinite(motion.dof_std).mean() > 0.6

@@ -38,8 +38,13 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     nobody = np.flatnonzero(motion.quality <= 0)
     if len(nobody):
         say(f"nobody seen: frames {frame_ranges(nobody)}")
-    for name, lost in lost_segments(motion).items():
-        say(f"lost: {name} in frames {frame_ranges(lost)}")
+    gone = lost_segments(motion)
+    never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
+    if never:
+        say(f"nothing supports: {', '.join(never)} (no frame)")
+    for name, frames in gone.items():
+        if name not in never:
+            say(f"lost: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
     say("bone lengths [cm]: " + ", ".join(lengths))
     if points:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
 from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import Rig
@@ -185,20 +186,12 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
     """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
     out = []
     for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
-        std: NDArray | None = None
         try:
-            own = known_set(body, markers.names, entry.set if entry.set in body.marker_sets else None)
-            if entry.set and entry.set != own:
-                raise ObservationError(f"marker set {entry.set} is not the body's own")
-            known = body.markers(own) if own else body.landmarks
-        except KinefitError as unknown:
-            try:
-                placed = find_placement(body, {bare(n) for n in markers.names}, entry.set)
-            except KinefitError as error:
-                raise type(error)(
-                    error.problem, file=entry.file, place=f"[[markers]] {k + 1}", remedy=error.remedy
-                ) from unknown
-            own, known, std = placed.name, placed.points, placed.spread
+            own, known, std = _set_of(body, markers.names, entry.set)
+        except KinefitError as error:
+            place = f"[[markers]] {k + 1}"
+            raise type(error)(error.problem, file=entry.file, place=place, remedy=error.remedy) from error
+        if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
         names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))
         here = [i for i, n in enumerate(names) if n in known.names]
@@ -207,6 +200,29 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
         )
         out.append(NamedMarkers(marker_sensor(take, k), named, own, entry.time_offset, std))
     return out, body
+
+
+def _set_of(body: Body, labels: Sequence[str], wanted: str | None) -> tuple[str, PointSet, NDArray | None]:
+    """The set that labels belong to, its points, and how far each may sit elsewhere, where the catalogue says so.
+
+    That is the body's own set, or "" for its landmarks, unless a set of the catalogue knows more of the labels.
+    """
+    own, known, count = None, body.landmarks, 0
+    with suppress(KinefitError):
+        own = known_set(body, labels, wanted if wanted in body.marker_sets else None)
+        known = body.markers(own) if own else body.landmarks
+        count = len(set(matched(labels, known.names)) - {None})
+    if own is not None and wanted and own == wanted:
+        return own, known, None
+    try:
+        placed = find_placement(body, {bare(n) for n in labels}, wanted)
+    except KinefitError:
+        if own is None or wanted:
+            raise
+        return own, known, None
+    if own is not None and not wanted and count >= len(placed.points):
+        return own, known, None
+    return placed.name, placed.points, placed.spread
 
 
 def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, DepthFrame]:
