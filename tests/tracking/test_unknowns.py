@@ -1,5 +1,7 @@
 """Which parameters a recording can tell: points first, then surfaces and what sensors do not know of themselves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def kinds(unknown):
 def test_markers_tell_lengths_and_their_own_places():
     unknown = of_points(a_recording(), BODY, SIZED, None, None)
     assert kinds(unknown) == [SegmentScales, PointOffsets]
-    assert unknown.world.body is BODY
+    assert unknown.world.body.tree is BODY.tree
     lengths = unknown.start[: len(SCALES)]
     np.testing.assert_allclose(lengths, np.log(SCALES))
     np.testing.assert_allclose(unknown.start[len(SCALES) :], 0.0, atol=1e-12)
@@ -41,6 +43,16 @@ def test_a_set_says_how_far_its_markers_may_sit_elsewhere():
     std = np.linspace(0.005, 0.03, len(BODY.markers(SET)))
     known = of_points(a_recording(std=std), BODY, SIZED, None, None).parameters[1]
     np.testing.assert_allclose(known.std, std)
+
+
+def test_markers_that_are_not_worn_have_no_place():
+    few = SIZED.body.markers(SET).select(SIZED.body.markers(SET).names[3:23])
+    some = replace(SIZED, body=replace(SIZED.body, marker_sets={**SIZED.body.marker_sets, SET: few}))
+    std = np.linspace(0.005, 0.03, len(BODY.markers(SET)))
+    unknown = of_points(a_recording(std=std), BODY, some, None, None)
+    assert len(unknown.parameters[1].names) == 3 * 20
+    np.testing.assert_allclose(unknown.parameters[1].std, std[3:23])
+    assert unknown.world.body.markers(SET).names == few.names
 
 
 def test_a_height_holds_the_size():

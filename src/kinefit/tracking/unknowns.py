@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, PointSet
 from kinefit.subject.keypoints import Subject
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import OwnUnknowns
@@ -48,9 +48,13 @@ def of_points(
     subject : what the first fit found
     height, trial : as of `track`
     """
-    sets = {name: _SEAT if std is None else std for name, std in recording.marker_sets if name}
+    sets = {name: std for name, std in recording.marker_sets if name}
     if not sets:
         return None
+    worn = {name: subject.body.markers(name) for name in sets}  # a fit from markers leaves those that were seen
+    places = {name: generic.markers(name).select(points.names) for name, points in worn.items()}
+    stds = {n: _SEAT if s is None else _of(s, generic.markers(n), places[n]) for n, s in sets.items()}
+    generic = replace(generic, marker_sets={**generic.marker_sets, **places})
     lengths = SegmentScales(generic, height / generic.stature if height and generic.stature else None)
     if trial is not None and trial.covariance is not None:
         count = len(trial.scales)
@@ -58,11 +62,15 @@ def of_points(
     found: list[tuple[Parameters, NDArray]] = [(lengths, np.log(subject.scales))]
     found += list(_keypoint_offsets(generic, subject).values())
     scaled = generic.scaled(subject.scales)
-    for name, std in sets.items():
-        offsets = PointOffsets(generic, name, std)
-        shifts = subject.body.markers(name).points - scaled.markers(name).points
-        found.append((offsets, offsets.values_of(shifts)))
+    for name in sets:
+        offsets = PointOffsets(generic, name, stds[name])
+        found.append((offsets, offsets.values_of(worn[name].points - scaled.markers(name).points)))
     return _together(World(generic, recording.rig), found)
+
+
+def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
+    """(K,) values of the points of a part of a set."""
+    return np.asarray(values)[[whole.names.index(name) for name in part.names]]
 
 
 def of_all(recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool) -> Unknowns | None:
