@@ -27,6 +27,7 @@ PAIRS = (
     ("cameras", "cameras_silhouettes"), ("cameras", "cameras_depth"), ("cameras", "cameras_markers"),
     ("cameras_silhouettes", "all"), ("cameras_depth", "all"), ("cameras_markers", "all"),
 )  # fmt: skip
+QUICK = ("cameras", "markers_alone")  # mixes of which a take needs a second
 SAMPLES, FEWEST, SIGMAS = 2000, 200, 1.96
 NOISE = 0.3  # [m/s²] that no smoothing need improve
 
@@ -203,8 +204,8 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 
 
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
-    """Runs that some groups of figures need; quickly, without depth alone (a minute a take) and with few conditions."""
-    mixes = [mix for mix in MIXES if not quick or mix != "depth_alone"]
+    """Runs that some groups of figures need; quickly, what the sensors add, and all conditions of two fast mixes."""
+    mixes = [mix for mix in MIXES if not quick or mix in QUICK]
     out: list[Run] = []
     if "sensors" in groups:
         out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
@@ -213,5 +214,5 @@ def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
     if "smoothing" in groups or "intervals" in groups:
         out += [(mix, condition) for mix in mixes for condition in CONDITIONS[:2]]
     if "intervals" in groups:
-        out += [(m, c) for m in (("cameras", "all") if quick else mixes) for c in CONDITIONS[2:]]
+        out += [(m, c) for m in mixes for c in CONDITIONS[2:]]
     return list(dict.fromkeys(out))
