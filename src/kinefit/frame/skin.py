@@ -59,7 +59,7 @@ class Skin:
     @property
     def information(self) -> NDArray:
         """(n, n) Jᵀ H' J."""
-        return np.einsum("sin,sij,sjm->nm", self.jacobian, self.H, self.jacobian, optimize=True)
+        return self.jacobian.reshape(-1, self.n).T @ (self.H @ self.jacobian).reshape(-1, self.n)
 
     @property
     def pushes(self) -> NDArray:
@@ -72,7 +72,7 @@ class Skin:
         return self._pushes(self.exact)
 
     def _pushes(self, H: NDArray) -> NDArray:
-        return np.einsum("sin,sij,j->sjn", self.jacobian, H, self.sigma, optimize=True).reshape(-1, self.n)
+        return (self.sigma[:, None] * (H @ self.jacobian)).reshape(-1, self.n)
 
     @property
     def n(self) -> int:
@@ -97,10 +97,11 @@ def skin_of(scene: Scene, parts: Sequence[Rows], shift: float, turn: float) -> S
     data = np.array(rows.data)
     data[:3] -= middle[rows.segment].T
     blocks = np.zeros((S, 27))
-    order = np.argsort(rows.segment, kind="stable")
-    _kernels.accumulate(
-        np.ascontiguousarray(data[:, order]), rows.segment[order], factor[order], len(rows), 0.0, 0.0, 0.0, blocks
-    )
+    segment = rows.segment
+    if np.any(segment[1:] < segment[:-1]):
+        order = np.argsort(segment, kind="stable")
+        data, segment, factor = np.ascontiguousarray(data[:, order]), segment[order], factor[order]
+    _kernels.accumulate(data, segment, factor, len(rows), 0.0, 0.0, 0.0, blocks)
     H, upper = np.zeros((S, 6, 6)), np.triu_indices(6)
     H[:, upper[0], upper[1]] = blocks[:, :21]
     H[:, upper[1], upper[0]] = blocks[:, :21]
