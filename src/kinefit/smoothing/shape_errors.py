@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.frame.fit import rows_of
+from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -23,13 +23,12 @@ from kinefit.solvers.border_frames import Part, Weighing, differences, frame_at,
 from kinefit.solvers.equations import joint_moves, normal_equations
 from kinefit.subject.fit import Subject
 from kinefit.subject.matched_frames import Worlds
+from kinefit.subject.parameters import stacked
 from kinefit.subject.surfaces import CylinderShape
 
 SAMPLED = 16
-"""Frames in which answers are found; between them variances are interpolated. Of 16 and 64 frames of simulated takes
-the mean standard deviations of joint centres differ by less than 1 %."""
-
-_MANY = 10**6  # rows of points, beside which surfaces are not taken for exact
+"""Frames in which answers are found; between them variances are interpolated. On three simulated takes of 60 frames the
+mean standard deviation of joint centres differs by less than 1 % from answers in every frame, single ones by 60 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +74,12 @@ def shape_errors(
     kept = np.concatenate([
         np.full(len(p.names), not isinstance(p, CylinderShape)) for p in found.parameters
     ])  # fmt: skip
-    step = np.concatenate([p.step for p in found.parameters])
+    step, worlds = stacked(found.parameters)[3], Worlds(found.prior_world, found.parameters)
     Sigma = found.covariance[np.ix_(kept, kept)]
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
         scene, matched = seen(frame)
-        one = _Frame(Worlds(found.prior_world, found.parameters), scene, matched, found.mean, kept)
+        one = _Frame(worlds, scene, matched, found.mean, kept)
         pushed = one.points(step) + one.surfaces(step, settings)
         answer = P @ pushed
         moves = joint_moves(scene.body, scene.state)
@@ -129,7 +128,7 @@ class _Frame:
         wide = [k for k, touched in enumerate(self.touches) if touched is None]
         if not shown or not wide:
             return out
-        beside = _MANY if any(m.of_points for m in self.matched) else 0
+        beside = rows_of_points(self.scene, self.matched)
 
         def gradient(values: NDArray) -> NDArray:
             scene = self._scene(values)
@@ -167,5 +166,4 @@ class _Frame:
 
 def _centres(body: Body, state: BodyState) -> NDArray:
     """(S, 3) [m] joint centres."""
-    frames = body.tree.forward(state.T_world_root, state.angles)[0]
-    return np.einsum("sij,sj->si", frames[:, :9].reshape(-1, 3, 3), body.tree.rest) + frames[:, 9:]
+    return body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, :, :3, 3]

@@ -15,7 +15,7 @@ from kinefit.subject.sensor_parameters import OwnUnknowns
 from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording
 
-_SEAT = 0.01  # [m] how far a marker of the body's own set sits from its place on a person
+_SEAT = 0.01  # [m] how far a marker of the body's own set sits from its place on a person: as a detector's points
 
 
 @dataclass(frozen=True, eq=False)
