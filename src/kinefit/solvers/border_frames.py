@@ -20,8 +20,11 @@ from kinefit.solvers.whitened import Pose, columns, residuals, softening
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
 
+SETTLING = 6
+"""Steps that a pose takes by itself, at most, after each one with the parameters."""
+
 _FIRST = 1e-3  # damping to begin with, as a share of the pose's mean diagonal
-_STEPS, _SETTLED = 6, 1e-3  # of a pose by itself, and the fall of its cost at which it rests
+_SETTLED = 1e-3  # fall of a pose's cost at which it rests
 _FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
 
 Part = tuple[str, AnyRows]
@@ -124,14 +127,14 @@ def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, wei
 
 
 def settle(
-    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing
+    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
 ) -> tuple[list[Frame], list[BodyState]]:
     """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
     bounds, frames, out = limits(problem.body(theta)), [], []
     for f, state in enumerate(states):
         frame = frame_at(problem, theta, f, state, weighing)
         damping, growth = _FIRST * float(np.trace(frame.H)) / len(frame.H) + 1e-12, 2.0
-        for _ in range(_STEPS):
+        for _ in range(steps):
             move, predicted = frame.step(damping)
             if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
                 break

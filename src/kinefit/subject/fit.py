@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
 from kinefit.solvers.border import Bordered, Prior, solve
-from kinefit.solvers.border_frames import POSTURE
+from kinefit.solvers.border_frames import POSTURE, SETTLING
 from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
@@ -30,8 +30,11 @@ REACH = (0.08, 0.05, 0.03)
 TOLD = 0.1
 """Share of the prior's variance that data must explain for a direction to count as measured."""
 
+COARSE = 4, SETTLING
+"""Iterations of a round where correspondences are sought anew, or reach farther than in the end; and how many steps
+poses take by themselves in each."""
+
 _ITERATIONS = 15  # of the solver, in the last rounds
-_COARSE = 4  # of one where some are sought anew, or reach farther than in the end
 _DONE = 0.01  # posterior standard deviations of a change between rounds that is none
 
 
@@ -121,6 +124,7 @@ def fit_subject(
     looks: float | None = None,
     loss: Loss = SQUARED,
     posture: float = POSTURE,
+    coarse: tuple[int, int] = COARSE,
 ) -> Subject:
     """Parameters and poses that explain what all sensors saw in K frames.
 
@@ -140,6 +144,8 @@ def fit_subject(
         how much residuals last (see `lasting.excess`).
     loss : Loss of rows that have none of their own.
     posture : share of the body's posture prior that holds the poses.
+    coarse : iterations of a round where correspondences are sought anew, and steps of poses by themselves in each: few,
+        where the nearest points of a surface would let poses follow lengths that are wrong.
 
     Raises
     ------
@@ -167,13 +173,14 @@ def fit_subject(
     told = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
-        coarse, before = anew or used < min(len(reach), rounds), theta
+        early, before = anew or used < min(len(reach), rounds), theta
+        iterations, settling = coarse if early else (_ITERATIONS, SETTLING)
         solved = solve(
             frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
-            max_iterations=_COARSE if coarse else _ITERATIONS,
+            max_iterations=iterations, settling=settling,
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
-        if not coarse and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
+        if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
             break
     if looks is None:
         told = excess(frames.seen(theta, states), _followed(body, solved))

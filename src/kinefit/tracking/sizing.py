@@ -143,7 +143,7 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
         if progress:
             progress("size", 1, 1)
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
-    told = dict(zip(fit.names, map(float, fit.factors)))
+    told = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
     person = _wearing(person, replace(person.subject, body=fit.body), size=told)
     return person if person.start is not None else replace(person, start=(step, best.state))
 
