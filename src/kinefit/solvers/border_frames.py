@@ -170,15 +170,19 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
     for together in _apart(touches):
         change = np.zeros(len(theta))
         change[together] = steps[together]
-        for sign in (-1.0, 1.0):
-            for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-                moved = problem.parts(theta + sign * change, f, state)
+        owner = _owner(together, touches, len(problem.body(theta).tree.segments))
+        for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
+            ends = [problem.parts(theta + sign * change, f, state) for sign in (1.0, -1.0)]
+            for moved in ends:
                 _same(parts, moved)
-                away = -sign * _stacked(moved) / 2.0
-                for k in together:
-                    touched, segment = touches[k], on[f]
-                    felt = slice(None) if touched is None or segment is None else np.isin(segment, list(touched))
-                    out[f][felt, k] += away[felt] / steps[k]
+            away = (_stacked(ends[1]) - _stacked(ends[0])) / 2.0
+            segment = on[f]
+            if owner is None or segment is None:
+                out[f][:, together[0]] = away / steps[together[0]]
+            else:
+                k = owner[segment]
+                felt = np.flatnonzero(k >= 0)
+                out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
     return out
 
 
@@ -187,6 +191,17 @@ def _segments(parts: Sequence[Part]) -> NDArray | None:
     if not all(isinstance(rows, Rows) for _, rows in parts):
         return None
     return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
+
+
+def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], count: int) -> NDArray | None:
+    """(S,) which of some parameters each of so many segments feels, -1 for none; None for one felt everywhere."""
+    out = np.full(count, -1)
+    for k in together:
+        touched = touches[k]
+        if touched is None:
+            return None
+        out[list(touched)] = k
+    return out
 
 
 def _apart(touches: Sequence[frozenset[int] | None]) -> list[list[int]]:

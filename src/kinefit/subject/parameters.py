@@ -118,6 +118,17 @@ class SegmentScales:
         """(G,)."""
         return np.full(len(self.names), _STEP)
 
+    @cached_property
+    def touches(self) -> tuple[frozenset[int] | None, ...]:
+        """Of each parameter the segments that it moves: its own, and all beyond; None where a skin joins segments."""
+        body, count = self.body, len(self.body.scale_groups)
+        if body.skin is not None or body.morphs:
+            return (None,) * count
+        above: list[set[int]] = []
+        for parent, group in zip(body.tree.parents, body.segment_scale):
+            above.append({int(group)} | (above[parent] if parent >= 0 else set()))
+        return tuple(frozenset(s for s, groups in enumerate(above) if g in groups) for g in range(count))
+
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these lengths; all its points, surfaces and morphs go along."""
         return replace(world, body=world.body.scaled(np.exp(values)))
