@@ -121,10 +121,10 @@ def fit_marker_subject(
     starts = np.cumsum([0, *map(len, given)])
     seen = np.isfinite(x).all(axis=2)
     placed, x, seen = _worn(placed, x, seen)
-    whole = height / body.stature if height and body.stature else None
-    size = whole if whole is not None else _first_size(body, placed, x)
-    generic = replace(body, marker_sets={**body.marker_sets, placed.name: placed.points})
-    lengths, groups = SegmentScales(generic, whole, size), len(body.scale_groups)
+    known = height / body.stature if height and body.stature else None
+    size = known if known is not None else _first_size(body, placed, x)
+    generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)  # no need to scale those
+    lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
     sigma = floor = np.hypot(_LEAST, _SLIDES * placed.spread)
     theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
     fitted = generic.scaled(np.exp(lengths.mean))
@@ -148,8 +148,10 @@ def fit_marker_subject(
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
     inlier, scales = residuals < 5.0 * 1.7 * sigma, np.exp(theta[:groups])
+    whole = body.scaled(scales)
+    named = {**whole.marker_sets, **fitted.marker_sets}
     return MarkerSubject(
-        fitted, placed.name, scales, scales * found.std[:groups], sigma,
+        replace(whole, marker_sets=named), placed.name, scales, scales * found.std[:groups], sigma,
         np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
         len(chosen),
     )  # fmt: skip

@@ -99,6 +99,8 @@ class Matched(ABC):
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
+    of_set : marker set of the body and names of the points in it that the rows are of, counted by their `group`; None
+        for other rows. A subject fit then differentiates all frames at once.
     """
 
     sensor: str = ""
@@ -106,6 +108,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
+    of_set: tuple[str, tuple[str, ...]] | None = None
 
     @property
     def key(self) -> bytes:

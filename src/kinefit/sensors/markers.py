@@ -101,6 +101,11 @@ class MarkerMatched(Matched):
         """Name of the marker system."""
         return self.measurement.sensor
 
+    @property
+    def of_set(self) -> tuple[str, tuple[str, ...]] | None:  # type: ignore[override]
+        """Their marker set and names; None for landmarks."""
+        return (self.measurement.marker_set, self.measurement.names) if self.measurement.marker_set else None
+
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Three rows a marker."""
         m = self.measurement

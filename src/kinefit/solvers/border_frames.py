@@ -35,7 +35,8 @@ class Problem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation.
+    different segments then share an evaluation. It may have `places(theta, states)`: of every frame and part (K, 3) [m]
+    where the points are that its rows' groups count, or None; derivatives are then those of these points.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -171,11 +172,9 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
         change = np.zeros(len(theta))
         change[together] = steps[together]
         owner = _owner(together, touches, len(problem.body(theta).tree.segments))
+        all_frames = _by_places(problem, theta, change, states, centre)
         for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-            ends = [problem.parts(theta + sign * change, f, state) for sign in (1.0, -1.0)]
-            for moved in ends:
-                _same(parts, moved)
-            away = (_stacked(ends[1]) - _stacked(ends[0])) / 2.0
+            away = _by_rows(problem, theta, change, f, state, parts) if all_frames is None else all_frames[f]
             segment = on[f]
             if owner is None or segment is None:
                 out[f][:, together[0]] = away / steps[together[0]]
@@ -184,6 +183,36 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
                 felt = np.flatnonzero(k >= 0)
                 out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
     return out
+
+
+def _by_rows(
+    problem: Problem, theta: NDArray, change: NDArray, frame: int, state: BodyState, parts: Sequence[Part]
+) -> NDArray:
+    """(N,) how far each row's point moves with half the change, whitened: from its rows on either side."""
+    ends = [problem.parts(theta + sign * change, frame, state) for sign in (1.0, -1.0)]
+    for moved in ends:
+        _same(parts, moved)
+    return (_stacked(ends[1]) - _stacked(ends[0])) / 2.0
+
+
+def _by_places(
+    problem: Problem, theta: NDArray, change: NDArray, states: Sequence[BodyState], centre: Sequence[Sequence[Part]]
+) -> list[NDArray] | None:
+    """The same of all frames, from where the points are on either side; None where the problem does not say."""
+    places = getattr(problem, "places", None)
+    after, before = (places(theta + sign * change, states) if places else None for sign in (1.0, -1.0))
+    if after is None or before is None:
+        return None
+    return [
+        np.concatenate([_along(rows, (x - y) / 2.0) for (_, rows), x, y in zip(parts, a, b, strict=True)])
+        for parts, a, b in zip(centre, after, before, strict=True)
+    ]
+
+
+def _along(rows: AnyRows, moved: NDArray) -> NDArray:
+    """(N,) whitened moves of rows whose points (K, 3) [m] move so."""
+    assert isinstance(rows, Rows)
+    return np.asarray(np.sqrt(rows.weight) * np.einsum("ni,ni->n", rows.direction, moved[rows.group]))
 
 
 def _segments(parts: Sequence[Part]) -> NDArray | None:

@@ -22,30 +22,25 @@ class Pose:
     body : Body
     state : BodyState
     centre : (3,) [m] the root's origin, which twists are taken about.
-    moves : (S, 6, n) twist (v, ω) of each segment by each degree of freedom.
+    twists : (6, n) twist (v, ω) by each degree of freedom of the segments that it moves.
     """
 
     body: Body
     state: BodyState
     centre: NDArray
-    moves: NDArray
+    twists: NDArray
 
     @classmethod
     def of(cls, body: Body, state: BodyState) -> Pose:
         """The body at a state."""
         tree = body.tree
         _, screws = tree.forward(state.T_world_root, state.angles)
-        moves = np.stack([tree.segment_jacobian(screws, s) for s in range(len(tree.segments))])
-        return cls(body, state, state.T_world_root[:3, 3], moves)
+        return cls(body, state, state.T_world_root[:3, 3], np.concatenate([np.eye(6), screws.T], axis=1))
 
     def along(self, segment: NDArray, point: NDArray, direction: NDArray) -> NDArray:
         """(N, n) [m] how far points (N, 3) of segments (N,) move along directions (N, 3)."""
         a = np.concatenate([direction, np.cross(point - self.centre, direction)], axis=1)
-        out = np.empty((len(a), self.moves.shape[2]))
-        for s in np.unique(segment):
-            of = segment == s
-            out[of] = a[of] @ self.moves[s]
-        return out
+        return (a @ self.twists) * self.body.tree.moved_by[segment]
 
 
 def residuals(rows: AnyRows) -> NDArray:

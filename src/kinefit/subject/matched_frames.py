@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ class Worlds:
     """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
-        self._first = world
+        self.first = world
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
@@ -31,7 +32,7 @@ class Worlds:
 
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
-        world = self._first
+        world = self.first
         for one, own in self._parameters:
             values = theta[own]
             key = id(world), values.tobytes()
@@ -94,6 +95,29 @@ class MatchedFrames:
             rows = self._rows((frame, i), measurement.sensor, matched, scene, world)
             out += [(measurement.sensor, part) for part in rows]
         return out
+
+    def places(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[NDArray]] | None:
+        """(K, 3) [m] of every frame and its rows where the points of the body are that these are of, at once.
+
+        None where rows are of others, or where more than the body differs from what the parameters are about.
+        """
+        world, first = self._worlds.at(theta), self._worlds.first
+        if self._points is None or world.rig is not first.rig or world.values != first.values or world.body.morphs:
+            return None
+        roots, angles = (np.stack([getattr(s, n) for s in states]) for n in ("T_world_root", "angles"))
+        names = {name for several in self._points for name, _ in several}
+        x = {name: world.body.trajectories(roots, angles, world.body.markers(name)) for name in names}
+        return [[x[name][f, index] for name, index in several] for f, several in enumerate(self._points)]
+
+    @cached_property
+    def _points(self) -> list[list[tuple[str, NDArray]]] | None:
+        """Of every frame and its rows the marker set and the points of it that these are of."""
+        told = [[one.of_set for one in several] for several in self._matched]
+        if self._velocities is not None or any(one is None for several in told for one in several):
+            return None
+        body = self._worlds.first.body
+        at = {s: {n: k for k, n in enumerate(body.markers(s).names)} for s in {o[0] for f in told for o in f if o}}
+        return [[(o[0], np.array([at[o[0]][n] for n in o[1]], np.int64)) for o in several if o] for several in told]
 
     def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
         """What every frame's sensors saw, with the names of what they saw."""
