@@ -37,12 +37,37 @@ def drop_flying(depth, near, far, noise, slope, out):
 
 
 @jit
-def drop_speckles(depth, noise, slope, least, out):
+def around(depth, out, v, u, noise, slope, most, beside):
+    """Mean depth [m] of the neighbours of a pixel that stay, where `most` of them are of one surface; 0 elsewhere.
+
+    beside (8,): room for them.
+    """
+    height, width = depth.shape
+    n = 0
+    for i in range(v - 1 if v > 0 else v, v + 2 if v + 1 < height else v + 1):
+        for j in range(u - 1 if u > 0 else u, u + 2 if u + 1 < width else u + 1):
+            if out[i, j] > 0.0 and out[i, j] == depth[i, j]:
+                beside[n] = out[i, j]
+                n += 1
+    if n >= most:
+        for k in range(n - most + 1):
+            total, alike = np.float32(0.0), 0
+            for m in range(n):
+                if abs(beside[m] - beside[k]) <= noise + slope * beside[k]:
+                    total += beside[m]
+                    alike += 1
+            if alike >= most:
+                return total / np.float32(alike)
+    return np.float32(0.0)
+
+
+@jit
+def drop_speckles(depth, noise, slope, least, most, out):
     """Copy (H, W) float32 `depth` to `out`, 0 where fewer than `least` of the eight neighbours are of its surface.
 
-    Of one surface: they differ by noise + slope * depth [m] at most. Beyond the image's edge there are none. Returns
-    how many pixels are measured and how many of them stay. Row by row without branches, so that the compiler handles
-    many pixels at a time.
+    Of one surface: they differ by noise + slope * depth [m] at most. Beyond the image's edge there are none. Where
+    `most` neighbours that stay are of one surface, their mean takes the place of what goes. Returns how many pixels are
+    measured and how many of them stay. Row by row without branches, so that the compiler handles many pixels at a time.
     """
     height, width = depth.shape
     none, one, empty = np.int32(0), np.int32(1), np.float32(0.0)
@@ -77,6 +102,12 @@ def drop_speckles(depth, noise, slope, least, out):
             before += one if own[u] > empty else none
             after += one if line[u] > empty else none
         seen, kept = seen + before, kept + after
+    if seen > kept:
+        beside = np.empty(8, np.float32)
+        for v in range(height):
+            for u in range(width):
+                if depth[v, u] > empty and out[v, u] == empty:
+                    out[v, u] = around(depth, out, v, u, noise, slope, most, beside)
     return seen, kept
 
 
