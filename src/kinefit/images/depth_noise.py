@@ -21,14 +21,15 @@ _STEP = 0.03  # [m] between pixels of one surface: noise of 7 mm explains it, an
 _SLANT = math.radians(75.0)  # from pixel to pixel across a surface; along it, depth is alike on a flatter one too
 _ALONE = 2  # neighbours on the same surface, at least: of 20 % random pixels 0.3 % have them by chance, with 1 7 %
 _AROUND = 5  # of a surface about a pixel that went, at least: beside a straight edge there are three on either side
+_NEVER = 9  # of eight neighbours
 
 
-def without_speckles(depth: NDArray, camera: Camera, sigma: float = 0.0) -> NDArray:
+def without_speckles(depth: NDArray, camera: Camera, sigma: float = 0.0, *, closed: bool = False) -> NDArray:
     """A depth image without pixels that stand alone: those of which fewer than two neighbours are on one surface.
 
     Neighbours are the eight about a pixel. Pixels that a sensor mismatches, that interfere or that a transmission
-    spoils lie anywhere along their rays, one by one; a limb that is two pixels wide stays. Within a surface, what its
-    neighbours show takes their place. An image of scattered pixels, most of them without neighbours, stays as it is.
+    spoils lie anywhere along their rays, one by one; a limb that is two pixels wide stays. An image of scattered
+    pixels, most of them without neighbours, stays as it is.
 
     Parameters
     ----------
@@ -36,6 +37,8 @@ def without_speckles(depth: NDArray, camera: Camera, sigma: float = 0.0) -> NDAr
     camera : Camera of the sensor, for the size of its pixels
     sigma : float [m]
         Standard deviation of a pixel, where it is known to be more than the usual centimetre.
+    closed : bool
+        Within a surface, the mean of its neighbours takes the place of what goes.
 
     Returns
     -------
@@ -48,7 +51,7 @@ def without_speckles(depth: NDArray, camera: Camera, sigma: float = 0.0) -> NDAr
     """
     depth = _image(depth, camera)
     out = np.empty_like(depth)
-    seen, kept = kernels.drop_speckles(depth, max(_STEP, _ALIKE * sigma), slope_of(camera, _SLANT), _ALONE, _AROUND, out)
+    seen, kept = kernels.drop_speckles(depth, max(_STEP, _ALIKE * sigma), slope_of(camera, _SLANT), _ALONE, _AROUND if closed else _NEVER, out)
     return out if 2 * kept >= seen else depth
 
 

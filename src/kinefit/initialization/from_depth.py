@@ -180,7 +180,7 @@ def _views(
         if depth.shape != (camera.size[1], camera.size[0]):
             problem = f"a depth image of shape {depth.shape}, camera {camera.name} has {camera.size}"
             raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
-        depth = without_speckles(np.where((depth > 0) & (depth < np.inf), depth, 0.0), camera)
+        depth = without_speckles(np.where((depth > 0) & (depth < np.inf), depth, 0.0), camera, closed=True)
     if points is None:
         if depth is None:
             raise ObservationError("neither points nor a depth image", remedy="Give one of them.")
