@@ -274,8 +274,8 @@ def _kinds(
     """Rows of all but surfaces, rows of surfaces, and how many of points there are."""
     parts: list[AnyRows] = []
     surface: list[Rows] = []
-    same = without is None or isinstance(without, np.ndarray)
-    for m, off in zip(matched, [without] * len(matched) if same else without):
+    each = [without] * len(matched) if without is None or isinstance(without, np.ndarray) else without
+    for m, off in zip(matched, each):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
             rows = rows if off is None else left_out(rows, off)

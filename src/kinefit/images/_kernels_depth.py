@@ -67,7 +67,8 @@ def drop_speckles(depth, noise, slope, least, most, out):
 
     Of one surface: they differ by noise + slope * depth [m] at most. Beyond the image's edge there are none. Where
     `most` neighbours that stay are of one surface, their mean takes the place of what goes. Returns how many pixels are
-    measured and how many of them stay. Row by row without branches, so that the compiler handles many pixels at a time.
+    measured and how many of them stay. Two columns at least; row by row without branches, so that the compiler handles
+    many pixels at a time.
     """
     height, width = depth.shape
     none, one, empty = np.int32(0), np.int32(1), np.float32(0.0)
@@ -101,7 +102,7 @@ def drop_speckles(depth, noise, slope, least, most, out):
         for u in range(width):
             before += one if own[u] > empty else none
             after += one if line[u] > empty else none
-        seen, kept = seen + before, kept + after
+        seen, kept = seen + int(before), kept + int(after)
     if seen > kept:
         beside = np.empty(8, np.float32)
         for v in range(height):

@@ -50,8 +50,11 @@ def without_speckles(depth: NDArray, camera: Camera, sigma: float = 0.0, *, clos
         An image of another size than the camera's.
     """
     depth = _image(depth, camera)
+    if depth.shape[1] < 2:
+        return depth
     out = np.empty_like(depth)
-    seen, kept = kernels.drop_speckles(depth, max(_STEP, _ALIKE * sigma), slope_of(camera, _SLANT), _ALONE, _AROUND if closed else _NEVER, out)
+    noise, slope, around = max(_STEP, _ALIKE * sigma), slope_of(camera, _SLANT), _AROUND if closed else _NEVER
+    seen, kept = kernels.drop_speckles(depth, noise, slope, _ALONE, around, out)
     return out if 2 * kept >= seen else depth
 
 

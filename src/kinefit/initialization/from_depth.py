@@ -76,7 +76,7 @@ def start_from_points(
     depth : (H, W) [m], optional
         Its image, 0 where nothing was measured. It shows what is empty.
     background : (H, W) [m], optional
-        What it sees of the empty scene, 0 where that is not known: of a person's size in `depth`, only what is new is tried.
+        What it sees of the empty scene, 0 where that is not known: the person is sought in what is new.
     up : (3,) upwards, in the world
     count : int, poses at most
     attempts : int

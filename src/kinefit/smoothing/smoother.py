@@ -112,7 +112,7 @@ def smooth_results(
 
 def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> list[FrameResult]:
     """Frames that state nothing of joints that are `adrift`, nor of their coordinates."""
-    gone = adrift(body.tree, *(np.stack([getattr(r, name) for r in results]) for name in ("lost", "hidden")), half)
+    gone = adrift(body.tree, np.stack([r.lost for r in results]), np.stack([r.hidden for r in results]), half)
     of_dofs = np.concatenate([np.zeros((len(gone), 6), bool), gone[:, body.tree.owners]], axis=1)
     return [
         replace(
