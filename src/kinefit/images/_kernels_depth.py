@@ -103,7 +103,7 @@ def drop_speckles(depth, noise, slope, least, most, out):
             before += one if own[u] > empty else none
             after += one if line[u] > empty else none
         seen, kept = seen + int(before), kept + int(after)
-    if seen > kept:
+    if seen > kept and most <= 8:
         beside = np.empty(8, np.float32)
         for v in range(height):
             for u in range(width):
