@@ -133,10 +133,11 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
     r, body = person.recording, person.subject.body
     frames = r.depth
     camera = r.rig[next(iter(frames.values())).sensor]
+    empty = {r.rig[name].name: depth for name, depth in r.backgrounds.items()}.get(camera.name)
     if progress:
         progress("size", 0, 1)
     try:
-        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, up=r.up_axis)
+        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, background=empty, up=r.up_axis)
     except KinefitError as error:
         return replace(person, told={**person.told, "size": f"not found: {error.problem}"})
     finally:
