@@ -101,6 +101,11 @@ class MarkerMatched(Matched):
         """Name of the marker system."""
         return self.measurement.sensor
 
+    @property
+    def places(self) -> Sequence[tuple[str, str]]:  # type: ignore[override]
+        """Of every marker."""
+        return [(self.measurement.marker_set, name) for name in self.measurement.names]
+
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Three rows a marker."""
         m = self.measurement

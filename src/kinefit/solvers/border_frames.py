@@ -32,7 +32,8 @@ class Problem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation.
+    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives as
+    far as it is known without other worlds, NaN where it is not.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -159,12 +160,20 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
         A sensor whose rows differ in number or kind between two worlds.
     """
     centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
-    out = [np.zeros((sum(len(rows) for _, rows in parts), len(theta))) for parts in centre]
+    told = getattr(problem, "columns", None)
+    if told is None:
+        out = [np.full((sum(len(rows) for _, rows in parts), len(theta)), np.nan) for parts in centre]
+    else:
+        out = told(theta, steps, states)
+    unknown = [np.isnan(D) for D in out]
+    left = np.any([u.any(axis=0) for u in unknown], axis=0)
+    for D, u in zip(out, unknown):
+        D[u] = 0.0
     on = [_segments(parts) for parts in centre]
     touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
     if all(segment is not None for segment in on):
         touches = getattr(problem, "touches", touches)
-    for together in _apart(touches):
+    for together in _apart(touches, np.flatnonzero(left)):
         change = np.zeros(len(theta))
         change[together] = steps[together]
         for sign in (-1.0, 1.0):
@@ -173,8 +182,9 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
                 _same(parts, moved)
                 away = -sign * _stacked(moved) / 2.0
                 for k in together:
-                    touched, segment = touches[k], on[f]
-                    felt = slice(None) if touched is None or segment is None else np.isin(segment, list(touched))
+                    touched, segment, felt = touches[k], on[f], unknown[f][:, k]
+                    if touched is not None and segment is not None:
+                        felt = felt & np.isin(segment, list(touched))
                     out[f][felt, k] += away[felt] / steps[k]
     return out
 
@@ -186,11 +196,12 @@ def _segments(parts: Sequence[Part]) -> NDArray | None:
     return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
 
 
-def _apart(touches: Sequence[frozenset[int] | None]) -> list[list[int]]:
-    """Parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
+def _apart(touches: Sequence[frozenset[int] | None], some: NDArray) -> list[list[int]]:
+    """Some parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
     groups: list[tuple[list[int], set[int]]] = []
     out: list[list[int]] = []
-    for k, segments in enumerate(touches):
+    for k in map(int, some):
+        segments = touches[k]
         if segments is None:
             out.append([k])
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World
+from kinefit.subject.point_moves import PointMoves
 
 _KEPT = 64  # worlds that are remembered
 _SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
@@ -27,6 +29,7 @@ class Worlds:
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
+        self._bare: Worlds | None = None
         self._scenes: dict[int, tuple[Body, Scene]] = {}
 
     def at(self, theta: NDArray) -> World:
@@ -50,6 +53,23 @@ class Worlds:
         for one, own in self._parameters:
             out += getattr(one, "touches", (None,) * (own.stop - own.start))
         return tuple(out)
+
+    @property
+    def of_points(self) -> NDArray:
+        """(p,) bool, parameters that move nothing but points and joints of the body."""
+        told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
+        return np.concatenate(told)
+
+    def beside(self, theta: NDArray, steps: NDArray, some: Sequence[int]) -> list[tuple[Body, Body]]:
+        """Bodies a step below and above in some parameters; without surfaces where no parameter needs them."""
+        worlds = self
+        if self.of_points.all():
+            if self._bare is None:
+                bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
+                self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
+            worlds = self._bare
+        changes = steps * np.eye(len(theta))
+        return [(worlds.at(theta - changes[k]).body, worlds.at(theta + changes[k]).body) for k in some]
 
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body share what was made for it."""
@@ -93,6 +113,23 @@ class MatchedFrames:
         for i, (measurement, matched) in enumerate(zip(self._steps[frame], self._matched[frame], strict=True)):
             rows = self._rows((frame, i), measurement.sensor, matched, scene, world)
             out += [(measurement.sensor, part) for part in rows]
+        return out
+
+    def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
+        """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
+        world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
+        some = len(moving) and any(m.places is not None for several in self._matched for m in several)
+        moves = PointMoves(self._worlds.beside(theta, steps, moving), steps[moving]) if some else None
+        out = []
+        for f, state in enumerate(states):
+            scene, blocks = self._scene(world, f, state), [np.empty((0, len(theta)))]
+            for i, matched in enumerate(self._matched[f]):
+                for rows in self._rows((f, i), matched.sensor, matched, scene, world):
+                    blocks.append(np.full((len(rows), len(theta)), np.nan))
+                    told = None if moves is None else moves.columns(matched, rows, scene)
+                    if told is not None:
+                        blocks[-1][:, moving] = told
+            out.append(np.concatenate(blocks))
         return out
 
     def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:

@@ -1,0 +1,80 @@
+"""How points of a body move with parameters: derivatives of rows of points, without the rows of other worlds.
+
+A row of a point feels the body by where the point sits in its segment and where joints sit in their parents'. Both do
+not depend on the pose: their derivatives are differences between bodies, taken once for all frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, KinematicTree, PointSet
+from kinefit.rows import AnyRows, Rows
+from kinefit.sensors.base import Matched
+from kinefit.sensors.scene import Scene
+
+Place = tuple[str, str]
+"""A set of points and a name in it; landmarks are in the set ""."""
+
+
+class PointMoves:
+    """Derivatives of a body's points and joints by some parameters that move nothing else.
+
+    Parameters
+    ----------
+    pairs : p bodies a step below and above
+    steps : (p,)
+    """
+
+    def __init__(self, pairs: Sequence[tuple[Body, Body]], steps: NDArray) -> None:
+        def slope(of: Callable[[Body], NDArray]) -> NDArray:
+            return np.stack([(of(b) - of(a)) / (2.0 * step) for (a, b), step in zip(pairs, steps)], axis=-1)
+
+        self._offsets = slope(lambda body: body.tree.offsets)
+        self._points: dict[Place, NDArray] = {}
+        for name, points in _sets(pairs[0][0]).items():
+            moves = slope(lambda body, name=name: _sets(body)[name].points)  # type: ignore[misc]
+            self._points.update({(name, point): moves[k] for k, point in enumerate(points.names)})
+        self._chosen: dict[tuple[Place, ...], NDArray] = {}
+
+    def columns(self, matched: Matched, rows: AnyRows, scene: Scene) -> NDArray | None:
+        """(N, p) how far the points of rows move along their directions, whitened; None where rows do not tell."""
+        if matched.places is None or not isinstance(rows, Rows) or scene.morphing is not None:
+            return None
+        places = self._of(tuple(matched.places))
+        if places is None:
+            return None
+        scene = scene.at_time(matched.time)
+        turns = scene.frames[:, :9].reshape(-1, 3, 3)
+        which, first, row = np.unique(rows.group, return_index=True, return_inverse=True)
+        owner = rows.segment[first]
+        moved = _joints(scene.body.tree, turns, self._offsets)[owner] + turns[owner] @ places[which]
+        weighed = np.sqrt(rows.weight)[:, None] * rows.direction
+        return np.asarray((weighed[:, None] @ moved[row])[:, 0])
+
+    def _of(self, places: tuple[Place, ...]) -> NDArray | None:
+        """(M, 3, p) derivatives of points in their segments."""
+        if places not in self._chosen:
+            if not all(place in self._points for place in places):
+                return None
+            self._chosen[places] = np.stack([self._points[place] for place in places])
+        return self._chosen[places]
+
+
+def _joints(tree: KinematicTree, turns: NDArray, offsets: NDArray) -> NDArray:
+    """(S, 3, p) derivatives of joint centres in the world."""
+    out = turns[tree.parents] @ offsets
+    out[0] = 0.0
+    for s in range(1, len(out)):
+        out[s] += out[tree.parents[s]]
+    return out
+
+
+def _sets(body: Body) -> dict[str, PointSet]:
+    """All sets of points; those of one name, of keypoints and of markers, are left out."""
+    both = body.marker_sets.keys() & body.keypoint_sets.keys()
+    sets = {**body.marker_sets, **body.keypoint_sets, "": body.landmarks}
+    return {name: points for name, points in sets.items() if name not in both}
