@@ -7,8 +7,8 @@ import pytest
 
 from kinefit import Markers, load_body
 from kinefit.geometry.camera import Rig
-from kinefit.subject.keypoints import Subject
 from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
+from kinefit.subject.subject import Subject
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.unknowns import of_all, of_points

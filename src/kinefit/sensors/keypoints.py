@@ -80,8 +80,9 @@ class Layout:
     @cached_property
     def places(self) -> tuple[tuple[str, str], ...]:
         """(N,) keypoint set and name of every channel's point."""
-        sets = [(name, point) for name, span in self.channels.sets.items() for point in self.channels.points.names[span]]
-        return tuple(sets[k] for k in self.channels.column)
+        c = self.channels
+        known = [(name, point) for name, span in c.sets.items() for point in c.points.names[span]]
+        return tuple(known[k] for k in c.column)
 
     @staticmethod
     def _of(channels: Channels) -> PointSet:

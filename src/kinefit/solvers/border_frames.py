@@ -32,8 +32,8 @@ class Problem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives as
-    far as it is known without other worlds, NaN where it is not.
+    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives
+    as far as it is known without other worlds, NaN where it is not.
     """
 
     def body(self, theta: NDArray) -> Body:

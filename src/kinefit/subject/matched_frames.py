@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part
 from kinefit.subject.lasting import Seen
-from kinefit.subject.parameters import Parameters, World
+from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.subject import SubjectFit
 
 _KEPT = 64  # worlds that are remembered
 _SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
@@ -60,7 +61,7 @@ class Worlds:
         told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
         return np.concatenate(told)
 
-    def beside(self, theta: NDArray, steps: NDArray, some: Sequence[int]) -> list[tuple[Body, Body]]:
+    def beside(self, theta: NDArray, steps: NDArray, some: Iterable[int]) -> list[tuple[Body, Body]]:
         """Bodies a step below and above in some parameters; without surfaces where no parameter needs them."""
         worlds = self
         if self.of_points.all():
@@ -126,7 +127,10 @@ class MatchedFrames:
             for i, matched in enumerate(self._matched[f]):
                 for rows in self._rows((f, i), matched.sensor, matched, scene, world):
                     blocks.append(np.full((len(rows), len(theta)), np.nan))
-                    told = None if moves is None else moves.columns(matched, rows, scene)
+                    if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
+                        continue
+                    there = scene.at_time(matched.time)
+                    told = moves.columns(matched.places, rows, there.body.tree, there.frames)
                     if told is not None:
                         blocks[-1][:, moving] = told
             out.append(np.concatenate(blocks))
@@ -165,6 +169,12 @@ class MatchedFrames:
         time = several[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
         return scene.at(state, time=time, velocity=velocity, measurements=several)
+
+
+def point_moves(found: SubjectFit) -> PointMoves:
+    """How points and joints move with the parameters of a fit, all of which move nothing else."""
+    worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
+    return PointMoves(worlds.beside(found.mean, step, range(len(step))), step)
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

@@ -135,7 +135,7 @@ class KnownLengths(SegmentScales):
 
     Parameters
     ----------
-    scales, covariance : (G,) of the body's lengths, and (G, G) of them
+    scales, covariance : (G,) of the body's lengths, and (G, G) of their logarithms
     """
 
     scales: NDArray = field(default_factory=lambda: np.ones(0))
@@ -149,7 +149,7 @@ class KnownLengths(SegmentScales):
     @property
     def information(self) -> NDArray:
         """(G, G)."""
-        return np.linalg.inv(self.covariance / np.outer(self.scales, self.scales))
+        return np.linalg.inv(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)

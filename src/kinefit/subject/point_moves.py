@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, KinematicTree, PointSet
-from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Matched
-from kinefit.sensors.scene import Scene
+from kinefit.rows import Rows
 
 Place = tuple[str, str]
 """A set of points and a name in it; landmarks are in the set ""."""
@@ -40,20 +38,31 @@ class PointMoves:
             self._points.update({(name, point): moves[k] for k, point in enumerate(points.names)})
         self._chosen: dict[tuple[Place, ...], NDArray] = {}
 
-    def columns(self, matched: Matched, rows: AnyRows, scene: Scene) -> NDArray | None:
-        """(N, p) how far the points of rows move along their directions, whitened; None where rows do not tell."""
-        if matched.places is None or not isinstance(rows, Rows) or scene.morphing is not None:
+    def columns(self, places: Sequence[Place], rows: Rows, tree: KinematicTree, frames: NDArray) -> NDArray | None:
+        """(N, p) how far the points of rows move along their directions, whitened; None where a point is not known.
+
+        Parameters
+        ----------
+        places : of the points that rows number by group
+        tree, frames : of the body, and (S, 12) of its segments
+        """
+        moves = self._of(tuple(places))
+        if moves is None:
             return None
-        places = self._of(tuple(matched.places))
-        if places is None:
-            return None
-        scene = scene.at_time(matched.time)
-        turns = scene.frames[:, :9].reshape(-1, 3, 3)
+        turns = frames[:, :9].reshape(-1, 3, 3)
         which, first, row = np.unique(rows.group, return_index=True, return_inverse=True)
         owner = rows.segment[first]
-        moved = _joints(scene.body.tree, turns, self._offsets)[owner] + turns[owner] @ places[which]
+        moved = self.joints(tree, frames)[owner] + turns[owner] @ moves[which]
         weighed = np.sqrt(rows.weight)[:, None] * rows.direction
         return np.asarray((weighed[:, None] @ moved[row])[:, 0])
+
+    def joints(self, tree: KinematicTree, frames: NDArray) -> NDArray:
+        """(S, 3, p) how joint centres move in the world, the pose as it is."""
+        out = frames[:, :9].reshape(-1, 3, 3)[tree.parents] @ self._offsets
+        out[0] = 0.0
+        for s in range(1, len(out)):
+            out[s] += out[tree.parents[s]]
+        return out
 
     def _of(self, places: tuple[Place, ...]) -> NDArray | None:
         """(M, 3, p) derivatives of points in their segments."""
@@ -62,15 +71,6 @@ class PointMoves:
                 return None
             self._chosen[places] = np.stack([self._points[place] for place in places])
         return self._chosen[places]
-
-
-def _joints(tree: KinematicTree, turns: NDArray, offsets: NDArray) -> NDArray:
-    """(S, 3, p) derivatives of joint centres in the world."""
-    out = turns[tree.parents] @ offsets
-    out[0] = 0.0
-    for s in range(1, len(out)):
-        out[s] += out[tree.parents[s]]
-    return out
 
 
 def _sets(body: Body) -> dict[str, PointSet]:
