@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -173,7 +173,7 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
     touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
     if all(segment is not None for segment in on):
         touches = getattr(problem, "touches", touches)
-    for together in _apart(touches, np.flatnonzero(left)):
+    for together in apart(touches, np.flatnonzero(left)):
         change = np.zeros(len(theta))
         change[together] = steps[together]
         for sign in (-1.0, 1.0):
@@ -196,7 +196,7 @@ def _segments(parts: Sequence[Part]) -> NDArray | None:
     return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
 
 
-def _apart(touches: Sequence[frozenset[int] | None], some: NDArray) -> list[list[int]]:
+def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list[list[int]]:
     """Some parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
     groups: list[tuple[list[int], set[int]]] = []
     out: list[list[int]] = []

@@ -24,7 +24,7 @@ _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones,
 _BELIEF = 5.0  # axes of points that this counts for
 _UNTOLD = 1.6  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
-_ROUNDS = 3  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
+_ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
 _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
 
 

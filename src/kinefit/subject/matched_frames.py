@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.border_frames import Part
+from kinefit.solvers.border_frames import Part, apart
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import PointMoves
@@ -61,16 +61,20 @@ class Worlds:
         told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
         return np.concatenate(told)
 
-    def beside(self, theta: NDArray, steps: NDArray, some: Iterable[int]) -> list[tuple[Body, Body]]:
-        """Bodies a step below and above in some parameters; without surfaces where no parameter needs them."""
+    def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
+        """How points move with some parameters, all of which move nothing else; by central differences."""
         worlds = self
-        if self.of_points.all():
+        if self.of_points.all():  # surfaces would be stretched for nothing
             if self._bare is None:
                 bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
                 self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
             worlds = self._bare
-        changes = steps * np.eye(len(theta))
-        return [(worlds.at(theta - changes[k]).body, worlds.at(theta + changes[k]).body) for k in some]
+        pairs = []
+        for together in apart(self.touches, some):
+            change = np.zeros(len(theta))
+            change[together] = steps[together]
+            pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
+        return PointMoves(pairs, some, steps, self.touches)
 
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body share what was made for it."""
@@ -120,7 +124,7 @@ class MatchedFrames:
         """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
         world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
         some = len(moving) and any(m.places is not None for several in self._matched for m in several)
-        moves = PointMoves(self._worlds.beside(theta, steps, moving), steps[moving]) if some else None
+        moves = self._worlds.moves(theta, steps, moving) if some else None
         out = []
         for f, state in enumerate(states):
             scene, blocks = self._scene(world, f, state), [np.empty((0, len(theta)))]
@@ -174,7 +178,7 @@ class MatchedFrames:
 def point_moves(found: SubjectFit) -> PointMoves:
     """How points and joints move with the parameters of a fit, all of which move nothing else."""
     worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
-    return PointMoves(worlds.beside(found.mean, step, range(len(step))), step)
+    return worlds.moves(found.mean, step, np.arange(len(step)))
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

@@ -6,7 +6,7 @@ not depend on the pose: their derivatives are differences between bodies, taken 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,30 @@ class PointMoves:
 
     Parameters
     ----------
-    pairs : p bodies a step below and above
+    pairs : parameters that change together, and bodies a step below and above in them
+    some : (q,) the parameters that columns are wanted of
     steps : (p,)
+    touches : (p,) of each parameter the segments whose points alone it moves; None for one that moves joints
     """
 
-    def __init__(self, pairs: Sequence[tuple[Body, Body]], steps: NDArray) -> None:
-        def slope(of: Callable[[Body], NDArray]) -> NDArray:
-            return np.stack([(of(b) - of(a)) / (2.0 * step) for (a, b), step in zip(pairs, steps)], axis=-1)
-
-        self._offsets = slope(lambda body: body.tree.offsets)
-        self._points: dict[Place, NDArray] = {}
-        for name, points in _sets(pairs[0][0]).items():
-            moves = slope(lambda body, name=name: _sets(body)[name].points)  # type: ignore[misc]
-            self._points.update({(name, point): moves[k] for k, point in enumerate(points.names)})
+    def __init__(
+        self, pairs: Sequence[tuple[list[int], Body, Body]], some: NDArray, steps: NDArray,
+        touches: Sequence[frozenset[int] | None],
+    ) -> None:  # fmt: skip
+        body, column = pairs[0][1], {int(k): j for j, k in enumerate(some)}
+        self._offsets = np.zeros((*body.tree.offsets.shape, len(some)))
+        owner = np.concatenate([points.segments for points in _sets(body).values()])
+        slopes = np.zeros((len(owner), 3, len(some)))
+        for together, below, above in pairs:
+            joints, points = above.tree.offsets - below.tree.offsets, _places(above) - _places(below)
+            for k in together:
+                touched, width = touches[k], 2.0 * steps[k]
+                if touched is None:
+                    self._offsets[:, :, column[k]] = joints / width
+                felt = slice(None) if touched is None else np.isin(owner, list(touched))
+                slopes[felt, :, column[k]] = points[felt] / width
+        names = [(name, point) for name, points in _sets(body).items() for point in points.names]
+        self._points = dict(zip(names, slopes))
         self._chosen: dict[tuple[Place, ...], NDArray] = {}
 
     def columns(self, places: Sequence[Place], rows: Rows, tree: KinematicTree, frames: NDArray) -> NDArray | None:
@@ -78,3 +89,8 @@ def _sets(body: Body) -> dict[str, PointSet]:
     both = body.marker_sets.keys() & body.keypoint_sets.keys()
     sets = {**body.marker_sets, **body.keypoint_sets, "": body.landmarks}
     return {name: points for name, points in sets.items() if name not in both}
+
+
+def _places(body: Body) -> NDArray:
+    """(M, 3) [m] of all points of all sets in their segments."""
+    return np.concatenate([points.points for points in _sets(body).values()])
