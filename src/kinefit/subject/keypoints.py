@@ -17,6 +17,8 @@ from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.triangulation import triangulated
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
+from kinefit.subject.lasting import excess
+from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
@@ -99,14 +101,26 @@ def _fitted(
         points = [PointOffsets(body, name, spread) for name in channels.sets if name]
         if start is None:
             start = np.concatenate([np.log(scales), *(one.mean for one in points)])
-        found = joint.fit_subject(body, channels.rig, steps, states, [lengths, *points], start=start, rounds=1)
+        found = joint.fit_subject(
+            body, channels.rig, steps, states, [lengths, *points], start=start, rounds=1, looks=len(steps)
+        )
         start, states = found.mean, found.states
-        more = 1.0 / min(found.excess.get(NAME, 1.0), 1.0)  # detectors may be better than they are said to be
-        covariance = inverse(found.prior.information + more * found.information)
+        covariance = inverse(found.prior.information + found.information / _excess(found, steps))
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(found.prior.information), spread**-2)
         told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
     return found, _UNTOLD * covariance
+
+
+def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:
+    """How many times larger than assumed a channel's variance is once all frames are averaged; 1 where too few tell.
+
+    It scales what data say of themselves, not the fit: less weight would leave the lengths to the prior.
+    """
+    worlds, prior = Worlds(found.prior_world, found.parameters), found.prior.information
+    frames = MatchedFrames(worlds, steps, None, None, found.mean, found.states, joint.REACH[0])
+    known = len(found.mean) - float(np.sum(prior * inverse(prior + found.information)))
+    return excess(frames.seen(found.mean, found.states), found.body.tree.n_dofs + known).get(NAME, 1.0)
 
 
 def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:
