@@ -24,7 +24,7 @@ from kinefit.simulation import cut, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take import track_take
 from kinefit.tracking.take_recording import recording_of

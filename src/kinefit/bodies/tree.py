@@ -180,16 +180,6 @@ class KinematicTree:
             problem = f"a state with {count} angles for a body with {len(self.coordinates)}"
             raise BodyError(problem, remedy="Is the state that of another body?")
 
-    @cached_property
-    def moved_by(self) -> NDArray:
-        """(S, 6 + D) bool, whether each degree of freedom moves each segment."""
-        out = np.zeros((len(self.segments), self.n_dofs), bool)
-        out[:, :6] = True
-        for s, parent in enumerate(self.parents):
-            out[s] |= out[parent] if parent >= 0 else False
-            out[s, 6 + self.dof_start[s] : 6 + self.dof_start[s + 1]] = True
-        return _frozen(out, bool)
-
     def segment_jacobian(self, screws: NDArray, segment: int) -> NDArray:
         """J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin for each degree of freedom."""
         out = np.zeros((6, self.n_dofs))

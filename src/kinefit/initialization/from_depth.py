@@ -21,8 +21,8 @@ from kinefit.images.depth_noise import denoised, noise_of, without_speckles
 from kinefit.images.depth_scene import Blob, find_floor, foreground, people
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.depth_view import DepthView, splat, view_of
-from kinefit.subject import fit as joint
 from kinefit.subject.depth import fit_surfaces
+from kinefit.subject.subject import SubjectFit
 
 _GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m; and half
 # of it, for those who stand by a table or a wall: people are then still closed, a pixel is some centimetres wide
@@ -121,7 +121,7 @@ def sized_start(
     up: ArrayLike = (0.0, 1.0, 0.0),
     rounds: int = 2,
     seed: int = 0,
-) -> tuple[joint.Subject, list[Start]]:
+) -> tuple[SubjectFit, list[Start]]:
     """The person's own size, and a pose in each of a few depth images: poses, sizes, better poses, better sizes.
 
     With a body of another size limbs lie on the trunk's border; once the trunk is as wide as the person's they are

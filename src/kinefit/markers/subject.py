@@ -20,6 +20,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
 from kinefit.subject import fit as joint
 from kinefit.subject.parameters import PointOffsets, SegmentScales
+from kinefit.subject.subject import SubjectFit
 
 Progress = Callable[[str, int, int], None]
 
@@ -258,7 +259,7 @@ def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) ->
     return np.sort(usable[chosen])
 
 
-def _residuals(found: joint.Subject, marker_set: str, x: NDArray) -> NDArray:
+def _residuals(found: SubjectFit, marker_set: str, x: NDArray) -> NDArray:
     """(F, K) [m] lengths of residuals of the frames that a fit is of."""
     roots, angles = (np.stack([getattr(s, n) for s in found.states]) for n in ("T_world_root", "angles"))
     return np.linalg.norm(x - found.body.trajectories(roots, angles, found.body.markers(marker_set)), axis=2)

@@ -99,8 +99,8 @@ class Matched(ABC):
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
-    of_set : marker set of the body and names of the points in it that the rows are of, counted by their `group`; None
-        for other rows. A subject fit then differentiates all frames at once.
+    places : (M,) set and name of the body's points that its `Rows` number by group, "" for landmarks, where every row
+        says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
     """
 
     sensor: str = ""
@@ -108,7 +108,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
-    of_set: tuple[str, tuple[str, ...]] | None = None
+    places: Sequence[tuple[str, str]] | None = None
 
     @property
     def key(self) -> bytes:

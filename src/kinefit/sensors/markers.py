@@ -102,9 +102,9 @@ class MarkerMatched(Matched):
         return self.measurement.sensor
 
     @property
-    def of_set(self) -> tuple[str, tuple[str, ...]] | None:  # type: ignore[override]
-        """Their marker set and names; None for landmarks."""
-        return (self.measurement.marker_set, self.measurement.names) if self.measurement.marker_set else None
+    def places(self) -> Sequence[tuple[str, str]]:  # type: ignore[override]
+        """Of every marker."""
+        return [(self.measurement.marker_set, name) for name in self.measurement.names]
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Three rows a marker."""

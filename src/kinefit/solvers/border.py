@@ -37,7 +37,7 @@ _LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
 _NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
-_LEAST = 3.0  # [1/m², 1/rad²] damping of poses when they move with parameters
+_LEAST = 0.3  # [1/m², 1/rad²] damping of poses when they move with parameters
 
 
 @dataclass(frozen=True, eq=False)

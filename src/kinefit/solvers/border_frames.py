@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -35,8 +35,8 @@ class Problem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation. It may have `places(theta, states)`: of every frame and part (K, 3) [m]
-    where the points are that its rows' groups count, or None; derivatives are then those of these points.
+    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives
+    as far as it is known without other worlds, NaN where it is not.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -163,25 +163,34 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
         A sensor whose rows differ in number or kind between two worlds.
     """
     centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
-    out = [np.zeros((sum(len(rows) for _, rows in parts), len(theta))) for parts in centre]
+    told = getattr(problem, "columns", None)
+    if told is None:
+        out = [np.full((sum(len(rows) for _, rows in parts), len(theta)), np.nan) for parts in centre]
+    else:
+        out = told(theta, steps, states)
+    unknown = [np.isnan(D) for D in out]
+    left = np.any([u.any(axis=0) for u in unknown], axis=0)
+    for D, u in zip(out, unknown):
+        D[u] = 0.0
     on = [_segments(parts) for parts in centre]
     touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
     if all(segment is not None for segment in on):
         touches = getattr(problem, "touches", touches)
-    for together in _apart(touches):
+    for together in apart(touches, np.flatnonzero(left)):
         change = np.zeros(len(theta))
         change[together] = steps[together]
         owner = _owner(together, touches, len(problem.body(theta).tree.segments))
-        all_frames = _by_places(problem, theta, change, states, centre)
         for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-            away = _by_rows(problem, theta, change, f, state, parts) if all_frames is None else all_frames[f]
+            if not unknown[f][:, together].any():
+                continue
+            away = _by_rows(problem, theta, change, f, state, parts)
             segment = on[f]
-            if owner is None or segment is None:
-                out[f][:, together[0]] = away / steps[together[0]]
-            else:
+            k = np.full(len(away), together[0])
+            if owner is not None and segment is not None:
                 k = owner[segment]
-                felt = np.flatnonzero(k >= 0)
-                out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
+            felt = np.flatnonzero(k >= 0)
+            felt = felt[unknown[f][felt, k[felt]]]
+            out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
     return out
 
 
@@ -195,33 +204,6 @@ def _by_rows(
     return (_stacked(ends[1]) - _stacked(ends[0])) / 2.0
 
 
-def _by_places(
-    problem: Problem, theta: NDArray, change: NDArray, states: Sequence[BodyState], centre: Sequence[Sequence[Part]]
-) -> list[NDArray] | None:
-    """The same of all frames, from where the points are on either side; None where the problem does not say."""
-    places = getattr(problem, "places", None)
-    after, before = (places(theta + sign * change, states) if places else None for sign in (1.0, -1.0))
-    if after is None or before is None:
-        return None
-    return [
-        np.concatenate([_along(rows, (x - y) / 2.0) for (_, rows), x, y in zip(parts, a, b, strict=True)])
-        for parts, a, b in zip(centre, after, before, strict=True)
-    ]
-
-
-def _along(rows: AnyRows, moved: NDArray) -> NDArray:
-    """(N,) whitened moves of rows whose points (K, 3) [m] move so."""
-    assert isinstance(rows, Rows)
-    return np.asarray(np.sqrt(rows.weight) * np.einsum("ni,ni->n", rows.direction, moved[rows.group]))
-
-
-def _segments(parts: Sequence[Part]) -> NDArray | None:
-    """(N,) the segment of every row; None where a row may be about several."""
-    if not all(isinstance(rows, Rows) for _, rows in parts):
-        return None
-    return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
-
-
 def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], count: int) -> NDArray | None:
     """(S,) which of some parameters each of so many segments feels, -1 for none; None for one felt everywhere."""
     out = np.full(count, -1)
@@ -233,11 +215,19 @@ def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], co
     return out
 
 
-def _apart(touches: Sequence[frozenset[int] | None]) -> list[list[int]]:
-    """Parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
+def _segments(parts: Sequence[Part]) -> NDArray | None:
+    """(N,) the segment of every row; None where a row may be about several."""
+    if not all(isinstance(rows, Rows) for _, rows in parts):
+        return None
+    return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
+
+
+def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list[list[int]]:
+    """Some parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
     groups: list[tuple[list[int], set[int]]] = []
     out: list[list[int]] = []
-    for k, segments in enumerate(touches):
+    for k in map(int, some):
+        segments = touches[k]
         if segments is None:
             out.append([k])
             continue

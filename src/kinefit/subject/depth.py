@@ -26,6 +26,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface_match import SurfacePairs
 from kinefit.subject import fit as joint
 from kinefit.subject.parameters import Parameters, SegmentScales
+from kinefit.subject.subject import SubjectFit
 from kinefit.subject.surfaces import Girths
 
 # Chosen on ten simulated people in three postures each, off by 5° and 3 cm; the figure `size_lengths` has four of them.
@@ -47,7 +48,7 @@ def fit_surfaces(
     views: Sequence[DepthView] = (),
     sigma: float = 0.01,
     points: int = 500,
-) -> joint.Subject:
+) -> SubjectFit:
     """Lengths and girths of a body from clouds of the person in poses that are about known.
 
     Parameters
@@ -93,7 +94,7 @@ def fit_surfaces(
         parameters.append(Girths(body))
     groups = np.arange(sum(len(p.names) for p in parameters)) < len(body.scale_groups)
 
-    def fitted(states: Sequence[BodyState], start: NDArray, rounds: int, reach: Sequence[float]) -> joint.Subject:
+    def fitted(states: Sequence[BodyState], start: NDArray, rounds: int, reach: Sequence[float]) -> SubjectFit:
         return joint.fit_subject(
             body, rig, steps, states, parameters, start=start, reach=reach, rounds=rounds, looks=_LOOKS * len(steps),
             posture=_POSTURE, coarse=_COARSE,
@@ -104,7 +105,7 @@ def fit_surfaces(
     return fitted(best.states, best.mean, _ROUNDS, joint.REACH[-1:])
 
 
-def _misfit(found: joint.Subject, steps: Sequence[Sequence[Measurement]]) -> float:
+def _misfit(found: SubjectFit, steps: Sequence[Sequence[Measurement]]) -> float:
     """What stands out, less the points that the body explains; alike for fits with other correspondences."""
     total, soft = 0.0, joint.REACH[-1]
     for state, several in zip(found.states, steps):

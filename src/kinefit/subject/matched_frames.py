@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.border_frames import Part
+from kinefit.solvers.border_frames import Part, apart
 from kinefit.subject.lasting import Seen
-from kinefit.subject.parameters import Parameters, World
+from kinefit.subject.parameters import Parameters, World, stacked
+from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.subject import SubjectFit
 
 _KEPT = 64  # worlds that are remembered
 _SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
@@ -24,15 +26,16 @@ class Worlds:
     """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
-        self.first = world
+        self._first = world
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
+        self._bare: Worlds | None = None
         self._scenes: dict[int, tuple[Body, Scene]] = {}
 
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
-        world = self.first
+        world = self._first
         for one, own in self._parameters:
             values = theta[own]
             key = id(world), values.tobytes()
@@ -51,6 +54,27 @@ class Worlds:
         for one, own in self._parameters:
             out += getattr(one, "touches", (None,) * (own.stop - own.start))
         return tuple(out)
+
+    @property
+    def of_points(self) -> NDArray:
+        """(p,) bool, parameters that move nothing but points and joints of the body."""
+        told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
+        return np.concatenate(told)
+
+    def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
+        """How points move with some parameters, all of which move nothing else; by central differences."""
+        worlds = self
+        if self.of_points.all():  # surfaces would be stretched for nothing
+            if self._bare is None:
+                bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
+                self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
+            worlds = self._bare
+        pairs = []
+        for together in apart(self.touches, some):
+            change = np.zeros(len(theta))
+            change[together] = steps[together]
+            pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
+        return PointMoves(pairs, some, steps, self.touches)
 
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body share what was made for it."""
@@ -96,28 +120,25 @@ class MatchedFrames:
             out += [(measurement.sensor, part) for part in rows]
         return out
 
-    def places(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[NDArray]] | None:
-        """(K, 3) [m] of every frame and its rows where the points of the body are that these are of, at once.
-
-        None where rows are of others, or where more than the body differs from what the parameters are about.
-        """
-        world, first = self._worlds.at(theta), self._worlds.first
-        if self._points is None or world.rig is not first.rig or world.values != first.values or world.body.morphs:
-            return None
-        roots, angles = (np.stack([getattr(s, n) for s in states]) for n in ("T_world_root", "angles"))
-        names = {name for several in self._points for name, _ in several}
-        x = {name: world.body.trajectories(roots, angles, world.body.markers(name)) for name in names}
-        return [[x[name][f, index] for name, index in several] for f, several in enumerate(self._points)]
-
-    @cached_property
-    def _points(self) -> list[list[tuple[str, NDArray]]] | None:
-        """Of every frame and its rows the marker set and the points of it that these are of."""
-        told = [[one.of_set for one in several] for several in self._matched]
-        if self._velocities is not None or any(one is None for several in told for one in several):
-            return None
-        body = self._worlds.first.body
-        at = {s: {n: k for k, n in enumerate(body.markers(s).names)} for s in {o[0] for f in told for o in f if o}}
-        return [[(o[0], np.array([at[o[0]][n] for n in o[1]], np.int64)) for o in several if o] for several in told]
+    def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
+        """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
+        world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
+        some = len(moving) and any(m.places is not None for several in self._matched for m in several)
+        moves = self._worlds.moves(theta, steps, moving) if some else None
+        out = []
+        for f, state in enumerate(states):
+            scene, blocks = self._scene(world, f, state), [np.empty((0, len(theta)))]
+            for i, matched in enumerate(self._matched[f]):
+                for rows in self._rows((f, i), matched.sensor, matched, scene, world):
+                    blocks.append(np.full((len(rows), len(theta)), np.nan))
+                    if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
+                        continue
+                    there = scene.at_time(matched.time)
+                    told = moves.columns(matched.places, rows, there.body.tree, there.frames)
+                    if told is not None:
+                        blocks[-1][:, moving] = told
+            out.append(np.concatenate(blocks))
+        return out
 
     def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
         """What every frame's sensors saw, with the names of what they saw."""
@@ -152,6 +173,12 @@ class MatchedFrames:
         time = several[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
         return scene.at(state, time=time, velocity=velocity, measurements=several)
+
+
+def point_moves(found: SubjectFit) -> PointMoves:
+    """How points and joints move with the parameters of a fit, all of which move nothing else."""
+    worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
+    return worlds.moves(found.mean, step, np.arange(len(step)))
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

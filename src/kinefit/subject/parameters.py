@@ -44,7 +44,12 @@ class World:
 
 
 class Parameters(Protocol):
-    """One kind of parameters: names, a prior, and a function from values to a world."""
+    """One kind of parameters: names, a prior, and a function from values to a world.
+
+    It may have `of_points`, True where the values move nothing but points and joints of the body: derivatives of rows
+    of points then take no rows of other worlds. It may have `touches`, of each parameter the segments on which alone
+    rows can feel it.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -91,6 +96,7 @@ class SegmentScales:
     size: float | None = None
     about: float = 1.0
     proportions: float = PROPORTIONS
+    of_points = True
 
     def __post_init__(self) -> None:
         if not ((self.size is None or self.size > 0) and self.about > 0 and self.proportions > 0):
@@ -140,7 +146,7 @@ class KnownLengths(SegmentScales):
 
     Parameters
     ----------
-    scales, covariance : (G,) of the body's lengths, and (G, G) of them
+    scales, covariance : (G,) of the body's lengths, and (G, G) of their logarithms
     """
 
     scales: NDArray = field(default_factory=lambda: np.ones(0))
@@ -154,7 +160,7 @@ class KnownLengths(SegmentScales):
     @property
     def information(self) -> NDArray:
         """(G, G)."""
-        return np.linalg.inv(self.covariance / np.outer(self.scales, self.scales))
+        return np.linalg.inv(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +179,7 @@ class PointOffsets:
     name: str
     std: ArrayLike = 0.01
     mirror: bool | None = None
+    of_points = True
 
     def __post_init__(self) -> None:
         sets = {**self.body.keypoint_sets, **self.body.marker_sets}
