@@ -13,7 +13,7 @@ from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, 
 from kinefit.frame.prediction import belief
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged
 from kinefit.frame.skin import skin_of
-from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed
+from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
 from kinefit.rows import AnyRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
@@ -164,11 +164,11 @@ class FrameFit:
 
     def rows(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False,
-        without: NDArray | None = None,
+        without: Without = None,
     ) -> list[AnyRows]:  # fmt: skip
         """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart.
 
-        Measurements of the segments `without` (S,) bool weigh nothing.
+        Measurements of the segments `without` weigh nothing.
         """
         parts = rows_of(scene, matched, self.settings, without=without)
         if held is not None:
@@ -186,23 +186,27 @@ class FrameFit:
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
     def _judged(self, found: _Found, held: Held | None, told: Evidence, known: NDArray | None) -> Fitted:
-        """Where measurements contradict a segment, none of them makes it more certain."""
+        """Where measurements contradict a segment, none makes it more certain, nor does a surface that hides it."""
         scene, tree, H = found.scene, self.body.tree, found.H
         lost = told.lost if told.lost.any() else None
+        off = [unseen(m, scene) for m in found.matched]
         if lost is not None:
-            rows = self.rows(scene, held, found.matched, apart=found.apart, without=lost)
+            off = [lost if one is None else lost | one for one in off]
+        without = off if any(one is not None and one.any() for one in off) else None
+        if without is not None:
+            rows = self.rows(scene, held, found.matched, without=without)
             H = normal_equations(self.body, scene.state, rows).matrix
         if held is None:
             H = now = H + _TRACE * np.eye(len(H))  # where nothing measures the root, nothing holds it
         else:
             now = H - held[1] + _TRACE * np.eye(len(H))
-        seen = self._seen(scene, found.matched, now, lost)
+        seen = self._seen(scene, found.matched, now, without)
         known = seen[6:] if known is None else seen[6:] | known
         known = known | ~np.isfinite(tree.spread)
         alone = np.array(H)
         alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
         posterior = inverse(H)
-        stated = posterior + self._of_surfaces(scene, found.matched, now, lost)
+        stated = posterior + self._of_surfaces(scene, found.matched, now, without)
         if lost is not None:
             elsewhere = np.zeros(len(lost), bool) if told.elsewhere is None else lost & told.elsewhere
             gone = holding(tree, elsewhere) | (moving(tree, lost) & ~seen)
@@ -213,7 +217,7 @@ class FrameFit:
         return Fitted(result, inverse(alone), seen[6:], known)
 
     def _of_surfaces(
-        self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None
+        self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without
     ) -> NDArray:
         """(n, n) what the surfaces' own error, which lasts, adds to a pose, with the information of one time."""
         s, n = self.settings, self.body.tree.n_dofs
@@ -226,7 +230,7 @@ class FrameFit:
         moved = (skin.pushes if points >= n else skin.exact_pushes) @ inverse(now)
         return moved.T @ moved
 
-    def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: NDArray | None) -> NDArray:
+    def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n,) bool: what measurements observe, with the information of one time, the prior included.
 
         Keypoints observe no joint that hardly moves them, see `SHORTEST`: others must.
@@ -237,9 +241,10 @@ class FrameFit:
             return seen
         short = seen[6:] & ~levered(scene, pixels)
         if short.any():
-            others = [m for m in matched if not isinstance(m, KeypointMatched)]
+            others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
             if others:
-                rows = self.rows(scene, None, others, without=without)
+                off = without if without is None or isinstance(without, np.ndarray) else [without[k] for k in others]
+                rows = self.rows(scene, None, [matched[k] for k in others], without=off)
                 H = normal_equations(self.body, scene.state, rows).matrix + _TRACE * np.eye(len(now))
                 short &= ~observed(self.body.tree, H)[6:]
             seen[6:] &= ~short

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
+from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import AGREES
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers, near
@@ -61,6 +62,18 @@ def adrift(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> ND
     parents = np.where(tree.parents >= 0, tree.parents, np.arange(len(tree.parents)))
     unknown, contradicted = lost | hidden, lost | lost[:, parents]
     return np.asarray(unknown & unknown[:, parents] & near(contradicted, half))
+
+
+def unseen(matched: Matched, scene: Scene) -> NDArray | None:
+    """(S,) bool: segments that a surface does not show, or speaks against; None where its rows are of points.
+
+    What it has near one of these is another segment's, or no segment's: it may pull that one along, and tells nothing
+    of where it is. No more does it that parts of the body keep apart.
+    """
+    if not matched.shows_surface:
+        return None
+    told = matched.evidence(scene.at_time(matched.time))
+    return np.asarray(told.hidden | told.lost)
 
 
 def holding(tree: KinematicTree, segments: NDArray) -> NDArray:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.fit import rows_of
+from kinefit.frame.trust import unseen
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
@@ -131,7 +132,7 @@ class OtherSensors:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
             without = [unseen(m, scene) for m in matched] if judge else []
-            if unsure is not None and any(w is not None for w in without):
+            if unsure is not None and any(w is not None and w.any() for w in without):
                 sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
                 unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix
         span = slice(chosen.start, chosen.stop)
@@ -151,18 +152,6 @@ class OtherSensors:
             last = new if last is None else last.part(slice(span.start - first, None)).followed_by(new)
             first, done = span.start, span.stop
             yield last
-
-
-def unseen(matched: Matched, scene: Scene) -> NDArray | None:
-    """(S,) bool: segments that a surface does not show, or speaks against; None where its rows are of points.
-
-    What it has near one of these is another segment's, or no segment's: it may pull that one along, and tells nothing
-    of where it is. No more does it that parts of the body keep apart.
-    """
-    if not matched.shows_surface:
-        return None
-    told = matched.evidence(scene.at_time(matched.time))
-    return np.asarray(told.hidden | told.lost)
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

@@ -22,9 +22,9 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.border_frames import Part, Weighing, differences, frame_at, gram
 from kinefit.solvers.equations import joint_moves, normal_equations
 from kinefit.subject.matched_frames import Worlds
-from kinefit.subject.parameters import stacked
+from kinefit.subject.parameters import PointOffsets, stacked
 from kinefit.subject.subject import SubjectFit
-from kinefit.subject.surfaces import CylinderShape
+from kinefit.subject.surfaces import CylinderShape, Girths
 
 SAMPLED = 16
 """Frames in which answers are found; between them variances are interpolated. On three simulated takes of 60 frames the
@@ -72,14 +72,15 @@ def shape_errors(
     alone : K (n, n) covariances of each frame on its own, prior included
     """
     kept = np.concatenate([
-        np.full(len(p.names), not isinstance(p, CylinderShape)) for p in found.parameters
+        np.full(len(p.names), not isinstance(p, CylinderShape | Girths)) for p in found.parameters
     ])  # fmt: skip
+    wide = np.concatenate([np.full(len(p.names), not isinstance(p, PointOffsets)) for p in found.parameters])
     step, worlds = stacked(found.parameters)[3], Worlds(found.prior_world, found.parameters)
     Sigma = found.covariance[np.ix_(kept, kept)]
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
         scene, matched = seen(frame)
-        one = _Frame(worlds, scene, matched, found.mean, kept)
+        one = _Frame(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]))
         pushed = one.points(step) + one.surfaces(step, settings)
         answer = P @ pushed
         moves = joint_moves(scene.body, scene.state)
@@ -91,13 +92,17 @@ def shape_errors(
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """One frame's matches in the worlds of parameters (p,), of which q are kept: a problem of one frame."""
+    """One frame's matches in the worlds of parameters (p,), of which q are kept: a problem of one frame.
+
+    `wide` are those of the q that move more than places of points.
+    """
 
     worlds: Worlds
     scene: Scene
     matched: Sequence[Matched]
     theta: NDArray
     kept: NDArray
+    wide: NDArray
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
@@ -125,8 +130,7 @@ class _Frame:
         n, mean = self.scene.body.tree.n_dofs, self.theta[self.kept]
         out = np.zeros((n, len(mean)))
         shown = [m for m in self.matched if not m.of_points]
-        wide = [k for k, touched in enumerate(self.touches) if touched is None]
-        if not shown or not wide:
+        if not shown or not len(self.wide):
             return out
         beside = rows_of_points(self.scene, self.matched)
 
@@ -135,7 +139,7 @@ class _Frame:
             rows = [r for r in rows_of(scene, shown, settings, points=beside) if len(r)]
             return normal_equations(scene.body, scene.state, rows).gradient if rows else np.zeros(n)
 
-        for k in wide:
+        for k in self.wide:
             change = np.zeros(len(mean))
             change[k] = step[self.kept][k]
             out[:, k] = (gradient(mean + change) - gradient(mean - change)) / (2.0 * change[k])
@@ -145,12 +149,11 @@ class _Frame:
         """(S, 3, q) how joint centres move with the parameters, the pose as it is."""
         mean, state = self.theta[self.kept], self.scene.state
         out = np.zeros((len(self.scene.body.tree.segments), 3, len(mean)))
-        for k, touched in enumerate(self.touches):
-            if touched is None:
-                change = np.zeros(len(mean))
-                change[k] = step[self.kept][k]
-                a, b = (_centres(self.body(mean + sign * change), state) for sign in (1.0, -1.0))
-                out[:, :, k] = (a - b) / (2.0 * change[k])
+        for k in self.wide:
+            change = np.zeros(len(mean))
+            change[k] = step[self.kept][k]
+            a, b = (_centres(self.body(mean + sign * change), state) for sign in (1.0, -1.0))
+            out[:, :, k] = (a - b) / (2.0 * change[k])
         return out
 
     def _all(self, values: NDArray) -> NDArray:

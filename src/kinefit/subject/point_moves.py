@@ -26,7 +26,7 @@ class PointMoves:
     pairs : parameters that change together, and bodies a step below and above in them
     some : (q,) the parameters that columns are wanted of
     steps : (p,)
-    touches : (p,) of each parameter the segments whose points alone it moves; None for one that moves joints
+    touches : (p,) of each parameter the segments that it moves, or whose points; None for any
     """
 
     def __init__(
@@ -41,10 +41,9 @@ class PointMoves:
             joints, points = above.tree.offsets - below.tree.offsets, _places(above) - _places(below)
             for k in together:
                 touched, width = touches[k], 2.0 * steps[k]
-                if touched is None:
-                    self._offsets[:, :, column[k]] = joints / width
-                felt = slice(None) if touched is None else np.isin(owner, list(touched))
-                slopes[felt, :, column[k]] = points[felt] / width
+                here = np.ones(len(joints), bool) if touched is None else np.isin(np.arange(len(joints)), list(touched))
+                self._offsets[here, :, column[k]] = joints[here] / width
+                slopes[here[owner], :, column[k]] = points[here[owner]] / width
         names = [(name, point) for name, points in _sets(body).items() for point in points.names]
         self._points = dict(zip(names, slopes))
         self._chosen: dict[tuple[Place, ...], NDArray] = {}

@@ -146,7 +146,7 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
             progress("size", 1, 1)
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
     told = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
-    person = _wearing(person, replace(person.subject, body=fit.body), size=told)
+    person = replace(_by_joint(person, fit), told={**person.told, "size": told})
     return person if person.start is not None else replace(person, start=(step, best.state))
 
 
@@ -199,7 +199,7 @@ def _by_all(
     if points is not None:
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states
-    lengths = points is None and person.subject.fit is None
+    lengths = points is None and person.subject.fit is None and not person.joint
     left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
     if left is not None:
         found = fit(left, steps, states)
