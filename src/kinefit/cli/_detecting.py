@@ -39,18 +39,23 @@ class Job:
     video : Path
     file : Path
         Of the detections.
+    rate : float [Hz], optional
+        Of a video that is a folder of images.
     """
 
     camera: str
     video: Path
     file: Path
+    rate: float | None = None
 
 
 def jobs_of_take(take: Take) -> list[Job]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.detections import detections_file
 
-    found = [Job(c.name, c.video, detections_file(take.path, c.name)) for c in take.cameras if c.video is not None]
+    found = [
+        Job(c.name, c.video, detections_file(take.path, c.name), take.rate) for c in take.cameras if c.video is not None
+    ]
     if not found:
         raise TakeError(
             "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
@@ -130,7 +135,7 @@ def detect(
     """
     from kinefit.readers.detections import detections_key
 
-    keys = {job: _video_key(job.video) for job in jobs}
+    keys = {job: _video_key(job) for job in jobs}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], people, masks)
@@ -196,7 +201,7 @@ def _look_through(
     from kinefit.readers.video import Video
 
     models = Models(networks)
-    with Video(job.video) as video:
+    with Video(job.video, rate=job.rate) as video:
 
         def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
             for number, image in enumerate(images):
@@ -229,20 +234,26 @@ def _networks(progress: _screen.Step | None) -> Path:
     return detector_models(told)
 
 
-def _video_key(video: Path) -> str:
+def _video_key(job: Job) -> str:
     """Text that another video, or another detector, does not have."""
     from kinefit.assets import MODELS_PACKAGE
     from kinefit.errors import FileError
+    from kinefit.readers.image_folders import images_in
 
-    digest = hashlib.sha256()
+    digest, size, path = hashlib.sha256(), 0, job.video
+    images = images_in(path) if path.is_dir() or "*" in path.name else []
     try:
-        with video.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            for start in (0, max(0, size - _ENDS)):
-                file.seek(start)
-                digest.update(file.read(_ENDS))
+        for part in images or [path]:
+            with part.open("rb") as file:
+                length = file.seek(0, os.SEEK_END)
+                for start in (0, max(0, length - _ENDS // max(1, len(images)))):
+                    file.seek(start)
+                    digest.update(file.read(_ENDS // max(1, len(images))))
+            size += length
     except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=video, remedy="Check the path.") from error
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
+    if images:
+        digest.update(f"{len(images)} {job.rate}".encode())
     return f"{digest.hexdigest()[:32]} {size} {MODELS_PACKAGE} {_METHOD}"
 
 

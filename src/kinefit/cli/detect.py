@@ -43,7 +43,7 @@ def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out:
 def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[_detecting.Job]:
     from kinefit.readers.take.file import read_take
 
-    takes = [path for path in inputs if path.suffix.lower() == ".toml"]
+    takes = [path for path in inputs if path.suffix.lower() == ".toml" or path.is_dir()]
     if takes:
         if len(inputs) > 1 or out is not None:
             raise click.UsageError("give one take alone, without --out; or video files")

@@ -15,7 +15,7 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
     formats = tuple(dict.fromkeys(part.strip().lower() for part in value.split(",") if part.strip()))
     for name in formats:
         if name not in _results.NAMES:
-            raise click.BadParameter(f"there is no format '{name}'; there are: {', '.join(_results.NAMES)}")
+            raise click.BadParameter(_results.no_format(name, _results.NAMES))
     return formats
 
 _EXAMPLES = """\b
@@ -55,12 +55,15 @@ def track(
     `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
     the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done.
     """
+    from kinefit.readers.take.find import find_take
+
     if contacts and realtime:
         raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
     if lag is not None and (contacts or realtime):
         other = "--contacts needs the whole take" if contacts else "--realtime knows of no later frame"
         raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
     wanted = ctx.get_parameter_source("overlays") == click.core.ParameterSource.COMMANDLINE
+    take = find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
         take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, contacts=contacts,
@@ -80,12 +83,14 @@ def run(
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TakeError, TrackingError
+    from kinefit.readers.take.checks import check_enough
     from kinefit.readers.take.file import read_take
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.take import track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     take = read_take(path)
+    check_enough(take)
     if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
         raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
     _results.check_folder(out)

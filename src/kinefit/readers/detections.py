@@ -25,11 +25,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError
+from kinefit.errors import FileError, KinefitError, command
 from kinefit.observations import Detections
 
 FORMAT, VERSION = "kinefit detections", 1
-_REMEDY = "Make it anew: kinefit detect --force."
 _DAMAGE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
 
 
@@ -49,13 +48,14 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         No such file, not one of the detector's, damaged, or of a later version.
     """
     file = Path(path)
+    again = f"Make it anew: {_anew(file, '--force')}"
     if not file.is_file():
-        raise FileError("no such file of detections", file=file, remedy="Run: kinefit detect TAKE.")
+        raise FileError("no such file of detections", file=file, remedy=f"Run: {_anew(file)}")
     try:
         arrays = _load(file)
     except _DAMAGE as error:
         problem = f"not a file of the built-in detector, or damaged ({error})"
-        raise FileError(problem, file=file, remedy=_REMEDY) from error
+        raise FileError(problem, file=file, remedy=again) from error
     try:
         width, height = (int(n) for n in arrays["size"])
         found = Detections(
@@ -63,9 +63,9 @@ def read_detections(path: str | PathLike[str]) -> Detections:
             arrays["mask_runs"], arrays["mask_starts"], str(file),
         )
     except (KinefitError, KeyError, ValueError, TypeError, IndexError) as error:
-        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=_REMEDY) from error
+        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error
     if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
-        raise FileError("numbers that cannot be", file=file, remedy=_REMEDY)
+        raise FileError("numbers that cannot be", file=file, remedy=again)
     return found
 
 
@@ -75,6 +75,13 @@ def detections_key(path: str | PathLike[str]) -> str | None:
         return str(_load(Path(path), "key")["key"])
     except (FileError, *_DAMAGE):
         return None
+
+
+def _anew(file: Path, *options: str) -> str:
+    """The command that makes a file of detections."""
+    take = file.parent.with_name(f"{file.parent.name.removesuffix('-detect')}.toml")
+    video = next((p for p in file.parent.glob(f"{file.stem.removesuffix('-detect')}.*") if p.suffix != ".npz"), None)
+    return command("detect", take if take.is_file() else video or "VIDEO", *options)
 
 
 def _load(file: Path, *names: str) -> dict[str, NDArray]:
@@ -87,6 +94,6 @@ def _load(file: Path, *names: str) -> dict[str, NDArray]:
         if int(archive["version"]) != VERSION:
             raise FileError(
                 f"detections of version {int(archive['version'])}; this kinefit reads version {VERSION}", file=file,
-                remedy="Use the kinefit that wrote it, or a newer one; or make it anew: kinefit detect --force.",
+                remedy=f"Use the kinefit that wrote it, or a newer one; or make it anew: {_anew(file, '--force')}",
             )
         return {name: archive[name] for name in names or archive.files}

@@ -5,11 +5,12 @@ from __future__ import annotations
 from os import PathLike
 
 from kinefit.bodies import load_body
-from kinefit.errors import TakeError
+from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
@@ -39,6 +40,7 @@ def track_take(
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
+    check_enough(take)
     seen = with_names(take, load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
@@ -51,7 +53,7 @@ def track_take(
     if not alone:
         raise TakeError(
             "the take has no [[keypoints]], nor any other sensor", file=take.path,
-            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
         )  # fmt: skip
     named = body if take.start is None or take.body == _USUAL else load_body(take.body)
     if named.tree.segments != body.tree.segments:
@@ -76,7 +78,7 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
         raise TakeError(
             "the take has no [[keypoints]]",
             file=take.path,
-            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
         )
     return observations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, transform
@@ -38,7 +38,7 @@ def read_table(text: str, kind: str, path: Path) -> Table:
     """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage) into nested tables."""
     try:
         if kind == "toml":
-            return tomllib.loads(text)
+            return parse_toml(text, path, CalibrationError)
         if kind == "json":
             tree = _matrices(json.loads(text))
         else:

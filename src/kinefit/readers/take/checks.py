@@ -30,6 +30,27 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 """Formats for which a key means something: with any other it is refused."""
 
 
+ONE_CAMERA = "one camera does not tell how far a person is; two cameras do, or one beside depth or markers"
+
+
+def check_enough(take: Take) -> None:
+    """Refuse to track a take with a single camera and nothing else, before anything is read or detected.
+
+    Raises
+    ------
+    TakeError
+        With what to add.
+    """
+    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.lines)
+    seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
+    if len(seeing) == 1 and not (any(others) or take.start or take.pose):
+        raise TakeError(
+            ONE_CAMERA, file=take.path, place=f"camera {next(iter(seeing))}",
+            remedy="Add [[camera]] of a second one, calibrated with the first, or [[depth]]; or tell by [start] where "
+            "the body is.",
+        )  # fmt: skip
+
+
 def check_take(take: Take) -> None:
     """Refuse a take whose values cannot be, whose names do not agree, whose files are missing, or keys without use.
 
