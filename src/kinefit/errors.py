@@ -35,14 +35,14 @@ class KinefitError(Exception):
         place: str | None = None,
         remedy: str | None = None,
     ) -> None:
-        self.file, self.remedy = file, remedy
-        self.problem, self.place = shortened(problem), shortened(str(place), 140) if place else place
+        self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
+        self.remedy = shortened(remedy, _ALL - len(self.problem) - len(self.place or "")) if remedy else remedy
         where = ", ".join(str(part) for part in (file, self.place) if part)
         text = f"{where}: {self.problem}" if where else self.problem
-        super().__init__(f"{text.rstrip('.')}. {remedy}" if remedy else text)
+        super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
 
 
-_LONGEST = 300  # characters of a problem or a place: what a file holds may be of any length
+_LONGEST, _ALL = 300, 570  # characters of a problem, and of all parts: what a file gives them may be of any length
 
 
 def shortened(text: str, longest: int = _LONGEST) -> str:

@@ -17,19 +17,18 @@ the video's picture, the centre of the first pixel is (0, 0):
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npz
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.observations import Detections
 
 FORMAT, VERSION = "kinefit detections", 1
-_DAMAGE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
+_DAMAGE = (OSError, ValueError, KeyError, TypeError)
 
 
 def detections_file(take: str | PathLike[str], camera: str) -> Path:
@@ -62,7 +61,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
             arrays["mask_runs"], arrays["mask_starts"], str(file),
         )
-    except (KinefitError, KeyError, ValueError, TypeError, IndexError) as error:
+    except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error
     if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
         raise FileError("numbers that cannot be", file=file, remedy=again)
@@ -86,14 +85,16 @@ def _anew(file: Path, *options: str) -> str:
 
 def _load(file: Path, *names: str) -> dict[str, NDArray]:
     """Arrays of these names, default all, of a file that is whole and of the right kind."""
-    if not zipfile.is_zipfile(file):
-        raise ValueError("no whole archive of arrays")
-    with np.load(file, allow_pickle=False) as archive:
-        if str(archive["format"]) != FORMAT:
-            raise ValueError("another format")
-        if int(archive["version"]) != VERSION:
-            raise FileError(
-                f"detections of version {int(archive['version'])}; this kinefit reads version {VERSION}", file=file,
-                remedy=f"Use the kinefit that wrote it, or a newer one; or make it anew: {_anew(file, '--force')}",
-            )
-        return {name: archive[name] for name in names or archive.files}
+    wanted = {*names, "format", "version"} if names else ()
+    try:
+        arrays = read_npz(file, *wanted, remedy="")
+    except FileError as error:
+        raise ValueError(error.problem) from error
+    if "format" not in arrays or str(arrays["format"]) != FORMAT:
+        raise ValueError("another format")
+    if arrays["version"].shape or int(arrays["version"]) != VERSION:
+        raise FileError(
+            f"detections of version {arrays['version']}; this kinefit reads version {VERSION}", file=file,
+            remedy=f"Use the kinefit that wrote it, or a newer one; or make it anew: {_anew(file, '--force')}",
+        )
+    return arrays

@@ -9,7 +9,6 @@ A TOML file with one table a point, and in it the pixel of each camera that sees
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -58,5 +57,5 @@ def read_static_points(
 def _is_pixel(value: object) -> bool:
     return (
         isinstance(value, list) and len(value) == 2
-        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and -1e9 < v < 1e9 for v in value)
     )  # fmt: skip

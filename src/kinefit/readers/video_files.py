@@ -102,6 +102,9 @@ def _open(path: Path) -> Any:
     if not container.streams.video:
         container.close()
         raise FileError("there is no video stream in this file", file=path, remedy="Name a video file.")
+    if container.streams.video[0].codec_context is None:
+        container.close()
+        raise FileError("a video of a codec that FFmpeg does not know", file=path, remedy=_REMEDY)
     return container
 
 

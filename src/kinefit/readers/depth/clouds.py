@@ -63,7 +63,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
             return _ply(data, path)
         if b"FIELDS" in data[:2000]:
             return _pcd(data, path)
-    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise FileError(f"its header cannot be understood ({error})", file=path, remedy=_REMEDY) from error
     raise FileError("neither PCD nor PLY", file=path, remedy=_REMEDY)
 
@@ -85,7 +85,10 @@ def _pcd(data: bytes, path: Path) -> Cloud:
     number = int(header.get("POINTS", [str(width * height)])[0])
     if not 0 <= number == width * height < _MOST:
         raise FileError(f"{number} points, but {width} x {height}", file=path, remedy=_REMEDY)
-    kinds = [f"<{_PCD_TYPES[t]}{s}" for t, s in zip(types, sizes, strict=True)]
+    if not (set(sizes) <= {1, 2, 4, 8} and all(0 < c < 10_000 for c in counts) and len(counts) == len(names)):
+        problem = f"SIZE {' '.join(map(str, sizes[:9]))}, COUNT {' '.join(map(str, counts[:9]))}"
+        raise FileError(problem, file=path, remedy=_REMEDY)
+    kinds = [np.dtype(f"<{_PCD_TYPES[t]}{s}") for t, s in zip(types, sizes, strict=True)]
     where = [_place(axis, names, path) for axis in "xyz"]
     body, kind = data[at:], header["DATA"][0]
     if kind == "ascii":

@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from kinefit._files import npy_header
 from kinefit.errors import CalibrationError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
@@ -230,11 +230,8 @@ def _openpose_points(numbered: list[Path]) -> int | None:
 
 
 def _array_shape(path: Path) -> tuple[int, ...] | None:
-    try:
-        array: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        return None
-    return array.shape if array.dtype.kind in "fiu" else None
+    header = npy_header(path)
+    return header[0] if header and header[1].kind in "fiu" else None
 
 
 def _caliscope_frames(path: Path) -> int:

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from kinefit._files import BACKSLASHES, parse_toml
-from kinefit.errors import FileError, TakeError, choices
+from kinefit.errors import FileError, TakeError, choices, shortened
 from kinefit.readers.markers import UNITS
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -176,6 +176,8 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder is a text")
+        if any(len(part.encode()) > 255 for part in Path(value).parts):
+            raise ValueError(f"{shortened(value, 60)!r} is no path: a name in it is too long")
         if any(ord(character) < 32 for character in value):
             raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
         return folder / value
