@@ -61,7 +61,10 @@ def fuzz(name: str, count: int) -> Counter[str]:
 def _some(name: str, first: int, count: int, found: Counter[str]) -> int:
     """Read files in one process until it is done, ends or is stopped; the number of the next file."""
     words = [sys.executable, "-m", "benchmarks.fuzz_worker", name, *map(str, (first, count, MEMORY))]
-    worker = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace")
+    worker = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace",
+        env=os.environ | {"MALLOC_ARENA_MAX": "1"},  # threads of FFmpeg would reserve memory that they never use
+    )  # fmt: skip
     lines: queue.Queue[str | None] = queue.Queue()
     errors: list[str] = []
     threads = [

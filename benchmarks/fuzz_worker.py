@@ -36,7 +36,7 @@ def main(name: str, first: int, count: int, memory: int) -> None:
         size = _status("VmSize")
         resource.setrlimit(resource.RLIMIT_AS, (size + (memory + _KEPT) * 10**6,) * 2)
         for i in range(first, first + count):
-            if _status("VmSize") > size + _KEPT * 10**6:  # what libraries keep of the files before
+            if i > first and _status("VmSize") > size + _KEPT * 10**6:  # what libraries keep of the files before
                 break
             which = i % len(whole)
             try:

@@ -24,7 +24,16 @@ from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.methods import lengths_table, methods
-from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubtful_moments, listed, never_observed, plain
+from kinefit.exporters.report.moments import (
+    DOUBTFUL,
+    Moment,
+    doubt_sentence,
+    doubtful_moments,
+    listed,
+    never_observed,
+    place,
+    span,
+)
 from kinefit.exporters.report.pictures import MOMENTS, report_frames
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
@@ -106,14 +115,9 @@ def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
         if names:
             parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {told}")
     start = " and ".join(parts) or "comes without measurements to compare it with"
-    count = len(moments)
-    if not count:
+    if not moments:
         return f"The motion {start}; no doubtful moment."
-    frames = np.zeros(len(motion), bool)
-    for m in moments:
-        frames[m.start : m.stop] = True
-    share = 100 * frames.mean()
-    return f"The motion {start}; {count} doubtful moment{'s' if count > 1 else ''} ({share:.0f}\u00a0% of the frames)."
+    return f"The motion {start}; doubtful moments: {doubt_sentence(motion, moments)}."
 
 
 def _subtitle(motion: Motion, date: str) -> str:
@@ -182,11 +186,7 @@ def _moments(motion: Motion, moments: Sequence[Moment], pictures: Pictures, widt
 
 
 def _when(motion: Motion, m: Moment) -> p.Html:
-    start, stop = motion.times[m.start], motion.times[m.stop - 1]
-    span = f"{start:.2f} s" if m.stop - m.start == 1 else f"{start:.2f}–{stop:.2f} s"
-    frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    who = listed([plain(s) for s in m.segments]) or "whole body"
-    return p.joined(p.moment(motion.times[m.worst], span), f" ({frames}): {who}")
+    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(m)}")
 
 
 def _angles(motion: Motion) -> list[p.Html]:
