@@ -28,6 +28,8 @@ LONGEST = 600
 def main(name: str, first: int, count: int, memory: int) -> None:
     """Read `count` damaged copies; `memory` [MB] is what each may take beyond what the process has."""
     faulthandler.enable()
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8", errors="replace")
+    os.dup2(2, 1)  # what libraries print is not among the lines
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as place:
         seed = seed_of(name, Path(place))
@@ -41,8 +43,8 @@ def main(name: str, first: int, count: int, memory: int) -> None:
             which = i % len(whole)
             try:
                 seed.files[which].write_bytes(mutated(whole[which], [zlib.crc32(name.encode()), i]))
-                print(f"at {i}", flush=True)
-                print(i, *_read(seed, Path(place)), flush=True)
+                print(f"at {i}", file=out, flush=True)
+                print(i, *_read(seed, Path(place)), file=out, flush=True)
             finally:
                 seed.files[which].write_bytes(whole[which])
 
@@ -57,11 +59,11 @@ def _read(seed: Seed, place: Path) -> tuple[str, str, str, str]:
         seed.read()
         kind, text = "read", ""
     except KinefitError as error:
-        kind, text = _kind(error, place), repr(str(error)).replace("\n", " ")
+        kind, text = _kind(error, place), repr(str(error))
     except MemoryError:
         kind, text = "memory", _last()
     except Exception as error:
-        text = f"{type(error).__name__}: {error} @ {_last()}".replace("\n", " ")
+        text = repr(f"{type(error).__name__}: {error} @ {_last()}")
         kind = "memory" if "Insufficient memory" in text else "untyped"
     peak = (_status("VmHWM") - before) / 1e6
     return kind, f"{time.monotonic() - began:.3f}", f"{peak:.0f}", text[:1500]

@@ -17,7 +17,7 @@ from benchmarks.fuzz_worker import LONGEST
 
 from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.depth.clouds import read_cloud
+from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
 from kinefit.readers.keypoints import read_caliscope_csv
 from kinefit.readers.skeletons.asf import read_asf
 from kinefit.readers.static_points import read_static_points
@@ -143,3 +143,19 @@ def test_a_video_of_a_codec_that_nobody_knows_is_told(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"FMP4", b"zzzz"))
     with pytest.raises(FileError, match="codec"):
         Video(path)
+
+
+def test_packed_points_that_claim_gigabytes_are_told(tmp_path):
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
+    head += "DATA binary_compressed\n"
+    (tmp_path / "a.pcd").write_bytes(head.encode() + np.array([4, 2**33 - 2**32 - 1], "<u4").tobytes() + bytes(4))
+    with pytest.raises(FileError):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_points_at_the_end_of_the_world_are_told(tmp_path):
+    points = np.random.default_rng(0).random((400, 3)) + 0.1
+    points[:, 0] *= 1e300
+    cloud = Cloud(points, (20, 20), np.eye(4))
+    with pytest.raises(CalibrationError, match="no camera sees"):
+        camera_of(cloud, "a", tmp_path / "a.pcd")

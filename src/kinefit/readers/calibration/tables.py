@@ -217,7 +217,7 @@ def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -
 
 def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
     """(4, 4) of a rotation that a file gives with few digits: the nearest exact rotation."""
-    if np.abs(R).max() > 2:
+    if not np.abs(R).max() <= 2:  # not finite, too
         R = np.zeros((3, 3))
     left, stretch, right = np.linalg.svd(R)
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(R) < 0:
