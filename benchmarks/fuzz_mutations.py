@@ -14,8 +14,9 @@ import numpy as np
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _WORDS = (
     b"0", b"-1", b"1", b"65536", b"2147483647", b"-2147483648", b"4294967296", b"9223372036854775808", b"1e11", b"1e20",
-    b"1e308", b"-1e308", b"1e-320", b"0.5", b"1.0", b"100000", b"-0.0", b"1e999", b"nan", b"inf", b"-inf", b"NaN", b"Infinity", b"0x7f", b"1,5", b"", b"-",
-    b'"text"', b"null", b"true", b"[]", b"{}", b"9" * 400, b"9" * 5000, b"\xff\xfe", b"\0",
+    b"1e308", b"-1e308", b"1e-320", b"0.5", b"1.0", b"100000", b"-0.0", b"1e999",
+    b"nan", b"inf", b"-inf", b"NaN", b"Infinity", b"0x7f", b"1,5", b"", b"-", b'"text"', b"null", b"true", b"[]", b"{}",
+    b"9" * 400, b"9" * 5000, b"\xff\xfe", b"\0",
 )  # fmt: skip
 _PLAIN = 18  # of these are numbers in every format, so that what follows them is read
 _INTEGERS = (0, 1, *(2**n - 1 for n in (7, 8, 15, 16, 31, 32, 64)), *(2**n for n in (7, 15, 31, 40, 63)))
