@@ -136,6 +136,7 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
      ("view", "{take}", "--html", "{folder}"), ("calibrate", "people", "{take}", "--out", "{file}/c.toml"),
      ("retarget", "none.bvh", "--out", "{folder}"), ("markers", "learn", "none.c3d", "--out", "{folder}"),
      ("markers", "identify", "none.c3d", "none.json", "--out", "{folder}"),
+     ("detect", "none.mp4", "--out", "{file}"),
      ("markers", "fit", "none.c3d", "--out", "{file}"), ("simulate", "none.npz", "--out", "{file}")],
 )  # fmt: skip
 def test_an_out_that_cannot_be_written_is_refused_before_any_work(take, words):

