@@ -169,6 +169,6 @@ def _size(body: Any) -> None:
         fit = fit_surfaces(body, [v.cloud for v in views], states, views=views)
         groups = len(scales)
         before += np.abs(np.log(scales)).tolist()
-        after += np.abs(np.log(fit.factors[:groups] / scales)).tolist()
+        after += np.abs(fit.mean[:groups] - np.log(scales)).tolist()
     figure("size_lengths_before", 100 * float(np.mean(before)), "% mean error of lengths", ">= 0")
     figure("size_lengths", 100 * float(np.mean(after)), "% mean error of lengths", "<= 3")

@@ -16,8 +16,9 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
-from kinefit.subject.fit import Subject, fit_subject
+from kinefit.subject.fit import fit_subject
 from kinefit.subject.parameters import Parameters
+from kinefit.subject.subject import SubjectFit
 
 
 def ring(count: int, *, size: tuple[int, int] = (640, 480), focal: float = 525.0, away: float = 3.0) -> Rig:
@@ -45,7 +46,7 @@ def looking(name: str, eye: NDArray, at: NDArray, size: tuple[int, int], focal: 
 def shape_from_silhouettes(
     body: Body, rig: Rig, frames: Sequence[Sequence[SilhouetteFrame]], states: Sequence[BodyState],
     parameters: Sequence[Parameters], *, sigma: float = 4.0, settings: TrackSettings | None = None,
-) -> Subject:  # fmt: skip
+) -> SubjectFit:  # fmt: skip
     """Parameters and poses that explain silhouettes of several times; the overlap with them is printed.
 
     Parameters

@@ -8,13 +8,13 @@ from click.testing import CliRunner
 import kinefit
 from kinefit import assets
 from kinefit.cli import main
-from kinefit.errors import AssetError
+from kinefit.errors import AssetError, command
 
 
 @pytest.fixture
 def no_overlays(monkeypatch):
     """Overlays are the slow part, and test_track.py sees to them."""
-    monkeypatch.setattr("kinefit.cli._results.write_overlays", lambda *args: None)
+    monkeypatch.setattr("kinefit.cli._results.write_overlays", lambda *args, **more: None)
 
 
 def run(*args):
@@ -28,8 +28,9 @@ def test_the_drawn_figure_needs_nothing_fetched(tmp_path, monkeypatch, no_overla
     assert len(kinefit.read_motion(tmp_path / "demo" / "motion.npz")) == 60
     assert (tmp_path / "demo" / "take" / "take.toml").is_file()
     assert "No recording of a person" in (tmp_path / "demo" / "take" / "take.toml").read_text()
-    for name in ("motion.bvh", "tables", "report.html", "overlays", "take/take.toml"):
+    for name in ("motion.bvh", "tables", "report.html", "overlays"):
         assert str(tmp_path / "demo" / name) in told.stdout
+    assert command("check", tmp_path / "demo" / "take" / "take.toml") in told.stdout
 
 
 def test_where_the_recording_cannot_be_had_the_drawn_figure_takes_its_place(tmp_path, monkeypatch, no_overlays):

@@ -24,7 +24,7 @@ from kinefit.simulation import cut, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take import track_take
 from kinefit.tracking.take_recording import recording_of
@@ -333,7 +333,8 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 
 OPTIONS = {
     "overlays": "--overlays", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
-    "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "out": None, "take": None,
+    "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
+    "out": None, "take": None,
 }  # fmt: skip
 
 
@@ -362,6 +363,7 @@ def test_an_option_acts_or_is_refused(kind, take):
         with_report = run(path, "--no-overlays")
         assert with_report[1] == ["motion.npz", "report.html"]
         code, drawn, said, _ = run(path, "--overlays", "--no-report")
+        assert run(path, "--pictures", "none")[1] == ["motion.npz", "report.html"]
         assert (code == 0 and "montage.png" in drawn) if kind == "keypoints" else (code != 0 and "overlays" in said)
         assert "tables/angles.csv" in run(path, "--formats", "csv", "--no-overlays", "--no-report")[1]
         assert digest(run(path, "--realtime", "--no-overlays", "--no-report")[3]) != digest(motion)

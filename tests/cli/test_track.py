@@ -254,7 +254,7 @@ def test_a_full_disk_leaves_only_whole_files(take, tmp_path):
     code = (
         "import resource, sys; from kinefit.cli import main\n"
         "import kinefit.cli._results as r; write = r.write_overlays\n"
-        "def limited(*a):\n    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); write(*a)\n"
+        "def limited(*a, **k):\n    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); write(*a, **k)\n"
         "r.write_overlays = limited; main()"
     )
     out = tmp_path / "out"
@@ -337,7 +337,7 @@ def test_ctrl_c_before_the_first_frame_is_only_that(monkeypatch):
 
 
 def test_ctrl_c_during_overlays_lists_what_is_whole(take, tmp_path, monkeypatch):
-    def interrupted(*args):
+    def interrupted(*args, **more):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("kinefit.cli._results.write_overlays", interrupted)
@@ -356,3 +356,31 @@ def test_bone_lengths_tell_left_and_right_once():
     lengths = bone_lengths(type("Motion", (), {"body": kinefit.load_body("humanoid")}))
     assert lengths["hip to knee"] == "42.0"
     assert len(lengths) == 11
+
+
+def test_pictures_without_faces_or_none_at_all(take, tmp_path):
+    for pictures in ("blurred", "none"):
+        told = run("track", take, "--out", tmp_path / pictures, "--formats", "bvh", "--pictures", pictures)
+        assert told.exit_code == 0, told.stderr
+    assert (tmp_path / "blurred" / "montage.png").is_file()
+    assert not (tmp_path / "none" / "montage.png").exists() and not (tmp_path / "none" / "overlays").exists()
+    assert "<img" in (tmp_path / "blurred" / "report.html").read_text()
+    assert "<img" not in (tmp_path / "none" / "report.html").read_text()
+    told = run("track", take, "--out", tmp_path / "c", "--pictures", "none", "--overlays")
+    assert told.exit_code == 2 and "choose one" in told.stderr
+
+
+def test_the_session_of_a_take_heads_its_report(take, tmp_path):
+    table = tmp_path / "norms.csv"
+    table.write_text("coordinate,percent,mean,sd\nknee_angle,0,5,4\nknee_angle,100,6,4\n")
+    text = take.read_text()
+    session = f"subject = 'P07'\ndate = 2026-03-02\nside = 'left'\nnorms = '{table.as_posix()}'\n"
+    take.write_text(f"{text}\n[session]\n{session}")
+    told = run("track", take, "--out", tmp_path / "out", "--formats", "motion", "--no-overlays")
+    assert told.exit_code == 0, told.stderr
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "<dt>Subject</dt><dd>P07</dd>" in page and "<dt>Date of the recording</dt><dd>2026-03-02</dd>" in page
+    assert kinefit.read_motion(tmp_path / "out" / "motion.npz").provenance["session"]["side"] == "left"
+    take.write_text(f"{text}\n[session]\nside = 'port'\n")
+    told = run("track", take, "--out", tmp_path / "bad")
+    assert told.exit_code == 2 and "session.side" in told.stderr and "'left'" in told.stderr

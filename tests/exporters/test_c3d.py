@@ -26,6 +26,29 @@ def test_our_own_reader_gets_all_of_it(tmp_path, up):
     assert (read.up, read.rate, read.first_frame) == (up, motion.rate, 121)
 
 
+def test_angles_are_points_that_the_file_names_as_such(tmp_path):
+    ezc3d = pytest.importorskip("ezc3d")
+    motion = smooth_motion(9)
+    std = np.full_like(motion.dof_std, 0.1)
+    names = list(motion.body.tree.coordinates)
+    columns = [6 + names.index(f"hip_{what}_l") for what in ("flexion", "adduction", "rotation")]
+    std[4, columns] = np.inf
+    motion = replace(motion, dof_std=std)
+    write_c3d(motion, tmp_path / "a.c3d")
+    read = ezc3d.c3d(str(tmp_path / "a.c3d"))
+    point = read["parameters"]["POINT"]
+    names = list(point["ANGLES"]["value"])
+    assert {"LHipAngles", "RKneeAngles", "PelvisAngles", "BackAngles"} <= set(names)
+    assert point["ANGLE_UNITS"]["value"] == ["deg"]
+    labels = list(point["LABELS"]["value"])
+    found = read["data"]["points"][:3, labels.index("LHipAngles")].T
+    truth = np.degrees(motion.angles[:, np.array(columns) - 6])
+    seen = np.arange(9) != 4
+    assert np.abs(found[seen] - truth[seen]).max() < 1e-3
+    assert np.isnan(found[4]).all()
+    assert not set(names) & set(read_markers(tmp_path / "a.c3d").names)
+
+
 def long_motion(frames, landmarks=1):
     body = load_body("arm")
     points = PointSet(tuple(f"p{k}" for k in range(landmarks)), np.zeros(landmarks), np.zeros((landmarks, 3)))
@@ -46,7 +69,7 @@ def test_more_frames_than_its_header_counts(tmp_path):
     write_c3d(motion, tmp_path / "a.c3d")
     assert len(read_markers(tmp_path / "a.c3d").positions) == 66000
     read = ezc3d.c3d(str(tmp_path / "a.c3d"))["data"]["points"]
-    assert read.shape == (4, 5, 66000)
+    assert read.shape == (4, 8, 66000)
     assert np.abs(read[0, 0] / 1000 - motion.segment_poses()[:, 0, 0, 3]).max() < 1e-6
 
 
@@ -55,7 +78,7 @@ def test_more_points_than_one_list_of_labels_holds(tmp_path):
     write_c3d(long_motion(3, landmarks=400), tmp_path / "a.c3d")
     names = read_markers(tmp_path / "a.c3d").names
     assert len(names) == 404 and names[-1] == "p399" and names[300] == "p296"
-    assert ezc3d.c3d(str(tmp_path / "a.c3d"))["data"]["points"].shape == (4, 404, 3)
+    assert ezc3d.c3d(str(tmp_path / "a.c3d"))["data"]["points"].shape == (4, 407, 3)  # with those of angles
 
 
 def test_what_it_cannot_hold_is_refused(tmp_path):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from kinefit.errors import ExportError, FileError
@@ -39,6 +39,7 @@ def test_c3d_round_trip(tmp_path, unit):
 
 
 @given(st.lists(st.floats(0, 1e-2), min_size=8, max_size=8))
+@example([0.0] * 7 + [1e-12])
 def test_residuals_keep_a_255th(tmp_path_factory, residuals):
     path = tmp_path_factory.getbasetemp() / "r.c3d"
     given = np.array(residuals).reshape(2, 4)

@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.images.depth_noise import denoised, noise_of
+from kinefit.images.depth_noise import denoised, noise_of, without_speckles
 
 CAMERA = Camera("tof", (160, 124), [[181.0, 0, 79.5], [0, 181.0, 61.5], [0, 0, 1]])
 
@@ -74,3 +74,46 @@ def test_scattered_pixels_nothing_and_other_sizes():
     assert noise_of(np.ones((1, 1))).shape == (1, 1)
     with pytest.raises(ObservationError, match="shape"):
         denoised(np.ones((10, 10)), CAMERA)
+
+
+def spoiled(depth, share=0.2, seed=0):
+    """An image of which a share of the pixels lies anywhere; which ones."""
+    random = np.random.default_rng(seed)
+    wrong = random.random(depth.shape) < share
+    return np.where(wrong, random.uniform(0.5, 5.5, depth.shape), depth).astype(np.float32), wrong
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.03])
+def test_pixels_that_stand_alone_go_and_surfaces_stay(sigma):
+    truth, depth = steps(sigma)
+    truth[50:52, 90:125] = depth[50:52, 90:125] = 1.2  # a limb two pixels wide
+    image, wrong = spoiled(depth)
+    out = without_speckles(image, CAMERA, sigma)
+    far = wrong & (np.abs(image - truth) > 0.3)
+    assert np.mean(out[far] > 0) < 0.02
+    np.testing.assert_array_equal(out[out > 0], image[out > 0])
+    assert np.mean(out[~wrong] > 0) > 0.99 and np.mean(out[50:52, 90:125][~wrong[50:52, 90:125]] > 0) > 0.85
+    assert np.mean(without_speckles(depth, CAMERA, sigma) == depth) > 0.999
+
+
+def test_what_went_is_closed_within_surfaces_alone():
+    truth, depth = steps(0.005)
+    image, wrong = spoiled(depth)
+    out = without_speckles(image, CAMERA, closed=True)
+    assert np.mean(out[wrong] > 0) > 0.9
+    assert np.mean(np.abs(out - truth)[wrong & (out > 0)] < 0.15) > 0.97
+    hole = depth.copy()
+    hole[60:70, 70:80] = 0.0
+    assert not without_speckles(hole, CAMERA, closed=True)[60:70, 70:80].any()
+
+
+def test_an_image_of_scattered_pixels_and_small_ones_stay():
+    _, depth = steps(0.01)
+    scattered = np.where((np.add.outer(np.arange(124), 3 * np.arange(160)) % 7) == 0, depth, 0.0).astype(np.float32)
+    np.testing.assert_array_equal(without_speckles(scattered, CAMERA), scattered)
+    for shape in ((1, 1), (5, 1), (1, 5), (2, 2)):
+        small = Camera("small", shape[::-1], [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1]])
+        out = without_speckles(np.ones(shape), small)
+        assert out.shape == shape and np.isin(out, (0.0, 1.0)).all()
+    with pytest.raises(ObservationError, match="shape"):
+        without_speckles(np.ones((10, 10)), CAMERA)

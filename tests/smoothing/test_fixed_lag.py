@@ -20,7 +20,7 @@ from kinefit.smoothing.smoother import pixels_of_track
 from kinefit.smoothing.unwrap import continued, unwrap
 from kinefit.solvers.marginal import leave
 from kinefit.solvers.smoothing import MotionPrior, blocks, smooth
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.session import KeptFrame, one_layout
 
 COLOUR = "left", "right"

@@ -23,7 +23,7 @@ from kinefit.smoothing.foot_contacts import find_contacts, soles
 from kinefit.smoothing.process_noise import alike, limbs
 from kinefit.smoothing.smoother import parts, smooth_results, swapped_channels
 from kinefit.smoothing.unwrap import boxes, unwrap
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.run import run
 
 BODY = load_body("humanoid")

@@ -7,10 +7,12 @@ from kinefit.bodies import PointSet, load_body
 from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
+from kinefit.sensors.keypoints import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.uncertainty import lasting
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.matched_frames import point_moves
 
 MOTION = squat_and_wave(rate=20.0, duration=3.0)
 RIG = studio_rig(MOTION)
@@ -42,10 +44,10 @@ def fit(body, channels, uv, weight, start):
 
 def covariance(scene, noise, Sigma=None):
     subject, channels, weight, state = scene
-    p = len(subject.shape.theta)
-    Sigma = np.zeros((p, p)) if Sigma is None else Sigma
+    moves, layout = point_moves(subject.fit), Layout(channels, subject.body)
+    Sigma = np.zeros((len(subject.fit.mean),) * 2) if Sigma is None else Sigma
     none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
-    return lasting(subject.shape.parameters, subject.shape.theta, Sigma, channels, state, weight, noise, none, none)
+    return lasting(moves, Sigma, layout, state, weight, noise, none, none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -85,19 +87,17 @@ def test_another_shape_moves_joints_as_refitting_does(scene):
     body, groups = load_body("humanoid"), load_body("humanoid").scale_groups
     g, by = groups.index("thigh"), 0.01
     longer = np.array(subject.scales)
-    longer[g] += by
+    longer[g] *= 1.0 + by
     name = next(iter(channels.sets))
     other = body.scaled(longer)
-    points = other.keypoints(name)
-    span = np.array(points.points)
-    span[[points.index(n) for n in channels.points.names]] += subject.shape.shifts
-    other = other.with_keypoints(name, span)
+    shifts = subject.body.keypoints(name).points - body.scaled(subject.scales).keypoints(name).points
+    other = other.with_keypoints(name, other.keypoints(name).points + shifts)
     refitted = fit(other, channels, channels.uv[20], weight, state)
     before, after = (
         b.tree.segment_poses(s.T_world_root[None], s.angles[None])[0, :, :3, 3]
         for b, s in ((subject.body, state), (other, refitted))
     )
-    Sigma = np.zeros((len(subject.shape.theta),) * 2)
+    Sigma = np.zeros((len(subject.fit.mean),) * 2)
     Sigma[g, g] = by**2
     told = np.sqrt(covariance(scene, noise_of(channels), Sigma).joints)
     np.testing.assert_allclose(told, np.abs(after - before), atol=1.2e-3)

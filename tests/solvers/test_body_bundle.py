@@ -52,7 +52,7 @@ def test_derivatives_by_the_cameras_agree_with_differences():
 
     def cost(delta):
         rig = moved_rig(RIG, delta)
-        left = pixels.uv[0] - parameters.pixels(theta, states[0], rig, pixels.camera, pixels.column)
+        left = pixels.uv[0] - rig.project(BODY.positions(states[0], pixels.points)[pixels.column], pixels.camera)
         left -= delta[pixels.camera, TIME, None] * velocity
         s2 = pixels.weight[0] * np.sum(left**2, axis=1)
         return float(np.sum(share * s2 / (1 + s2 / loss.scale**2)))

@@ -5,17 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from tests.oracle import posture, rig_around
+from tests.oracle import posture
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.correspondences import _kernels, pixel_rows, prior_rows, targets
+from kinefit.correspondences import _kernels, prior_rows, targets
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, huber
 from kinefit.rows import PairRows, ParameterRows
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.border import Prior, solve
-from kinefit.solvers.border_frames import differences
-from kinefit.solvers.shape import shape_parameters
 from kinefit.solvers.whitened import Pose, columns, residuals
 
 ARM = load_body("arm")
@@ -112,45 +110,6 @@ def test_a_share_leaves_the_prior_more_to_say():
     less = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), shares={"mocap": 0.01})
     assert np.allclose(less.information, 0.01 * full.information, rtol=0.05)
     assert np.linalg.norm(less.theta) < np.linalg.norm(full.theta)
-
-
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """Keypoints of a humanoid in a rig, by logarithms of its lengths."""
-
-    rig: object
-    uv: np.ndarray
-    camera: np.ndarray
-
-    def body(self, theta):
-        return HUMANOID.scaled(np.exp(theta))
-
-    def parts(self, theta, frame, state):
-        body = self.body(theta)
-        out = []
-        for c, one in enumerate(self.rig):
-            points = body.keypoints("COCO_17")
-            out.append((one.name, pixel_rows(body, state, points, self.rig, c, self.uv[self.camera == c], sigma=2.0)))
-        return out
-
-
-def test_differences_are_the_analytic_columns_of_lengths():
-    """`ShapeParameters.jacobian` knows them for keypoints; at scales of one logarithms change as the scales do."""
-    rig, points = rig_around((0.0, 0.0, 0.0), cameras=3), HUMANOID.keypoints("COCO_17")
-    state = posture(HUMANOID, 3, 0.3)
-    groups = len(HUMANOID.scale_groups)
-    model = shape_parameters(HUMANOID, points, np.ones(groups), 0.05, 0.01)
-    camera, column = np.repeat(np.arange(3), 17), np.tile(np.arange(17), 3)
-    theta = np.concatenate([np.ones(groups), np.zeros(len(model.mean) - groups)])
-    J = model.jacobian(theta, state, rig, camera, column).reshape(2 * len(camera), -1)
-    problem = Pixels(rig, model.pixels(theta, state, rig, camera, column) + 1.0, camera)
-    found = differences(problem, np.zeros(groups), np.full(groups, 1e-4), [state])[0]
-    n = HUMANOID.tree.n_dofs
-    assert np.abs(J[:, n : n + groups]).max() > 10.0
-    assert np.allclose(found, 0.5 * J[:, n : n + groups], rtol=1e-5, atol=1e-4)
-    pose = Pose.of(HUMANOID, state)
-    own = np.concatenate([columns(rows, pose) for _, rows in problem.parts(np.zeros(groups), 0, state)])
-    assert np.allclose(own, 0.5 * J[:, :n], rtol=1e-6, atol=1e-6)
 
 
 def test_rows_of_every_kind_have_their_columns():

@@ -1,14 +1,22 @@
 """Parameters apply as they say; lasting errors are told from fresh ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.subject import measured
 from tests.subject.measured import ARM, HUMANOID, RIG
 
+from kinefit.bodies import PointSet
 from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.geometry import se3
+from kinefit.losses import geman_mcclure
 from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import Unknown
+from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
+from kinefit.solvers.border_frames import differences
 from kinefit.subject.lasting import Seen, excess
+from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KNOWN_SIZE, UNKNOWN_SIZE, PointOffsets, SegmentScales, World, stacked
 from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 
@@ -24,6 +32,37 @@ def test_lengths_follow_the_size():
     assert np.allclose(longer.tree.offsets, 1.1 * HUMANOID.tree.offsets)
     with pytest.raises(BodyError, match="size"):
         SegmentScales(HUMANOID, size=-1.0)
+
+
+def test_a_length_moves_the_segments_that_it_says():
+    lengths, state, random = SegmentScales(HUMANOID), HUMANOID.usual_state(np.eye(4)), np.random.default_rng(0)
+    segments = np.arange(len(HUMANOID.tree.segments))
+    points = PointSet(HUMANOID.tree.segments, segments, random.normal(scale=0.1, size=(len(segments), 3)))
+    for k, touched in enumerate(lengths.touches):
+        body = lengths.apply(World(HUMANOID, RIG), 0.1 * (np.arange(len(lengths.names)) == k)).body
+        own = replace(points, points=points.points * np.where(body.segment_scale == k, np.exp(0.1), 1.0)[:, None])
+        moved = np.linalg.norm(body.positions(state, own) - HUMANOID.positions(state, points), axis=1)
+        assert set(np.flatnonzero(moved > 1e-9)) == touched
+
+
+def test_derivatives_of_markers_are_those_of_their_rows():
+    """How points move tells the same as rows of other worlds."""
+    body, states = ARM.scaled(np.full(len(ARM.scale_groups), 1.05)), measured.arms(3)
+    sensor, names = MarkerSensor("worn", 0.002, geman_mcclure(), 0.03), ARM.markers("worn").names
+    steps = []
+    for k, state in enumerate(states):
+        seen = names[k:]
+        x = body.positions(state, body.markers("worn").select(seen))
+        steps.append([MarkerMeasurement(sensor, seen, x, "worn", 0.0)])
+    parameters = [SegmentScales(ARM), PointOffsets(ARM, "worn")]
+    _, theta, _, step = stacked(parameters)
+    frames = MatchedFrames(Worlds(World(ARM, RIG), parameters), steps, None, None, theta, states, 0.03)
+    quick = differences(frames, theta, step, states)
+    assert not any(np.isnan(D).any() for D in frames.columns(theta, step, states))
+    frames.columns = None
+    for a, b in zip(quick, differences(frames, theta, step, states), strict=True):
+        assert np.abs(b).max() > 1.0
+        assert np.allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(b).max())
 
 
 def test_keypoints_shift_alike_left_and_right_and_hardly_to_the_side_in_the_middle():

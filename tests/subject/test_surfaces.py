@@ -16,7 +16,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.parameters import SegmentScales, World
-from kinefit.subject.surfaces import CylinderShape
+from kinefit.subject.surfaces import GIRTH, CylinderShape, Girths
 
 BODY = load_body("humanoid")
 SHAPE = CylinderShape(BODY)
@@ -47,6 +47,23 @@ def test_cylinders_start_from_the_body_and_keep_both_sides_alike():
     assert all(isinstance(s, TaperedCylinder) for s in wide.surfaces)
     with pytest.raises(BodyError, match="no cylinders"):
         CylinderShape(replace(BODY, surfaces=()))
+
+
+def test_girths_go_with_the_lengths_that_they_are_of():
+    girths = Girths(BODY)
+    values = np.log([{"girth thigh a": 1.2, "girth thigh b": 0.8}.get(name, 1.0) for name in girths.names])
+    wide = girths.apply(World(BODY, ring()), values).body
+    for s, old in zip(wide.surfaces, BODY.surfaces, strict=True):
+        thigh = BODY.scale_groups[BODY.segment_scale[s.segment]] == "thigh"
+        assert np.allclose(s.radii, np.array(old.radii) * ((1.2, 0.8) if thigh else (1.0, 1.0)))
+        assert np.allclose(s.end, old.end)
+        touched = girths.touches[girths.names.index("girth thigh a")]
+        assert (s.segment in touched) == thigh
+    covariance = np.linalg.inv(girths.information)
+    assert np.allclose(np.diag(covariance), GIRTH**2)
+    assert covariance[0, 1] == pytest.approx(0.5 * GIRTH**2)
+    with pytest.raises(BodyError, match="no cylinders"):
+        Girths(replace(BODY, surfaces=()))
 
 
 @pytest.mark.slow

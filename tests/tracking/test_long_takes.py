@@ -15,7 +15,7 @@ from kinefit import Recording, track
 from kinefit.errors import ObservationError
 from kinefit.smoothing import spool
 from kinefit.smoothing.smoother import smooth_results
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking import motions
 from kinefit.tracking.interrupted import TrackingInterrupted
 

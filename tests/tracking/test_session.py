@@ -17,7 +17,7 @@ from tests.tracking.movements import (
 
 from kinefit import BodyState, Recording, track
 from kinefit.errors import ObservationError
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 
 COLOUR = "left", "right"
 SIGMA = dict.fromkeys(COLOUR, 2.0)

@@ -52,7 +52,8 @@ class PointSet:
 
     def select(self, names: tuple[str, ...]) -> PointSet:
         """The named points, in that order."""
-        rows = [self.index(name) for name in names]
+        places = dict(zip(reversed(self.names), range(len(self) - 1, -1, -1)))
+        rows = [places[name] if name in places else self.index(name) for name in names]
         return PointSet(tuple(names), self.segments[rows], self.points[rows])
 
 

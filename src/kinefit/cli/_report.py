@@ -22,21 +22,29 @@ _PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
 
 
 def write_track_report(
-    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
-) -> None:
-    """Write report.html into a folder of results, with links to what lies there already; enter it into `files`."""
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path],
+    pictures: str = "full",
+) -> None:  # fmt: skip
+    """Write report.html into a folder of results, with links to what lies there already; enter it into `files`.
+
+    `pictures` are "full", "blurred" or "none".
+    """
     from kinefit.cli._results import ABOUT
+    from kinefit.exporters.report.norms import read_norms
     from kinefit.exporters.report.report import write_report
 
-    pictures = take_pictures(motion, take, seen, step)
+    norms = read_norms(take.session.norms) if take.session.norms else None
+    shown = {} if pictures == "none" else take_pictures(motion, take, seen, step, blur=pictures == "blurred")
     step("report", 0, 1)
     links = {path.relative_to(folder).as_posix(): ABOUT.get(name, name) for name, path in files.items()}
-    files["report"] = write_report(motion, folder / "report.html", rig=seen.rig, pictures=pictures, files=links)
+    files["report"] = write_report(
+        motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms
+    )
     step("report", 1, 1)
 
 
 def take_pictures(
-    motion: Motion, take: Take, seen: Observations, step: Step
+    motion: Motion, take: Take, seen: Observations, step: Step, *, blur: bool = False
 ) -> dict[str, dict[int, NDArray[np.uint8]]]:
     """{camera: {frame: picture of the person with the fit drawn on it}} of the frames that a report shows.
 
@@ -53,7 +61,7 @@ def take_pictures(
     for number, (name, path) in enumerate(seen.videos.items()):
         step("pictures", number, len(seen.videos))
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
         with Video(path, rate=seen.rate) as video:
             for frame in frames:
                 shown = round((motion.times[frame] - offset) * video.rate)
@@ -91,6 +99,8 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
     ]  # fmt: skip
     if take.height:
         out["height"] = take.height
+    if take.session.told:
+        out["session"] = take.session.told
     return out | more
 
 

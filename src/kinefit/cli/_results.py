@@ -96,9 +96,13 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 
 
 def write_overlays(
-    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
-) -> None:
-    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path], *,
+    blur: bool = False,
+) -> None:  # fmt: skip
+    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`.
+
+    With `blur` faces are made unrecognisable.
+    """
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
     from kinefit.exporters.pictures.overlay import nearest_frame
     from kinefit.readers.video import Video
@@ -108,7 +112,7 @@ def write_overlays(
     pictures, middle = {}, motion.times[len(motion) // 2]
     for name, path in seen.videos.items():
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
         with Video(path, rate=seen.rate) as colour:
             shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
             at = nearest_frame(motion, shown / colour.rate + offset)

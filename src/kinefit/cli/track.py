@@ -18,6 +18,8 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
             raise click.BadParameter(_results.no_format(name, _results.NAMES))
     return formats
 
+PICTURES = ("full", "blurred", "none")
+
 _EXAMPLES = """\b
 Examples:
   kinefit track my_take/take.toml
@@ -37,6 +39,10 @@ Examples:
     help="What to write; parquet, c3d and usd are there too.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write report.html.")
+@click.option(
+    "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
+    help="What report and overlays show of the videos: all, all but the person's face, nothing.",
+)
 @click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor.")
 @click.option("--realtime", is_flag=True, help="Do not smooth over the whole take.")
 @click.option(
@@ -47,7 +53,7 @@ Examples:
 @click.pass_context
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
-    contacts: bool, realtime: bool, lag: float | None, verbose: bool,
+    pictures: str, contacts: bool, realtime: bool, lag: float | None, verbose: bool,
 ) -> None:
     """Track the person of a take file and write all results.
 
@@ -63,19 +69,22 @@ def track(
         other = "--contacts needs the whole take" if contacts else "--realtime knows of no later frame"
         raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
     wanted = ctx.get_parameter_source("overlays") == click.core.ParameterSource.COMMANDLINE
+    if pictures == "none" and overlays and wanted:
+        raise click.UsageError("--overlays draws on the videos, --pictures none shows nothing of them: choose one.")
     take = find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
-        take, out, overlays=overlays, formats=formats, report=report, smooth=not realtime, contacts=contacts,
-        lag=lag, verbose=verbose, wanted=overlays and wanted,
+        take, out, overlays=overlays and pictures != "none", formats=formats, report=report, pictures=pictures,
+        smooth=not realtime, contacts=contacts, lag=lag, verbose=verbose, wanted=overlays and wanted,
     )  # fmt: skip
     ctx.exit(code)
 
 
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
-    contacts: bool = False, lag: float | None = None, verbose: bool = False, wanted: bool = False,
-) -> int:
+    pictures: str = "full", contacts: bool = False, lag: float | None = None, verbose: bool = False,
+    wanted: bool = False,
+) -> int:  # fmt: skip
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._report import provenance, write_track_report
@@ -111,9 +120,9 @@ def run(
             motion = replace(motion, provenance=provenance(take, **motion.provenance))
             _results.write_results(motion, out, formats, step, files)
             if overlays:
-                _results.write_overlays(motion, take, seen, out, step, files)
+                _results.write_overlays(motion, take, seen, out, step, files, blur=pictures == "blurred")
             if report:
-                write_track_report(motion, take, seen, out, step, files)
+                write_track_report(motion, take, seen, out, step, files, pictures)
     except BaseException as error:
         if files:
             print_files(files)

@@ -103,9 +103,10 @@ def _rows(like: C3d, markers: Markers, path: Path) -> NDArray | None:
 def _residual_unit(residual: NDArray) -> float:
     """Unit in which residuals are counted from 0 to 255: the one that they come in where they do, else the finest."""
     steps = np.unique(residual)
-    if not len(steps) or not steps[-1] > 0:
+    gaps = np.diff(steps, prepend=0.0)
+    if not np.any(gaps > 1e-9):
         return 1.0
-    smallest = float(np.min(np.diff(np.concatenate([[0.0], steps]))[np.diff(np.concatenate([[0.0], steps])) > 1e-9]))
+    smallest = float(gaps[gaps > 1e-9].min())
     counted = steps / smallest
     own = counted[-1] <= _MOST_RESIDUAL + 0.5 and bool(np.all(np.abs(counted - np.round(counted)) < 1e-3))
     return smallest if own else float(steps[-1]) / _MOST_RESIDUAL

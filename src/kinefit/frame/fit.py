@@ -31,6 +31,9 @@ _ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wid
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it, without the posture prior."""
 
+Without = NDArray | Sequence[NDArray | None] | None
+"""Segments (S,) bool whose rows weigh nothing, of all matches or of each its own."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -245,7 +248,7 @@ class FrameFit:
 
 def rows_of(
     scene: Scene, matched: Sequence[Matched], settings: TrackSettings, scale: Mapping[str, float] | None = None, *,
-    points: int = 0, without: NDArray | None = None,
+    points: int = 0, without: Without = None,
 ) -> list[AnyRows]:  # fmt: skip
     """Rows of all matches; those of surfaces determine bones no better than where these lie below them (`frame.skin`).
 
@@ -257,7 +260,7 @@ def rows_of(
     ----------
     scale : {sensor: factor} on standard deviations
     points : rows of points that are not among the matches
-    without : (S,) bool, segments whose rows weigh nothing
+    without : (S,) bool, segments whose rows weigh nothing; of all matches, or of each its own
     """
     parts, surface, points = _kinds(scene, matched, scale, points, without)
     if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
@@ -266,15 +269,16 @@ def rows_of(
 
 
 def _kinds(
-    scene: Scene, matched: Sequence[Matched], scale: Mapping[str, float] | None, points: int, without: NDArray | None
+    scene: Scene, matched: Sequence[Matched], scale: Mapping[str, float] | None, points: int, without: Without
 ) -> tuple[list[AnyRows], list[Rows], int]:
     """Rows of all but surfaces, rows of surfaces, and how many of points there are."""
     parts: list[AnyRows] = []
     surface: list[Rows] = []
-    for m in matched:
+    each = [without] * len(matched) if without is None or isinstance(without, np.ndarray) else without
+    for m, off in zip(matched, each):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
-            rows = rows if without is None else left_out(rows, without)
+            rows = rows if off is None else left_out(rows, off)
             if not m.of_points and isinstance(rows, Rows):
                 surface.append(rows)
             else:

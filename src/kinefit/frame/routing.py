@@ -44,6 +44,10 @@ class Sensors:
         Two sensors of one name, or one without; a standard deviation that is not positive.
     CalibrationError
         A camera of `on_body` that the rig does not have.
+
+    Attributes
+    ----------
+    stated : {depth camera: (H, W) [m]} of the empty scene, as `know_background` was told
     """
 
     def __init__(
@@ -64,6 +68,7 @@ class Sensors:
             self._sensors[sensor.name] = sensor
         self._own = frozenset(self._sensors)
         self._backgrounds: dict[str, Background | None] = {rig[name].name: None for name in on_body}
+        self.stated: dict[str, NDArray] = {}
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
@@ -134,11 +139,12 @@ class Sensors:
         background = self.background(camera)
         if background is not None:
             background.know(depth)
+            self.stated[camera.name] = np.asarray(depth)
 
     def anew(self) -> Sensors:
         """The same sensors for another run over the take, which know the same backgrounds."""
         out = Sensors(self.rig, self.rate, self.sigma, self.settings, self.own)
-        out._backgrounds = self._backgrounds
+        out._backgrounds, out.stated = self._backgrounds, self.stated
         return out
 
     def _of_frame(self, frame: Frame) -> Sensor:

@@ -13,7 +13,7 @@ from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.evidence import AGREES
 from kinefit.sensors.keypoints import KeypointMatched
-from kinefit.sensors.observability import SHORTEST, levers
+from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances
 
@@ -44,6 +44,23 @@ def moving(tree: KinematicTree, segments: NDArray) -> NDArray:
         out[tree.chain[last, : tree.depth[last] + 1]] = True
     out[:6] &= tree.root_free
     return out
+
+
+def adrift(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> NDArray:
+    """(F, S) bool: joints of which frames in a row know nothing, whatever their fit says of them.
+
+    Neither of the two segments that a joint (each named by the segment that hangs on it) connects is where it is
+    thought to be, or seen at all, and within so many frames one of them is where it cannot be: what is unseen went
+    somewhere else, and no motion prior tells where.
+
+    Parameters
+    ----------
+    lost, hidden : (F, S) bool, as evidence has them
+    half : int, frames to either side
+    """
+    parents = np.where(tree.parents >= 0, tree.parents, np.arange(len(tree.parents)))
+    unknown, contradicted = lost | hidden, lost | lost[:, parents]
+    return np.asarray(unknown & unknown[:, parents] & near(contradicted, half))
 
 
 def holding(tree: KinematicTree, segments: NDArray) -> NDArray:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from kinefit._jit import jit
 
 
@@ -32,6 +34,82 @@ def drop_flying(depth, near, far, noise, slope, out):
                 across = abs(a - z) > t and abs(b - z) > t
                 along = abs(c - z) > t and abs(d - z) > t
                 out[v, u] = 0.0 if across or along else z
+
+
+@jit
+def around(depth, out, v, u, noise, slope, most, beside):
+    """Mean depth [m] of the neighbours of a pixel that stay, where `most` of them are of one surface; 0 elsewhere.
+
+    beside (8,): room for them.
+    """
+    height, width = depth.shape
+    n = 0
+    for i in range(v - 1 if v > 0 else v, v + 2 if v + 1 < height else v + 1):
+        for j in range(u - 1 if u > 0 else u, u + 2 if u + 1 < width else u + 1):
+            if out[i, j] > 0.0 and out[i, j] == depth[i, j]:
+                beside[n] = out[i, j]
+                n += 1
+    if n >= most:
+        for k in range(n - most + 1):
+            total, alike = np.float32(0.0), 0
+            for m in range(n):
+                if abs(beside[m] - beside[k]) <= noise + slope * beside[k]:
+                    total += beside[m]
+                    alike += 1
+            if alike >= most:
+                return total / np.float32(alike)
+    return np.float32(0.0)
+
+
+@jit
+def drop_speckles(depth, noise, slope, least, most, out):
+    """Copy (H, W) float32 `depth` to `out`, 0 where fewer than `least` of the eight neighbours are of its surface.
+
+    Of one surface: they differ by noise + slope * depth [m] at most. Beyond the image's edge there are none. Where
+    `most` neighbours that stay are of one surface, their mean takes the place of what goes. Returns how many pixels are
+    measured and how many of them stay. Two columns at least; row by row without branches, so that the compiler handles
+    many pixels at a time.
+    """
+    height, width = depth.shape
+    none, one, empty = np.int32(0), np.int32(1), np.float32(0.0)
+    noise, slope, least = np.float32(noise), np.float32(slope), np.int32(least)
+    nothing = np.zeros(width, np.float32)
+    seen = kept = 0
+    for v in range(height):
+        above, below = depth[v - 1] if v > 0 else nothing, depth[v + 1] if v + 1 < height else nothing
+        own, line = depth[v], out[v]
+        for u in range(width - 2):
+            z = own[u + 1]
+            t = noise + slope * z
+            n = one if abs(own[u] - z) <= t else none
+            n += one if abs(own[u + 2] - z) <= t else none
+            n += one if abs(above[u] - z) <= t else none
+            n += one if abs(above[u + 1] - z) <= t else none
+            n += one if abs(above[u + 2] - z) <= t else none
+            n += one if abs(below[u] - z) <= t else none
+            n += one if abs(below[u + 1] - z) <= t else none
+            n += one if abs(below[u + 2] - z) <= t else none
+            line[u + 1] = z if n >= least else empty
+        for u in (0, width - 1):
+            z, inner = own[u], 1 if u == 0 else u - 1
+            t = noise + slope * z
+            n = none
+            for row in (above, own, below):
+                n += one if abs(row[inner] - z) <= t else none
+                n += one if abs(row[u] - z) <= t else none
+            line[u] = z if n > least else empty  # it has counted itself
+        before = after = none
+        for u in range(width):
+            before += one if own[u] > empty else none
+            after += one if line[u] > empty else none
+        seen, kept = seen + int(before), kept + int(after)
+    if seen > kept and most <= 8:
+        beside = np.empty(8, np.float32)
+        for v in range(height):
+            for u in range(width):
+                if depth[v, u] > empty and out[v, u] == empty:
+                    out[v, u] = around(depth, out, v, u, noise, slope, most, beside)
+    return seen, kept
 
 
 @jit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,15 +49,20 @@ def starts_from_points(
 
 
 def starts_from_views(
-    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3
-) -> list[BodyState]:
-    """States to begin with from one depth image or cloud; those that known points agree with come first."""
+    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3,
+    *, backgrounds: Mapping[str, NDArray] | None = None,
+) -> list[BodyState]:  # fmt: skip
+    """States to begin with from one depth image or cloud; those that known points agree with come first.
+
+    `backgrounds`: {depth camera: (H, W) [m]} of the empty scene, where it is known.
+    """
     starts: list[Start] = []
     for frame in frames:
         view = _view(rig, frame)
         if view is not None and not starts:
             try:
-                starts = start_from_points(body, *view, up=up, count=count)
+                empty = (backgrounds or {}).get(view[1].name)
+                starts = start_from_points(body, *view, background=empty, up=up, count=count)
             except KinefitError:
                 continue
     points, x = known_points(frames, (), scene, keypoints)

@@ -17,11 +17,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import to_points
-from kinefit.images.depth_noise import denoised, noise_of
-from kinefit.images.depth_scene import Blob, find_floor, people
+from kinefit.images.depth_noise import denoised, noise_of, without_speckles
+from kinefit.images.depth_scene import Blob, find_floor, foreground, people
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.depth_view import DepthView, splat, view_of
-from kinefit.subject.depth import SurfaceFit, fit_surfaces
+from kinefit.subject.depth import fit_surfaces
+from kinefit.subject.subject import SubjectFit
 
 _GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m; and half
 # of it, for those who stand by a table or a wall: people are then still closed, a pixel is some centimetres wide
@@ -58,6 +59,7 @@ def start_from_points(
     camera: Camera,
     depth: NDArray | None = None,
     *,
+    background: NDArray | None = None,
     up: ArrayLike = (0.0, 1.0, 0.0),
     count: int = 5,
     attempts: int = 2,
@@ -74,6 +76,8 @@ def start_from_points(
     camera : Camera of the sensor
     depth : (H, W) [m], optional
         Its image, 0 where nothing was measured. It shows what is empty.
+    background : (H, W) [m], optional
+        What it sees of the empty scene, 0 where that is not known: the person is sought in what is new.
     up : (3,) upwards, in the world
     count : int, poses at most
     attempts : int
@@ -91,7 +95,7 @@ def start_from_points(
     """
     found: list[tuple[Search, BodyState]] = []
     views: list[DepthView] = []
-    more = _views(body, points, camera, depth, up)
+    more = _views(body, points, camera, depth, up, background)
     for attempt in range(max(attempts, 1)):
         views += next(more, [])
         searches = _searches(body, views, up, seed + attempt)
@@ -113,10 +117,11 @@ def sized_start(
     depths: Sequence[NDArray],
     camera: Camera,
     *,
+    background: NDArray | None = None,
     up: ArrayLike = (0.0, 1.0, 0.0),
     rounds: int = 2,
     seed: int = 0,
-) -> tuple[SurfaceFit, list[Start]]:
+) -> tuple[SubjectFit, list[Start]]:
     """The person's own size, and a pose in each of a few depth images: poses, sizes, better poses, better sizes.
 
     With a body of another size limbs lie on the trunk's border; once the trunk is as wide as the person's they are
@@ -125,7 +130,7 @@ def sized_start(
     Parameters
     ----------
     depths : K x (H, W) [m]; three to five, the more different the postures the better.
-    camera, up, seed : see `start_from_points`
+    camera, background, up, seed : see `start_from_points`
     rounds : int
 
     Raises
@@ -136,7 +141,7 @@ def sized_start(
     found: list[tuple[DepthView, BodyState]] = []
     for depth in depths:
         tried: list[tuple[Search, BodyState]] = []
-        for views in _views(body, None, camera, depth, up):
+        for views in _views(body, None, camera, depth, up, background):
             tried += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
             if max(_meant(*t) for t in tried) > _GOOD:
                 break
@@ -164,8 +169,9 @@ def _searches(body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int) 
 
 
 def _views(
-    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike
-) -> Iterator[list[DepthView]]:
+    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike,
+    background: NDArray | None,
+) -> Iterator[list[DepthView]]:  # fmt: skip
     """Views of the persons that may be meant; then of parts of them, where those may be a person by a table."""
     direction = _unit(up)
     if not body.surfaces:
@@ -175,12 +181,13 @@ def _views(
         if depth.shape != (camera.size[1], camera.size[0]):
             problem = f"a depth image of shape {depth.shape}, camera {camera.name} has {camera.size}"
             raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
-        depth = np.where((depth > 0) & (depth < np.inf), depth, 0.0)
+        depth = without_speckles(np.where((depth > 0) & (depth < np.inf), depth, 0.0), camera, closed=True)
     if points is None:
         if depth is None:
             raise ObservationError("neither points nor a depth image", remedy="Give one of them.")
         smooth, none = denoised(depth, camera), True
-        for blobs in _blobs(smooth, camera, direction):
+        new = None if background is None else foreground(smooth, background)
+        for blobs in _blobs(smooth, camera, direction, new):
             yield [view_of(smooth, blob.mask, camera) for blob in blobs]
             none = False
         if none:
@@ -208,12 +215,12 @@ def _views(
     yield [view_of(smooth, person, camera)]
 
 
-def _blobs(depth: NDArray, camera: Camera, up: NDArray) -> Iterator[list[Blob]]:
+def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) -> Iterator[list[Blob]]:
     """Things of a person's size, the likeliest first; then those that are only things if less is joined to them."""
     floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
     known: list[Blob] = []
     for gap in _GAPS:
-        new = [b for b in people(depth, camera, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
+        new = [b for b in people(depth, camera, mask=mask, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
         new.sort(key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))
         known += new
         if new:

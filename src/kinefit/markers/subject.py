@@ -13,9 +13,14 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import Placement, find_placement
 from kinefit.errors import ObservationError, TrackingError
+from kinefit.geometry.camera import Rig
 from kinefit.markers.poses import LOSS, columns, sequence_both_ways
 from kinefit.observations import Markers
-from kinefit.solvers.marker_shape import MarkerShape, fit_marker_shape, marker_parameters
+from kinefit.sensors.base import Measurement
+from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
+from kinefit.subject import fit as joint
+from kinefit.subject.parameters import PointOffsets, SegmentScales
+from kinefit.subject.subject import SubjectFit
 
 Progress = Callable[[str, int, int], None]
 
@@ -117,38 +122,39 @@ def fit_marker_subject(
     starts = np.cumsum([0, *map(len, given)])
     seen = np.isfinite(x).all(axis=2)
     placed, x, seen = _worn(placed, x, seen)
-    whole = height / body.stature if height and body.stature else None
-    size = whole if whole is not None else _first_size(body, placed, x)
-    groups = len(body.scale_groups)
-    floor = np.hypot(_LEAST, _SLIDES * placed.spread)
-    sigma = floor
-    theta = np.concatenate([np.full(groups, size), np.zeros(3 * len(placed.points))])
+    known = height / body.stature if height and body.stature else None
+    size = known if known is not None else _first_size(body, placed, x)
+    generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)  # no need to scale those
+    lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
+    sigma = floor = np.hypot(_LEAST, _SLIDES * placed.spread)
+    theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
+    fitted = generic.scaled(np.exp(lengths.mean))
     for turn in range(_ROUNDS):
-        fitted, points = _dressed(body, placed, theta)
         looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
-        roots, angles, good = _all_poses(fitted, points, x, starts, looseness)
+        roots, angles, good = _all_poses(fitted, fitted.markers(placed.name), x, starts, looseness)
         count = max((frames if turn else frames // 4) // len(trials), min(frames, 8))
         parts = [a + _spread_frames(seen[a:b], angles[a:b], good[a:b], count) for a, b in pairwise(starts)]
         chosen = np.concatenate(parts)
-        states = [BodyState(roots[f], angles[f]) for f in chosen]
         if turn == 0:
-            theta = _moved(fitted, placed, theta, roots[good], angles[good], x[good])
+            theta[groups:] = _moved(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
         away = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
         spread = np.maximum(placed.spread, _FAR * away)  # one that sits elsewhere is believed, if it does so lastingly
-        parameters = marker_parameters(body, placed.points, spread, size, known=whole is not None)
-        share = np.concatenate([np.full(len(p), min(_INDEPENDENT / max(len(p), 1), 1.0)) for p in parts])
-        weight = np.where(seen[chosen], sigma**-2.0, 0.0)
-        shape = fit_marker_shape(parameters, x[chosen], weight, states, share=share, start=theta, loss=LOSS)
-        theta = np.concatenate([shape.scales, shape.offsets.ravel()])
-        residuals = _residuals(body, placed, shape, x[chosen])
+        found = joint.fit_subject(
+            generic, Rig(()), [_measured(placed, x[f], sigma) for f in chosen],
+            [BodyState(roots[f], angles[f]) for f in chosen], (lengths, PointOffsets(generic, placed.name, spread)),
+            start=theta, reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT * sum(len(p) > 0 for p in parts),
+        )  # fmt: skip
+        theta, fitted = found.mean, found.body
+        residuals = _residuals(found, placed.name, x[chosen])
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
-    fitted, points = _dressed(body, placed, theta)
-    inlier = residuals < 5.0 * 1.7 * sigma
-    named = {**fitted.marker_sets, placed.name: points}
+    inlier, scales = residuals < 5.0 * 1.7 * sigma, np.exp(theta[:groups])
+    whole = body.scaled(scales)
+    named = {**whole.marker_sets, **fitted.marker_sets}
     return MarkerSubject(
-        replace(fitted, marker_sets=named), placed.name, shape.scales, shape.scale_std, sigma,
-        np.linalg.norm(shape.offsets, axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))), len(chosen),
+        replace(whole, marker_sets=named), placed.name, scales, scales * found.std[:groups], sigma,
+        np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
+        len(chosen),
     )  # fmt: skip
 
 
@@ -192,31 +198,25 @@ def _first_size(body: Body, placed: Placement, x: NDArray) -> float:
     return size
 
 
-def _moved(
-    body: Body, placed: Placement, theta: NDArray, roots: NDArray, angles: NDArray, x: NDArray
-) -> NDArray:
-    """The parameters with every marker where it was seen on its segment, by the median over some of the frames.
+def _moved(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDArray) -> NDArray:
+    """(K, 3) [m] by which every marker was seen beside its place on its segment, by the median over some frames.
 
     A set says which segment a marker sits on, but laboratories differ in where; to a robust fit that begins far away
     such a marker would be an outlier in every frame.
     """
     some = np.unique(np.linspace(0, len(x) - 1, min(len(x), 200)).astype(int))
-    Ts = body.tree.segment_poses(roots[some], angles[some])[:, placed.points.segments]
+    Ts = body.tree.segment_poses(roots[some], angles[some])[:, points.segments]
     local = np.einsum("fkji,fkj->fki", Ts[..., :3, :3], x[some] - Ts[..., :3, 3])
-    groups = len(body.scale_groups)
-    scales = theta[:groups][body.segment_scale[placed.points.segments]]
     with np.errstate(all="ignore"):
-        offsets = np.nanmedian(local, axis=0) - placed.points.points * scales[:, None]
-    return np.concatenate([theta[:groups], np.nan_to_num(offsets).ravel()])
+        return np.nan_to_num(np.nanmedian(local, axis=0) - points.points)
 
 
-def _dressed(body: Body, placed: Placement, theta: NDArray) -> tuple[Body, PointSet]:
-    """The body of a shape, and its markers on it."""
-    groups = len(body.scale_groups)
-    scales, offsets = theta[:groups], theta[groups:].reshape(-1, 3)
-    p = placed.points
-    x = p.points * scales[body.segment_scale[p.segments]][:, None] + offsets
-    return body.scaled(scales), PointSet(p.names, p.segments, x)
+def _measured(placed: Placement, x: NDArray, sigma: NDArray) -> list[Measurement]:
+    """Markers (K, 3) [m] of one frame, those that were seen, each as sure as it sits on its segment."""
+    here = np.flatnonzero(np.isfinite(x).all(axis=1))
+    sensor = MarkerSensor("markers", sigma[here], LOSS, joint.REACH[-1])
+    names = tuple(placed.points.names[k] for k in here)
+    return [MarkerMeasurement(sensor, names, np.ascontiguousarray(x[here]), placed.name, 0.0)]
 
 
 def _all_poses(
@@ -259,11 +259,10 @@ def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) ->
     return np.sort(usable[chosen])
 
 
-def _residuals(body: Body, placed: Placement, shape: MarkerShape, x: NDArray) -> NDArray:
-    """(F, K) [m] lengths of residuals of the frames that a shape came from."""
-    fitted, points = _dressed(body, placed, np.concatenate([shape.scales, shape.offsets.ravel()]))
-    roots, angles = (np.stack([getattr(s, n) for s in shape.states]) for n in ("T_world_root", "angles"))
-    return np.linalg.norm(x - fitted.trajectories(roots, angles, points), axis=2)
+def _residuals(found: SubjectFit, marker_set: str, x: NDArray) -> NDArray:
+    """(F, K) [m] lengths of residuals of the frames that a fit is of."""
+    roots, angles = (np.stack([getattr(s, n) for s in found.states]) for n in ("T_world_root", "angles"))
+    return np.linalg.norm(x - found.body.trajectories(roots, angles, found.body.markers(marker_set)), axis=2)
 
 
 def _noise(residuals: NDArray, frames: int, dofs: int) -> NDArray:

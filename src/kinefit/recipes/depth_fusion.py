@@ -15,7 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import Frame
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.keypoints import Progress
+from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 

@@ -99,6 +99,8 @@ class Matched(ABC):
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
+    places : (M,) set and name of the body's points that its `Rows` number by group, "" for landmarks, where every row
+        says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
     """
 
     sensor: str = ""
@@ -106,6 +108,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
+    places: Sequence[tuple[str, str]] | None = None
 
     @property
     def key(self) -> bytes:

@@ -14,6 +14,7 @@ from kinefit.correspondences import depth_image_rows, surface_rows
 from kinefit.correspondences.free_space import FreeSpace
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
+from kinefit.images.depth_noise import without_speckles
 from kinefit.observations import DepthFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors import _kernels_depth_image as kernels
@@ -110,7 +111,8 @@ class DepthImageMeasurement(Measurement):
         self.box = corners[0] - s.reach, corners[1] + s.reach
         first, last, self._farthest = window_of(camera, *self.box)
         self._window, self._at = (first, last), (0, 0)
-        self._kept = frame.depth if of.background is None else of.background.marked(frame.depth, first, last)
+        depth = without_speckles(frame.depth, camera, self.sigma)
+        self._kept = depth if of.background is None else of.background.marked(depth, first, last)
         self._shown: NDArray | None = surface.depth(vertices, camera).copy()
         self._space = self._free(self._shown)
         self._matches, self.is_compact = 0, False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,23 @@ class Layout:
         return out
 
     def points_of(self, body: Body) -> PointSet:
-        """The same of another body of this make."""
-        return self.points if body is self.body else self._of(self.channels.with_points(body))
+        """The same of another body of this make; those of the body that was asked for last are kept."""
+        if body is self.body:
+            return self.points
+        if self._latest.get("body") is not body:
+            self._latest.update(body=body, points=self._of(self.channels.with_points(body)))
+        return self._latest["points"]
+
+    @cached_property
+    def _latest(self) -> dict[str, Any]:
+        return {}
+
+    @cached_property
+    def places(self) -> tuple[tuple[str, str], ...]:
+        """(N,) keypoint set and name of every channel's point."""
+        c = self.channels
+        known = [(name, point) for name, span in c.sets.items() for point in c.points.names[span]]
+        return tuple(known[k] for k in c.column)
 
     @staticmethod
     def _of(channels: Channels) -> PointSet:
@@ -200,6 +216,11 @@ class KeypointMatched(Matched):
     hidden: tuple[Hidden, ...] = ()
 
     sensor = NAME
+
+    @property
+    def places(self) -> Sequence[tuple[str, str]] | None:  # type: ignore[override]
+        """Of every channel; None where other rows than those of pixels take part."""
+        return None if self.hidden else self.measurement.layout.places
 
     @property
     def key(self) -> bytes:

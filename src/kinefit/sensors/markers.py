@@ -26,12 +26,12 @@ class MarkerSensor(Sensor):
     Parameters
     ----------
     name : str
-    sigma : float [m] standard deviation of a marker, with what it moves on the skin
+    sigma : float, or (M,) of markers that are always the same [m] standard deviation, with what it moves on the skin
     loss : Loss of a marker, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
     """
 
-    def __init__(self, name: str, sigma: float, loss: Loss, near: float) -> None:
+    def __init__(self, name: str, sigma: float | NDArray, loss: Loss, near: float) -> None:
         self.name, self.sigma, self.loss, self.near = name, sigma, loss, near
 
     def prepare(self, frame: MarkerFrame, scene: Scene) -> MarkerMeasurement:
@@ -69,7 +69,7 @@ class MarkerMeasurement(Measurement):
     ) -> None:
         self.sensor, self.time, self.of = of.name, time, of
         self.names, self.x_world, self.marker_set = names, x_world, marker_set
-        self.weight = np.full(len(names), 1.0 / of.sigma**2)
+        self.weight = np.ones(len(names)) / np.square(of.sigma)
         self._points: tuple[Body, PointSet] | None = None
 
     def points_of(self, body: Body) -> PointSet:
@@ -100,6 +100,11 @@ class MarkerMatched(Matched):
     def sensor(self) -> str:  # type: ignore[override]
         """Name of the marker system."""
         return self.measurement.sensor
+
+    @property
+    def places(self) -> Sequence[tuple[str, str]]:  # type: ignore[override]
+        """Of every marker."""
+        return [(self.measurement.marker_set, name) for name in self.measurement.names]
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """Three rows a marker."""

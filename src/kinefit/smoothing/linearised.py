@@ -38,6 +38,7 @@ class Linearised:
     roots, angles : (T, 4, 4), (T, D) about which
     matched : T lists, by which correspondences; empty where these are not kept
     rows : (T,) how many rows agree
+    unsure : (T, n, n) the part of H that makes nothing more certain, see `unseen`; None where that is not asked for
     """
 
     H: NDArray
@@ -47,17 +48,20 @@ class Linearised:
     angles: NDArray
     matched: Sequence[tuple[Matched, ...]]
     rows: NDArray
+    unsure: NDArray | None = None
 
     def part(self, frames: slice) -> Linearised:
         """A stretch of it."""
         names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
-        return replace(self, **{name: getattr(self, name)[frames] for name in names})
+        unsure = None if self.unsure is None else self.unsure[frames]
+        return replace(self, **{name: getattr(self, name)[frames] for name in names}, unsure=unsure)
 
     def followed_by(self, later: Linearised) -> Linearised:
         """With the frames after it; matches are left out."""
         names = ("H", "g", "cost", "roots", "angles", "rows")
         both = {name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in names}
-        return replace(self, **both, matched=())
+        told = self.unsure is not None and later.unsure is not None
+        return replace(self, **both, matched=(), unsure=np.concatenate([self.unsure, later.unsure]) if told else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +108,16 @@ class OtherSensors:
 
     def linearised(
         self, body: Body, roots: NDArray, angles: NDArray, *, frames: range | None = None,
-        keep: Spool[tuple[Matched, ...]] | None = None,
+        keep: Spool[tuple[Matched, ...]] | None = None, judge: bool = False,
     ) -> Linearised:  # fmt: skip
         """Frames matched and linearised about states (T, 4, 4), (T, D), all or some of them.
 
-        `keep` is where their matches go.
+        `keep` is where their matches go; `judge`: what of it makes nothing more certain is told as well.
         """
         chosen = range(len(roots)) if frames is None else frames
         F, n = len(chosen), body.tree.n_dofs
         H, g, cost, rows = np.zeros((F, n, n)), np.zeros((F, n)), np.zeros(F), np.zeros(F)
+        unsure = np.zeros((F, n, n)) if judge else None
         for k, f in enumerate(chosen):
             scene = self.scene(f, roots, angles)
             matched = self.matched(scene)
@@ -125,23 +130,39 @@ class OtherSensors:
             if parts:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
+            without = [unseen(m, scene) for m in matched] if judge else []
+            if unsure is not None and any(w is not None for w in without):
+                sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
+                unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix
         span = slice(chosen.start, chosen.stop)
-        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows)
+        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsure)
 
     def windows(
         self, body: Body, roots: NDArray, angles: NDArray, spans: Sequence[slice],
-        keep: Spool[tuple[Matched, ...]] | None = None,
+        keep: Spool[tuple[Matched, ...]] | None = None, *, judge: bool = False,
     ) -> Iterator[Linearised]:  # fmt: skip
         """Stretches of a take that overlap, one after the other; what two of them share is linearised once.
 
-        `keep` is where the matches of all frames go, each once.
+        `keep` is where the matches of all frames go, each once; `judge` as of `linearised`.
         """
         last, first, done = None, 0, 0
         for span in spans:
-            new = self.linearised(body, roots, angles, frames=range(done, span.stop), keep=keep)
+            new = self.linearised(body, roots, angles, frames=range(done, span.stop), keep=keep, judge=judge)
             last = new if last is None else last.part(slice(span.start - first, None)).followed_by(new)
             first, done = span.start, span.stop
             yield last
+
+
+def unseen(matched: Matched, scene: Scene) -> NDArray | None:
+    """(S,) bool: segments that a surface does not show, or speaks against; None where its rows are of points.
+
+    What it has near one of these is another segment's, or no segment's: it may pull that one along, and tells nothing
+    of where it is. No more does it that parts of the body keep apart.
+    """
+    if not matched.shows_surface:
+        return None
+    told = matched.evidence(scene.at_time(matched.time))
+    return np.asarray(told.hidden | told.lost)
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

@@ -126,7 +126,10 @@ class SmoothTake:
             make = with_quadratic(self.body, make, self.linear)
         bounds = lower, upper
         fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
-        return fit, posterior(self.body, fit)
+        if self.linear is None or self.linear.unsure is None:
+            return fit, posterior(self.body, fit)
+        sure = replace(fit.system, C=fit.system.C - self.linear.unsure)
+        return fit, posterior(self.body, replace(fit, system=sure))
 
 
 def estimate(

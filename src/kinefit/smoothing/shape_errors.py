@@ -21,9 +21,9 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.border_frames import Part, Weighing, differences, frame_at, gram
 from kinefit.solvers.equations import joint_moves, normal_equations
-from kinefit.subject.fit import Subject
 from kinefit.subject.matched_frames import Worlds
 from kinefit.subject.parameters import stacked
+from kinefit.subject.subject import SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 
 SAMPLED = 16
@@ -58,7 +58,7 @@ class ShapeErrors:
 
 
 def shape_errors(
-    found: Subject, settings: TrackSettings, seen: Callable[[int], tuple[Scene, Sequence[Matched]]],
+    found: SubjectFit, settings: TrackSettings, seen: Callable[[int], tuple[Scene, Sequence[Matched]]],
     frames: Sequence[int], alone: Sequence[NDArray],
 ) -> ShapeErrors:  # fmt: skip
     """Of some frames.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.frame.results import BLIND, FrameResult, judged
+from kinefit.frame.trust import adrift
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
@@ -28,6 +29,7 @@ from kinefit.solvers.equations import inverse
 _PARTS = 3  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
+_ADRIFT = 0.13  # [s] about a contradicted segment: of 0, 0.13 and 0.27, the first misses the ends of a gap
 _PASSES = 2  # of matching all other sensors anew and solving, once the process noise is known
 
 
@@ -89,6 +91,7 @@ def smooth_results(
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
     took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
     weight = take.confidence / np.square(channels.sigma)
+    surfaces = False
     smoothed, covariance, packed = [], np.empty((body.tree.n_dofs,) * 2), np.triu_indices(body.tree.n_dofs)
     for f, result in enumerate(results):
         state = BodyState(take.roots[f], take.angles[f])
@@ -100,8 +103,23 @@ def smooth_results(
         covariance[packed] = covariance.T[packed] = covariances[f]
         scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
+        surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
+    if surfaces:
+        smoothed = _without_adrift(body, smoothed, round(_ADRIFT * rate))
     return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
+
+
+def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> list[FrameResult]:
+    """Frames that state nothing of joints that are `adrift`, nor of their coordinates."""
+    gone = adrift(body.tree, np.stack([r.lost for r in results]), np.stack([r.hidden for r in results]), half)
+    of_dofs = np.concatenate([np.zeros((len(gone), 6), bool), gone[:, body.tree.owners]], axis=1)
+    return [
+        replace(
+            r, joint_std=np.where(joints[:, None], np.inf, r.joint_std), dof_std=np.where(dofs, np.inf, r.dof_std)
+        )
+        for r, joints, dofs in zip(results, gone, of_dofs)
+    ]  # fmt: skip
 
 
 def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDArray:
@@ -211,11 +229,12 @@ def _solve(
     packed = np.triu_indices(take.body.tree.n_dofs)
     covariances, matched, others = np.empty((len(take.roots), len(packed[0]))), None, take.others
     windows = parts(len(take.roots), window, overlap)
-    for _ in range(1 if others is None else _PASSES):
+    for last in [True] if others is None else [False] * (_PASSES - 1) + [True]:
         roots, angles, linear = np.array(take.roots), np.array(take.angles), None
         if others is not None:
             matched = Spool[tuple[Matched, ...]]()
-            linear = others.windows(take.body, take.roots, take.angles, [whole for whole, _ in windows], matched)
+            spans = [whole for whole, _ in windows]
+            linear = others.windows(take.body, take.roots, take.angles, spans, matched, judge=last)
         for whole, kept in windows:
             part = take.part(whole)
             fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)

@@ -6,7 +6,7 @@ import io
 import pickle
 import tempfile
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
@@ -89,6 +89,28 @@ class Spool(Sequence[T], Generic[T]):
         return out
 
 
+class _Pickler(pickle.Pickler):
+    """Writes a record, with a number in place of each thing that is not written."""
+
+    def __init__(self, file: io.BytesIO, number: Callable[[Any], int | None]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self._number = number
+
+    def persistent_id(self, thing: Any) -> int | None:
+        return self._number(thing)
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads a record, with the things that were not written by their numbers."""
+
+    def __init__(self, file: io.BytesIO, shared: Sequence[Any]) -> None:
+        super().__init__(file)
+        self._shared = shared
+
+    def persistent_load(self, number: int) -> Any:
+        return self._shared[number]
+
+
 class _Store:
     """A file of records, and what they refer to."""
 
@@ -102,9 +124,7 @@ class _Store:
     def write(self, thing: Any) -> tuple[int, int]:
         """Where it was written: first byte, and how many."""
         buffer = io.BytesIO()
-        pickler = pickle.Pickler(buffer, pickle.HIGHEST_PROTOCOL)
-        pickler.persistent_id = self._number  # type: ignore[method-assign]
-        pickler.dump(thing)
+        _Pickler(buffer, self._number).dump(thing)
         data, place = buffer.getbuffer(), (self._end, buffer.tell())
         try:
             self._file.seek(self._end)
@@ -119,9 +139,7 @@ class _Store:
 
     def read(self, place: tuple[int, int]) -> Any:
         self._file.seek(place[0])
-        pickler = pickle.Unpickler(io.BytesIO(self._file.read(place[1])))
-        pickler.persistent_load = self._shared.__getitem__  # type: ignore[method-assign]
-        return pickler.load()
+        return _Unpickler(io.BytesIO(self._file.read(place[1])), self._shared).load()
 
     def _number(self, thing: Any) -> int | None:
         """Of what is kept as it is; None for what is written."""

@@ -19,15 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.correspondences import _kernels, targets
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
-from kinefit.sensors.channels import Channels
+from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
-from kinefit.solvers.equations import inverse, product
-from kinefit.solvers.shape import ShapeParameters, shape_parameters
-from kinefit.subject.keypoints import Subject
+from kinefit.solvers.equations import inverse, joint_moves, product
+from kinefit.solvers.whitened import Pose, columns
+from kinefit.subject.matched_frames import point_moves
+from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.subject import Subject
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 """(frames, covariance of each on its own) -> what an uncertain shape adds to them."""
@@ -73,11 +76,10 @@ def with_lasting_errors(
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
-    if subject.shape is None or subject.covariance is None:
-        parameters = shape_parameters(body, channels.points, np.ones(len(body.scale_groups)), 0.1, 0.01)
-        theta, Sigma = parameters.mean, np.zeros((len(parameters.mean),) * 2)
-    else:
-        parameters, theta, Sigma = subject.shape.parameters, subject.shape.theta, subject.covariance
+    moves, Sigma = None, np.zeros((0, 0))
+    if subject.fit is not None and subject.covariance is not None:
+        moves, Sigma = point_moves(subject.fit), subject.covariance
+    layout = Layout(channels.with_points(body), body)
     half, n = round(_TIED * rate), body.tree.n_dofs
     weights = pooled(weight, half)
     nothing = np.zeros((n, n)), np.zeros((n, n))
@@ -85,7 +87,7 @@ def with_lasting_errors(
     added, alone = [], []
     for f, result in enumerate(results):
         more = nothing if others is None else others.pooled(f, half)
-        one = lasting(parameters, theta, Sigma, channels, result.state, weights[f], noise, *more)
+        one = lasting(moves, Sigma, layout, result.state, weights[f], noise, *more)
         added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
         if f in sampled:
             alone.append(one.alone)
@@ -110,36 +112,42 @@ def pooled(values: NDArray, half: int) -> NDArray:
 
 
 def lasting(
-    parameters: ShapeParameters, theta: NDArray, Sigma_shape: NDArray, channels: Channels, state: BodyState,
-    weight: NDArray, noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
+    moves: PointMoves | None, Sigma_shape: NDArray, layout: Layout, state: BodyState, weight: NDArray,
+    noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
 ) -> Lasting:  # fmt: skip
     """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
     Parameters
     ----------
-    parameters, theta : of the shape; Sigma_shape (p, p) their covariance.
+    moves : how points move with the shape, None for one that is exact; Sigma_shape (p, p) the shape's covariance.
     weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
     other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
-    tree = parameters.body.tree
+    body, channels, tree = layout.body, layout.channels, layout.body.tree
     n = tree.n_dofs
-    J = parameters.jacobian(theta, state, channels.rig, channels.camera, channels.column)
-    Jq = J[:, :, :n].reshape(-1, n)
-    each = np.repeat(weight, 2)
-    H = product((Jq * each[:, None]).T, J.reshape(len(each), J.shape[2]))
+    rows = targets.fill(
+        _kernels.pixel_rows, 2, body, state, layout.points, channels.rig.packed, channels.camera,
+        np.zeros((len(weight), 2)), np.ascontiguousarray(weight),
+    )  # fmt: skip
+    frames, _ = tree.forward(state.T_world_root, state.angles)
+    by_pose, by_shape = columns(rows, Pose.of(body, state)), np.zeros((len(rows), len(Sigma_shape)))
+    stretch = np.zeros((len(tree.segments), 3, len(Sigma_shape)))
+    if moves is not None:
+        told = moves.columns(layout.places, rows, tree, frames)
+        by_shape, stretch = by_shape if told is None else told, moves.joints(tree, frames)
     prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
-    alone[free, free] = inverse((H[:, :n] + other_information + prior)[free, free])
-    last = np.repeat(weight * noise.drift, 2)[:, None] * Jq
-    of_source = [channels.source == q for q in range(len(noise.shift))]
-    shifted = [product(weight[q][None], J[q, :, :n].reshape(int(q.sum()), 2 * n)).reshape(2, n) for q in of_source]
-    push = np.concatenate([last, *(p * shift[:, None] for p, shift in zip(shifted, noise.shift))])
+    alone[free, free] = inverse((product(by_pose.T, by_pose) + other_information + prior)[free, free])
+    pushed = np.sqrt(weight[rows.group])[:, None] * by_pose
+    last, source, axis = noise.drift[rows.group], channels.source[rows.group], np.arange(len(rows)) % 2
+    sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shift))]
+    push = np.concatenate([last[:, None] * pushed, *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
     meat = product(push.T, push) + other_lasting
-    answer = -product(alone, H[:, n:])
+    answer = -product(alone, product(by_pose.T, by_shape))
     dofs = product(product(alone, meat), alone)
-    moves, stretch = parameters.joint_moves(theta, state)
-    whole = product(moves, answer) + stretch
-    joints = np.sum(product(moves, dofs) * moves, axis=-1) + np.sum(product(whole, Sigma_shape) * whole, axis=-1)
+    moved = joint_moves(body, state)
+    whole = product(moved, answer) + stretch
+    joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma_shape) * whole, axis=-1)
     shape = product(product(answer, Sigma_shape), answer.T)
     return Lasting(dofs + shape, np.maximum(joints, 0.0), alone)

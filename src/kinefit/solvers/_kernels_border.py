@@ -50,3 +50,20 @@ def solve(A, right):
         for q in range(m):
             right[k, q] *= a
     return True
+
+
+@jit
+def along(data, segment, centre, screws, dof_parent, last_dof, J):
+    """J (N, n): how far the points of rows, data (6 or more, N), move along their directions."""
+    J[:] = 0.0
+    for i in range(segment.size):
+        x, y, z = data[0, i] - centre[0], data[1, i] - centre[1], data[2, i] - centre[2]
+        nx, ny, nz = data[3, i], data[4, i], data[5, i]
+        ax, ay, az = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        row = J[i]
+        row[0], row[1], row[2], row[3], row[4], row[5] = nx, ny, nz, ax, ay, az
+        d = last_dof[segment[i]]
+        while d >= 6:
+            t = screws[d - 6]
+            row[d] = t[0] * nx + t[1] * ny + t[2] * nz + t[3] * ax + t[4] * ay + t[5] * az
+            d = dof_parent[d]

@@ -132,31 +132,6 @@ def frame_system(
 
 
 @jit
-def frame_jacobian(
-    parents, dof_parent, last_dof, offsets, groups, n_groups, owner, rest, base, shift, mirror, cameras, camera, column,
-    frames, screws, centre, J,
-):  # fmt: skip
-    """J (N, 2, m): derivatives of every measurement's pixel; left alone where it cannot be seen."""
-    n = screws.shape[0] + 6
-    motion = np.empty((parents.size, n_groups, 3))
-    scale_motion(parents, offsets, groups, frames, motion)
-    index = np.empty(n + n_groups + 3, np.int64)
-    ju, jv = np.empty(index.size), np.empty(index.size)
-    for m in range(camera.size):
-        k = column[m]
-        x, y, z = place(frames, owner, rest, k)
-        ok, _, _, ux, uy, uz, vx, vy, vz = project_jacobian(cameras[camera[m]], x, y, z)
-        if not ok:
-            continue
-        count = pose_and_shape_columns(
-            x, y, z, ux, uy, uz, vx, vy, vz, owner[k], k, n, n_groups, dof_parent, last_dof, groups, base, shift,
-            mirror, motion, frames, screws, centre, index, ju, jv,
-        )  # fmt: skip
-        for a in range(count):
-            J[m, 0, index[a]], J[m, 1, index[a]] = ju[a], jv[a]
-
-
-@jit
 def frame_cost(owner, rest, cameras, camera, column, target, weight, share, frames, kind, scale):
     """Robust cost of one frame's pixels alone."""
     cost = 0.0

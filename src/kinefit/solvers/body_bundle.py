@@ -12,6 +12,7 @@ from kinefit.bodies import BodyState
 from kinefit.geometry.camera import Rig
 from kinefit.losses import Loss, geman_mcclure
 from kinefit.solvers import _kernels_linear, _kernels_shape
+from kinefit.solvers.border_frames import POSTURE
 from kinefit.solvers.cameras import (
     COLUMNS,
     TIME,
@@ -23,7 +24,7 @@ from kinefit.solvers.cameras import (
     residuals,
     robust_cost,
 )
-from kinefit.solvers.shape import _POSTURE, PixelFrames, ShapeParameters
+from kinefit.solvers.shape import PixelFrames, ShapeParameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ def fit_body_and_cameras(
     loss = loss or geman_mcclure()
     tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
     groups, size = len(model.body.scale_groups), len(rig) * COLUMNS
-    posture = _POSTURE * np.square(1.0 / tree.spread)
+    posture = POSTURE * np.square(1.0 / tree.spread)
     shape_prior = model.prior
     precision, freedom = prior.precision, prior.freedom
     owner = frames.points.segments

@@ -8,8 +8,9 @@ factors held: no sensor needs to know of a parameter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from kinefit.losses import SQUARED, Loss
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.border_frames import (
     POSTURE,
+    SETTLING,
     Frame,
     Problem,
     Weighing,
@@ -35,7 +37,7 @@ _LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
 _NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
-_LEAST = 3.0  # [1/m², 1/rad²] damping of poses when they move with parameters
+_LEAST = 0.3  # [1/m², 1/rad²] damping of poses when they move with parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +62,25 @@ class Bordered:
     ----------
     theta : (p,)
     states : K states
-    information : (p, p) what the rows tell of θ, every pose eliminated; without the prior.
     prior : Prior
     cost : float, of rows, postures and prior.
     iterations : int, steps tried.
     converged : bool, False when the iterations were used up.
+    told : function that makes `information`, when it is asked for.
     """
 
     theta: NDArray
     states: tuple[BodyState, ...]
-    information: NDArray
     prior: Prior
     cost: float
     iterations: int
     converged: bool
+    told: Callable[[], NDArray]
+
+    @cached_property
+    def information(self) -> NDArray:
+        """(p, p) what the rows tell of θ, every pose eliminated; without the prior."""
+        return self.told()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +106,7 @@ def solve(
     loss: Loss = SQUARED,
     posture: float = POSTURE,
     max_iterations: int = 20,
+    settling: int = SETTLING,
     tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
@@ -114,6 +122,7 @@ def solve(
         How much a sensor's rows count, where its errors last from frame to frame; 1 for those not named.
     loss : Loss of rows without their own.
     posture : share of the body's posture prior that holds the poses.
+    settling : steps that poses take by themselves, at most, after each one with the parameters.
     tolerance : stop when the predicted fall of the cost is below this share of it.
 
     Raises
@@ -124,19 +133,21 @@ def solve(
     task = _Task(problem, prior, np.asarray(steps, float), Weighing(shares or {}, loss, posture))
     theta, bounds = np.array(theta, float), limits(problem.body(theta))
     states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
-    frames, states = settle(problem, theta, states, task.weighing)
-    cost, blocks = task.cost(theta, frames), task.blocks(theta, states, frames, None)
+    frames, states = settle(problem, theta, states, task.weighing, settling)
+    cost, blocks, near = task.cost(theta, frames), None, None
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
     damping, growth, converged, iterations, far = _FIRST * mean, 2.0, False, 0, 0.0
     while iterations < max_iterations and not converged:
         iterations += 1
+        if blocks is None:  # not before it is needed: derivatives by θ are most of the work
+            blocks = task.blocks(theta, states, frames, near)
         delta, moves, predicted = task.step(theta, blocks, damping)
         if predicted <= tolerance * cost + 1e-300:
             converged = True
             continue
         trial = theta + delta
         moved = [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)]
-        settled, moved = settle(problem, trial, moved, task.weighing)
+        settled, moved = settle(problem, trial, moved, task.weighing, settling)
         new = task.cost(trial, settled)
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
         damping = max(damping, _LITTLE * mean)
@@ -145,12 +156,15 @@ def solve(
             far += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
             theta, states, frames, cost = trial, moved, settled, new
             near = blocks if far <= _NEAR else None
-            far = far if near else 0.0
-            blocks = task.blocks(theta, states, frames, near)
+            far, blocks = far if near else 0.0, None
         elif damping > _MOST * mean:
             converged = True
-    information = _information(blocks, len(theta), lock(problem.body(theta), None))
-    return Bordered(theta, tuple(states), information, prior, cost, iterations, converged)
+
+    def told() -> NDArray:
+        last = task.blocks(theta, states, frames, near) if blocks is None else blocks
+        return _information(last, len(theta), lock(problem.body(theta), None))
+
+    return Bordered(theta, tuple(states), prior, cost, iterations, converged, told)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -20,8 +20,11 @@ from kinefit.solvers.whitened import Pose, columns, residuals, softening
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
 
+SETTLING = 6
+"""Steps that a pose takes by itself, at most, after each one with the parameters."""
+
 _FIRST = 1e-3  # damping to begin with, as a share of the pose's mean diagonal
-_STEPS, _SETTLED = 6, 1e-3  # of a pose by itself, and the fall of its cost at which it rests
+_SETTLED = 1e-3  # fall of a pose's cost at which it rests
 _FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
 
 Part = tuple[str, AnyRows]
@@ -32,7 +35,8 @@ class Problem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation.
+    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives
+    as far as it is known without other worlds, NaN where it is not.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -124,14 +128,14 @@ def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, wei
 
 
 def settle(
-    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing
+    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
 ) -> tuple[list[Frame], list[BodyState]]:
     """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
     bounds, frames, out = limits(problem.body(theta)), [], []
     for f, state in enumerate(states):
         frame = frame_at(problem, theta, f, state, weighing)
         damping, growth = _FIRST * float(np.trace(frame.H)) / len(frame.H) + 1e-12, 2.0
-        for _ in range(_STEPS):
+        for _ in range(steps):
             move, predicted = frame.step(damping)
             if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
                 break
@@ -159,23 +163,55 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
         A sensor whose rows differ in number or kind between two worlds.
     """
     centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
-    out = [np.zeros((sum(len(rows) for _, rows in parts), len(theta))) for parts in centre]
+    told = getattr(problem, "columns", None)
+    if told is None:
+        out = [np.full((sum(len(rows) for _, rows in parts), len(theta)), np.nan) for parts in centre]
+    else:
+        out = told(theta, steps, states)
+    unknown = [np.isnan(D) for D in out]
+    left = np.any([u.any(axis=0) for u in unknown], axis=0)
+    for D, u in zip(out, unknown):
+        D[u] = 0.0
     on = [_segments(parts) for parts in centre]
     touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
     if all(segment is not None for segment in on):
         touches = getattr(problem, "touches", touches)
-    for together in _apart(touches):
+    for together in apart(touches, np.flatnonzero(left)):
         change = np.zeros(len(theta))
         change[together] = steps[together]
-        for sign in (-1.0, 1.0):
-            for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
-                moved = problem.parts(theta + sign * change, f, state)
-                _same(parts, moved)
-                away = -sign * _stacked(moved) / 2.0
-                for k in together:
-                    touched, segment = touches[k], on[f]
-                    felt = slice(None) if touched is None or segment is None else np.isin(segment, list(touched))
-                    out[f][felt, k] += away[felt] / steps[k]
+        owner = _owner(together, touches, len(problem.body(theta).tree.segments))
+        for f, (state, parts) in enumerate(zip(states, centre, strict=True)):
+            if not unknown[f][:, together].any():
+                continue
+            away = _by_rows(problem, theta, change, f, state, parts)
+            segment = on[f]
+            k = np.full(len(away), together[0])
+            if owner is not None and segment is not None:
+                k = owner[segment]
+            felt = np.flatnonzero(k >= 0)
+            felt = felt[unknown[f][felt, k[felt]]]
+            out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
+    return out
+
+
+def _by_rows(
+    problem: Problem, theta: NDArray, change: NDArray, frame: int, state: BodyState, parts: Sequence[Part]
+) -> NDArray:
+    """(N,) how far each row's point moves with half the change, whitened: from its rows on either side."""
+    ends = [problem.parts(theta + sign * change, frame, state) for sign in (1.0, -1.0)]
+    for moved in ends:
+        _same(parts, moved)
+    return (_stacked(ends[1]) - _stacked(ends[0])) / 2.0
+
+
+def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], count: int) -> NDArray | None:
+    """(S,) which of some parameters each of so many segments feels, -1 for none; None for one felt everywhere."""
+    out = np.full(count, -1)
+    for k in together:
+        touched = touches[k]
+        if touched is None:
+            return None
+        out[list(touched)] = k
     return out
 
 
@@ -186,11 +222,12 @@ def _segments(parts: Sequence[Part]) -> NDArray | None:
     return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
 
 
-def _apart(touches: Sequence[frozenset[int] | None]) -> list[list[int]]:
-    """Parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
+def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list[list[int]]:
+    """Some parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
     groups: list[tuple[list[int], set[int]]] = []
     out: list[list[int]] = []
-    for k, segments in enumerate(touches):
+    for k in map(int, some):
+        segments = touches[k]
         if segments is None:
             out.append([k])
             continue

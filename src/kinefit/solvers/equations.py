@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, DofRows, Rows, sort_out
-from kinefit.solvers import _kernels, _kernels_linear
+from kinefit.solvers import _kernels, _kernels_border, _kernels_linear
 
 _ROUNDING = 1e-14  # share of the most informed degree of freedom's information that is none
 _LOOSE = 1e-5  # share of a free direction from which a degree of freedom takes part in it
@@ -170,12 +170,10 @@ def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
     """(N, n) how far each row's point moves along its direction with every degree of freedom."""
     if isinstance(rows, DofRows):
         return rows.jacobian
-    _, screws = body.tree.forward(state.T_world_root, state.angles)
-    a = np.concatenate([rows.direction, np.cross(rows.point - state.T_world_root[:3, 3], rows.direction)], axis=1)
-    out = np.empty((len(rows), body.tree.n_dofs))
-    for s in np.unique(rows.segment):
-        of = rows.segment == s
-        out[of] = a[of] @ body.tree.segment_jacobian(screws, int(s))
+    tree, out = body.tree, np.empty((len(rows), body.tree.n_dofs))
+    _, screws = tree.forward(state.T_world_root, state.angles)
+    centre = np.ascontiguousarray(state.T_world_root[:3, 3])
+    _kernels_border.along(rows.data, rows.segment, centre, screws, tree.dof_parent, tree.last_dof, out)
     return out
 
 

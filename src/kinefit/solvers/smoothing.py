@@ -95,7 +95,8 @@ class MotionPrior:
             middle = 0.5 * (low + high)
             w = np.exp(middle)
             density = 1.0 / (w[:, None] + prior)
-            variance = np.trapezoid(density, theta, axis=1) / np.pi + lowest * density[:, 0] / np.pi
+            whole = 0.5 * (density[:, 1:] + density[:, :-1]) @ np.diff(theta)  # trapezoidal rule
+            variance = (whole + lowest * density[:, 0]) / np.pi
             wide = variance > self.spread**2
             low, high = np.where(wide, middle, low), np.where(wide, high, middle)
         return np.where(np.isfinite(self.spread), np.exp(0.5 * (low + high)), 0.0)

@@ -11,40 +11,34 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import Loss
 from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
+from kinefit.solvers import _kernels_border
 
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """How the segments of a body at a state move with its degrees of freedom.
+    """How a body at a state moves with its degrees of freedom.
 
     Parameters
     ----------
     body : Body
     state : BodyState
-    centre : (3,) [m] the root's origin, which twists are taken about.
-    moves : (S, 6, n) twist (v, ω) of each segment by each degree of freedom.
+    screws : (D, 6) twist (v, ω) of each coordinate about the root's origin.
     """
 
     body: Body
     state: BodyState
-    centre: NDArray
-    moves: NDArray
+    screws: NDArray
 
     @classmethod
     def of(cls, body: Body, state: BodyState) -> Pose:
         """The body at a state."""
-        tree = body.tree
-        _, screws = tree.forward(state.T_world_root, state.angles)
-        moves = np.stack([tree.segment_jacobian(screws, s) for s in range(len(tree.segments))])
-        return cls(body, state, state.T_world_root[:3, 3], moves)
+        return cls(body, state, body.tree.forward(state.T_world_root, state.angles)[1])
 
-    def along(self, segment: NDArray, point: NDArray, direction: NDArray) -> NDArray:
-        """(N, n) [m] how far points (N, 3) of segments (N,) move along directions (N, 3)."""
-        a = np.concatenate([direction, np.cross(point - self.centre, direction)], axis=1)
-        out = np.empty((len(a), self.moves.shape[2]))
-        for s in np.unique(segment):
-            of = segment == s
-            out[of] = a[of] @ self.moves[s]
+    def along(self, segment: NDArray, data: NDArray) -> NDArray:
+        """(N, n) [m] how far points, data[:3] (3, N), of segments (N,) move along directions, data[3:6] (3, N)."""
+        tree, out = self.body.tree, np.empty((len(segment), self.body.tree.n_dofs))
+        centre = np.ascontiguousarray(self.state.T_world_root[:3, 3])
+        _kernels_border.along(data, segment, centre, self.screws, tree.dof_parent, tree.last_dof, out)
         return out
 
 
@@ -80,11 +74,14 @@ def columns(rows: AnyRows, pose: Pose) -> NDArray:
     n, count = pose.body.tree.n_dofs, len(pose.body.tree.segments)
     if isinstance(rows, Rows):
         _within("segment", rows.segment, count, pose.body)
-        return np.sqrt(rows.weight)[:, None] * pose.along(rows.segment, rows.point, rows.direction)
+        return np.sqrt(rows.weight)[:, None] * pose.along(rows.segment, rows.data)
     if isinstance(rows, PairRows):
         _within("segment", rows.segments, count, pose.body)
-        a = pose.along(rows.segments[:, 0], rows.point_a, rows.direction)
-        return np.sqrt(rows.weight)[:, None] * (a - pose.along(rows.segments[:, 1], rows.point_b, rows.direction))
+        a, b = (
+            pose.along(np.ascontiguousarray(s), np.concatenate([x.T, rows.direction.T]))
+            for s, x in zip(rows.segments.T, (rows.point_a, rows.point_b))
+        )
+        return np.sqrt(rows.weight)[:, None] * (a - b)
     if isinstance(rows, ParameterRows):
         _within("degree of freedom", rows.index, n, pose.body)
         chosen = np.eye(n)[rows.index]

@@ -6,8 +6,7 @@ are matched, poses and parameters solved together, and matched again where the s
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,12 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
 from kinefit.solvers.border import Bordered, Prior, solve
-from kinefit.solvers.border_frames import POSTURE
+from kinefit.solvers.border_frames import POSTURE, SETTLING
 from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
+from kinefit.subject.subject import SubjectFit, Unmeasured
 
 REACH = (0.08, 0.05, 0.03)
 """[m] of correspondences that are sought anew, coarse to fine; the last for all further rounds."""
@@ -30,80 +30,12 @@ REACH = (0.08, 0.05, 0.03)
 TOLD = 0.1
 """Share of the prior's variance that data must explain for a direction to count as measured."""
 
+COARSE = 4, SETTLING
+"""Iterations of a round where correspondences are sought anew, or reach farther than in the end; and how many steps
+poses take by themselves in each."""
+
 _ITERATIONS = 15  # of the solver, in the last rounds
-_COARSE = 4  # of one where some are sought anew, or reach farther than in the end
 _DONE = 0.01  # posterior standard deviations of a change between rounds that is none
-
-
-@dataclass(frozen=True, eq=False)
-class Unmeasured:
-    """A combination of parameters that the prior alone holds.
-
-    Parameters
-    ----------
-    direction : (p,) in prior standard deviations, of length 1.
-    share : of the prior's variance in it that data explain, below `TOLD`.
-    names : of the parameters that make up most of it, the largest first.
-    """
-
-    direction: NDArray
-    share: float
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """A person, cameras and sensors as a fit found them.
-
-    Parameters
-    ----------
-    body, rig, values : the world that was found; see `World`.
-    names, mean : (p,) of the parameters.
-    covariance : (p, p) posterior, with the poses unknown and lasting errors counted.
-    states : K poses, refined along.
-    information : (p, p) what the sensors measure, without the prior, lasting errors counted.
-    prior : Prior
-    excess : {sensor: factor} by which what its frames measure together is less certain than its rows say.
-    unmeasured : directions that the prior alone holds, the least measured first.
-    cost : float
-    rounds : of match and solve
-    parameters : the kinds of them
-    prior_world : the world that they apply to
-    """
-
-    body: Body
-    rig: Rig
-    values: Mapping[str, Mapping[str, float]]
-    names: tuple[str, ...]
-    mean: NDArray
-    covariance: NDArray
-    states: tuple[BodyState, ...]
-    information: NDArray
-    prior: Prior
-    excess: Mapping[str, float]
-    unmeasured: tuple[Unmeasured, ...]
-    cost: float
-    rounds: int
-    parameters: tuple[Parameters, ...]
-    prior_world: World
-
-    @property
-    def std(self) -> NDArray:
-        """(p,) posterior standard deviation of each parameter."""
-        return np.sqrt(np.diag(self.covariance))
-
-    def value(self, name: str) -> tuple[float, float]:
-        """A parameter by name: its estimate and standard deviation.
-
-        Raises
-        ------
-        ObservationError
-            No such parameter.
-        """
-        if name not in self.names:
-            raise ObservationError(f"no parameter '{name}' was fitted", remedy=f"Fitted are: {', '.join(self.names)}.")
-        k = self.names.index(name)
-        return float(self.mean[k]), float(self.std[k])
 
 
 def fit_subject(
@@ -121,7 +53,8 @@ def fit_subject(
     looks: float | None = None,
     loss: Loss = SQUARED,
     posture: float = POSTURE,
-) -> Subject:
+    coarse: tuple[int, int] = COARSE,
+) -> SubjectFit:
     """Parameters and poses that explain what all sensors saw in K frames.
 
     Parameters
@@ -140,6 +73,8 @@ def fit_subject(
         how much residuals last (see `lasting.excess`).
     loss : Loss of rows that have none of their own.
     posture : share of the body's posture prior that holds the poses.
+    coarse : iterations of a round where correspondences are sought anew, and steps of poses by themselves in each: few,
+        where the nearest points of a surface would let poses follow lengths that are wrong.
 
     Raises
     ------
@@ -167,22 +102,25 @@ def fit_subject(
     told = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
-        coarse, before = anew or used < min(len(reach), rounds), theta
+        early, before = anew or used < min(len(reach), rounds), theta
+        iterations, settling = coarse if early else (_ITERATIONS, SETTLING)
         solved = solve(
             frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
-            max_iterations=_COARSE if coarse else _ITERATIONS,
+            max_iterations=iterations, settling=settling,
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
-        if not coarse and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
+        if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
             break
     if looks is None:
         told = excess(frames.seen(theta, states), _followed(body, solved))
-        shares = {sensor: 1.0 / told.get(sensor, 1.0) for sensor in sensors}
-        solved = solve(
-            frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture, max_iterations=_ITERATIONS
-        )
+        shares = {sensor: 1.0 / max(told.get(sensor, 1.0), 1.0) for sensor in sensors}
+        if min(shares.values()) < 1.0:
+            solved = solve(
+                frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
+                max_iterations=_ITERATIONS,
+            )  # fmt: skip
     world = worlds.at(solved.theta)
-    return Subject(
+    return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),
         solved.states, solved.information, prior, told, unmeasured(names, prior, solved.information), solved.cost, used,
         tuple(parameters), World(body, rig),

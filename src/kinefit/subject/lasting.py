@@ -19,6 +19,7 @@ from kinefit.solvers.whitened import residuals
 _FEWEST = 10  # residuals of a sensor, below which nothing is said of their errors
 _MOST_HIDDEN = 0.75  # share of all lasting errors that a fit may be thought to follow
 _OUTLIER = 3.0  # standard deviations
+_LEAST = 1e-3  # that is told, of a sensor whose residuals are all but zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +56,10 @@ class Seen:
 
 
 def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float]:
-    """{sensor: factor ≥ 1} by which the variance of what all frames measure together is larger than rows say.
+    """{sensor: factor} by which the variance of what all frames measure together is larger than rows say.
 
-    A channel is a row's measurement id and its place in it; of surfaces also a whole segment, because their errors last
-    over a patch.
+    Below 1 where rows state more than is left over. A channel is a row's measurement id and its place in it; of
+    surfaces also a whole segment, because their errors last over a patch.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float
         lasting = _lasting(count, total) / (1.0 - hidden)
         if name in surfaces:
             lasting = max(lasting, _lasting(*by_segment[name].sums()[:2]))
-        out[name] = max(lasting, size**2, 1.0)
+        out[name] = max(lasting, size**2, _LEAST)
     return out
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.border_frames import Part
+from kinefit.solvers.border_frames import Part, apart
 from kinefit.subject.lasting import Seen
-from kinefit.subject.parameters import Parameters, World
+from kinefit.subject.parameters import Parameters, World, stacked
+from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.subject import SubjectFit
 
 _KEPT = 64  # worlds that are remembered
 _SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
@@ -27,6 +30,7 @@ class Worlds:
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
+        self._bare: Worlds | None = None
         self._scenes: dict[int, tuple[Body, Scene]] = {}
 
     def at(self, theta: NDArray) -> World:
@@ -50,6 +54,27 @@ class Worlds:
         for one, own in self._parameters:
             out += getattr(one, "touches", (None,) * (own.stop - own.start))
         return tuple(out)
+
+    @property
+    def of_points(self) -> NDArray:
+        """(p,) bool, parameters that move nothing but points and joints of the body."""
+        told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
+        return np.concatenate(told)
+
+    def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
+        """How points move with some parameters, all of which move nothing else; by central differences."""
+        worlds = self
+        if self.of_points.all():  # surfaces would be stretched for nothing
+            if self._bare is None:
+                bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
+                self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
+            worlds = self._bare
+        pairs = []
+        for together in apart(self.touches, some):
+            change = np.zeros(len(theta))
+            change[together] = steps[together]
+            pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
+        return PointMoves(pairs, some, steps, self.touches)
 
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body share what was made for it."""
@@ -95,6 +120,26 @@ class MatchedFrames:
             out += [(measurement.sensor, part) for part in rows]
         return out
 
+    def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
+        """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
+        world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
+        some = len(moving) and any(m.places is not None for several in self._matched for m in several)
+        moves = self._worlds.moves(theta, steps, moving) if some else None
+        out = []
+        for f, state in enumerate(states):
+            scene, blocks = self._scene(world, f, state), [np.empty((0, len(theta)))]
+            for i, matched in enumerate(self._matched[f]):
+                for rows in self._rows((f, i), matched.sensor, matched, scene, world):
+                    blocks.append(np.full((len(rows), len(theta)), np.nan))
+                    if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
+                        continue
+                    there = scene.at_time(matched.time)
+                    told = moves.columns(matched.places, rows, there.body.tree, there.frames)
+                    if told is not None:
+                        blocks[-1][:, moving] = told
+            out.append(np.concatenate(blocks))
+        return out
+
     def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
         """What every frame's sensors saw, with the names of what they saw."""
         world, out = self._worlds.at(theta), []
@@ -128,6 +173,12 @@ class MatchedFrames:
         time = several[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
         return scene.at(state, time=time, velocity=velocity, measurements=several)
+
+
+def point_moves(found: SubjectFit) -> PointMoves:
+    """How points and joints move with the parameters of a fit, all of which move nothing else."""
+    worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
+    return worlds.moves(found.mean, step, np.arange(len(step)))
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

@@ -44,7 +44,12 @@ class World:
 
 
 class Parameters(Protocol):
-    """One kind of parameters: names, a prior, and a function from values to a world."""
+    """One kind of parameters: names, a prior, and a function from values to a world.
+
+    It may have `of_points`, True where the values move nothing but points and joints of the body: derivatives of rows
+    of points then take no rows of other worlds. It may have `touches`, of each parameter the segments on which alone
+    rows can feel it.
+    """
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -91,6 +96,7 @@ class SegmentScales:
     size: float | None = None
     about: float = 1.0
     proportions: float = PROPORTIONS
+    of_points = True
 
     def __post_init__(self) -> None:
         if not ((self.size is None or self.size > 0) and self.about > 0 and self.proportions > 0):
@@ -118,6 +124,17 @@ class SegmentScales:
         """(G,)."""
         return np.full(len(self.names), _STEP)
 
+    @cached_property
+    def touches(self) -> tuple[frozenset[int] | None, ...]:
+        """Of each parameter the segments that it moves: its own, and all beyond; None where a skin joins segments."""
+        body, count = self.body, len(self.body.scale_groups)
+        if body.skin is not None or body.morphs:
+            return (None,) * count
+        above: list[set[int]] = []
+        for parent, group in zip(body.tree.parents, body.segment_scale):
+            above.append({int(group)} | (above[parent] if parent >= 0 else set()))
+        return tuple(frozenset(s for s, groups in enumerate(above) if g in groups) for g in range(count))
+
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these lengths; all its points, surfaces and morphs go along."""
         return replace(world, body=world.body.scaled(np.exp(values)))
@@ -129,7 +146,7 @@ class KnownLengths(SegmentScales):
 
     Parameters
     ----------
-    scales, covariance : (G,) of the body's lengths, and (G, G) of them
+    scales, covariance : (G,) of the body's lengths, and (G, G) of their logarithms
     """
 
     scales: NDArray = field(default_factory=lambda: np.ones(0))
@@ -143,7 +160,7 @@ class KnownLengths(SegmentScales):
     @property
     def information(self) -> NDArray:
         """(G, G)."""
-        return np.linalg.inv(self.covariance / np.outer(self.scales, self.scales))
+        return np.linalg.inv(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +179,7 @@ class PointOffsets:
     name: str
     std: ArrayLike = 0.01
     mirror: bool | None = None
+    of_points = True
 
     def __post_init__(self) -> None:
         sets = {**self.body.keypoint_sets, **self.body.marker_sets}

@@ -1,4 +1,4 @@
-"""Parameters of a body's surface: girths of its cylinders, or the shape of an Anny body."""
+"""Parameters of a body's surface: girths or whole cylinders, or the shape of an Anny body."""
 
 from __future__ import annotations
 
@@ -93,6 +93,74 @@ class CylinderShape:
         surfaces = tuple(
             _shaped(s, sizes[g]) if isinstance(s, TaperedCylinder) else s
             for s, g in zip(world.body.surfaces, self._groups[1], strict=True)
+        )
+        return replace(world, body=replace(world.body, surfaces=surfaces))
+
+
+@dataclass(frozen=True, eq=False)
+class Girths:
+    """Logarithms of the girths of a body's cylinders along both half axes, one pair for each of its scale groups.
+
+    Who is thick is so all over: half of the variance is common to all girths. A few frames tell these, where they leave
+    the many numbers of a `CylinderShape` to its prior.
+
+    Parameters
+    ----------
+    body : Body with cylinders.
+    girth : standard deviation of each.
+
+    Raises
+    ------
+    BodyError
+        A body without cylinders.
+    """
+
+    body: Body
+    girth: float = GIRTH
+
+    def __post_init__(self) -> None:
+        if not self._groups:
+            raise BodyError(f"body '{self.body.name}' has no cylinders", remedy="Give its segments a `surface`.")
+
+    @cached_property
+    def _groups(self) -> tuple[int, ...]:
+        """Scale groups that have cylinders."""
+        of = self.body.segment_scale
+        return tuple(sorted({int(of[s.segment]) for s in self.body.surfaces if isinstance(s, TaperedCylinder)}))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(2 G,)."""
+        return tuple(f"girth {self.body.scale_groups[g]} {axis}" for g in self._groups for axis in "ab")
+
+    @property
+    def touches(self) -> tuple[frozenset[int], ...]:
+        """Of each parameter the segments that it changes."""
+        on = [frozenset(np.flatnonzero(self.body.segment_scale == g).tolist()) for g in self._groups]
+        return tuple(segments for segments in on for _ in "ab")
+
+    @property
+    def mean(self) -> NDArray:
+        """(2 G,) zero."""
+        return np.zeros(len(self.names))
+
+    @property
+    def information(self) -> NDArray:
+        """(2 G, 2 G)."""
+        return np.linalg.inv(self.girth**2 * (0.5 * np.eye(len(self.names)) + 0.5))
+
+    @property
+    def step(self) -> NDArray:
+        """(2 G,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The body with these girths."""
+        size = np.zeros((len(self.body.scale_groups), 6))
+        size[list(self._groups), :4] = np.tile(np.reshape(values, (-1, 2)), 2)
+        surfaces = tuple(
+            _shaped(s, size[self.body.segment_scale[s.segment]]) if isinstance(s, TaperedCylinder) else s
+            for s in world.body.surfaces
         )
         return replace(world, body=replace(world.body, surfaces=surfaces))
 

@@ -28,8 +28,7 @@ from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.subject import fit as joint
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, contradictions
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
@@ -63,7 +62,7 @@ class TrackedFrames:
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", name: str = "motion",
-    told: Mapping[str, Any] | None = None, found: Sequence[joint.Subject] = (),
+    told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 

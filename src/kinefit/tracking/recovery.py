@@ -90,7 +90,10 @@ class Recovery:
     ) -> FrameResult | None:
         """A start from what shows a whole person."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
-        for state in starts_from_views(self.body, self.rig, frames, self.up, scene, tracker.sensors.keypoints):
+        own = tracker.sensors
+        for state in starts_from_views(
+            self.body, self.rig, frames, self.up, scene, own.keypoints, backgrounds=own.stated
+        ):
             found = tracker.fitted(time, frames, state).result
             poor = found.lost[0] or found.quality < self.settings.poor
             if not poor and (result is None or _better(found, result)):

@@ -16,7 +16,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool
-from kinefit.subject.keypoints import Progress
+from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.residuals import Remains
 from kinefit.tracking.session import KeptFrame

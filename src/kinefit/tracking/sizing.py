@@ -19,8 +19,9 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
-from kinefit.subject.keypoints import Progress, Subject, fit_subject
+from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import SegmentScales
+from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
@@ -55,7 +56,7 @@ class Person:
     start: Start | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
-    joint: tuple[joint.Subject, ...] = ()
+    joint: tuple[SubjectFit, ...] = ()
 
 
 def fitted_to_person(
@@ -133,17 +134,18 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
     r, body = person.recording, person.subject.body
     frames = r.depth
     camera = r.rig[next(iter(frames.values())).sensor]
+    empty = {r.rig[name].name: depth for name, depth in r.backgrounds.items()}.get(camera.name)
     if progress:
         progress("size", 0, 1)
     try:
-        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, up=r.up_axis)
+        fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, background=empty, up=r.up_axis)
     except KinefitError as error:
         return replace(person, told={**person.told, "size": f"not found: {error.problem}"})
     finally:
         if progress:
             progress("size", 1, 1)
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
-    told = dict(zip(fit.names, map(float, fit.factors)))
+    told = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
     person = _wearing(person, replace(person.subject, body=fit.body), size=told)
     return person if person.start is not None else replace(person, start=(step, best.state))
 
@@ -187,7 +189,7 @@ def _by_all(
     states: Sequence[BodyState] = [tracked.results[k].state for k in chosen]
     times, velocities = [tracked.results[k].time for k in chosen], [_velocity(tracked.results, k) for k in chosen]
 
-    def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> joint.Subject:
+    def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         return joint.fit_subject(
             unknown.world.body, r.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
             times=times, velocities=velocities, rounds=_MATCHES,
@@ -197,7 +199,7 @@ def _by_all(
     if points is not None:
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states
-    lengths = points is None and person.subject.shape is None
+    lengths = points is None and person.subject.fit is None
     left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
     if left is not None:
         found = fit(left, steps, states)
@@ -205,13 +207,13 @@ def _by_all(
     return replace(person, start=(first + tracked.steps[chosen[0]], states[0]))
 
 
-def _by_joint(person: Person, found: joint.Subject) -> Person:
+def _by_joint(person: Person, found: SubjectFit) -> Person:
     """The person as a fit of several kinds of sensors found it; with its lengths where they were sought."""
     subject, count = person.subject, len(person.subject.scales)
     if any(isinstance(p, SegmentScales) for p in found.parameters):
         base = subject.scales if found.prior_world.body is subject.body else 1.0
         subject = replace(
-            subject, scales=base * np.exp(found.mean[:count]), shape=None, covariance=None,
+            subject, scales=base * np.exp(found.mean[:count]), fit=None, covariance=None,
             length_share=found.std[:count],
         )  # fmt: skip
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}

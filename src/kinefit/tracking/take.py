@@ -17,7 +17,8 @@ from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.subject.keypoints import Subject, fit_subject
+from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 

@@ -28,7 +28,7 @@ from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.keypoints import Subject
+from kinefit.subject.subject import Subject
 from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recovery import Recovery
 from kinefit.tracking.session import Session, axis_of

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.subject.keypoints import Subject
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import OwnUnknowns
+from kinefit.subject.subject import Subject
 from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording
 
@@ -102,12 +102,10 @@ def _together(world: World, found: Sequence[tuple[Parameters, NDArray]]) -> Unkn
 
 def _keypoint_offsets(generic: Body, subject: Subject) -> dict[str, tuple[Parameters, NDArray]]:
     """Of every keypoint set its offsets, as far as the keypoints' own fit found that they may be, and where it did."""
-    if subject.shape is None:
-        return {}
-    known, groups = subject.shape, len(subject.scales)
-    std = float(1.0 / np.sqrt(np.min(np.diag(known.prior)[groups:])))
     scaled, out = generic.scaled(subject.scales), dict[str, tuple[Parameters, NDArray]]()
-    for name in subject.sets:
-        offsets = PointOffsets(generic, name, std)
+    for one in subject.fit.parameters if subject.fit is not None else ():
+        if not isinstance(one, PointOffsets):
+            continue
+        name, offsets = one.name, PointOffsets(generic, one.name, one.std)
         out[name] = offsets, offsets.values_of(subject.body.keypoints(name).points - scaled.keypoints(name).points)
     return out

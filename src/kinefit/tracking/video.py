@@ -9,7 +9,7 @@ from kinefit.sensors.checks import of_kind
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import lag_frames
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.subject.keypoints import Progress, Subject
+from kinefit.subject.subject import Progress, Subject
 from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.motions import TrackedFrames, motion_of
 from kinefit.tracking.recording import Recording

@@ -249,7 +249,7 @@ def test_the_page_has_its_parts_and_no_address_and_no_nan(tmp_path):
     motion = replace(smooth_motion(60), name="a walk")
     text = page_of(motion, tmp_path, rig=Rig((a_camera("cam 0", 0.0),)), files={"motion.npz": "everything"})
     titles = re.findall(r"<h2>([^<]*)</h2>", text)
-    assert titles == ["Summary", "Doubtful moments", "Moving figure", "Angles", "Cycles", "Fit to the measurements",
+    assert titles == ["Summary", "Moving figure", "Angles", "Cycles", "Doubtful moments", "Fit to the measurements",
                       "Methods", "Files"]  # fmt: skip
     assert "://" not in own(text) and "<h1>a walk</h1>" in text and 'href="motion.npz"' in text
     assert plots(text)  # json.loads of the tests takes NaN; the text has none
@@ -270,7 +270,8 @@ def test_doubt_comes_before_results_and_names_its_severity(tmp_path):
     bad = replace(good_motion(), quality=np.zeros(F), segment_quality=np.zeros((F, 20)))
     text = page_of(bad, tmp_path, findings=[("warning", "Found by the check", "cam0 is late")])
     assert '<div class="callout bad">' in text and "In 100 % of the frames nobody was seen." in text
-    assert text.index("Found by the check") < text.index('id="doubtful-moments"') < text.index('id="angles"')
+    assert text.index("In 100 %") < text.index("Found by the check") < text.index('id="angles"')
+    assert '<a href="#doubtful-moments">where and why</a>' in text
     assert '<div class="callout good">' in page_of(good_motion(), tmp_path)
 
 
@@ -358,7 +359,7 @@ def test_pictures_stand_beside_their_moment(tmp_path):
     pictures = {"cam2": dict.fromkeys(report_frames(motion), np.full((90, 60, 3), 9, np.uint8))}
     assert worst in pictures["cam2"]
     text = page_of(motion, tmp_path, pictures=pictures)
-    doubtful = text[text.index('id="doubtful-moments"') : text.index('id="moving-figure"')]
+    doubtful = text[text.index('id="doubtful-moments"') : text.index('id="fit-to-the-measurements"')]
     assert f"cam2, frame {worst}" in doubtful and doubtful.count("<img") == 1
     shown = text[text.index('<section id="pictures"') : text.index('<section id="methods"')]
     assert shown.count("<img") == 3
@@ -377,8 +378,8 @@ def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
     }  # fmt: skip
     text = " ".join(methods_sentences(replace(motion, provenance=told), 3))
     for part in (
-        "kinefit 9.9", "(openpose BODY_25B)", "a stated standard deviation of 8 px",
-        "calib.toml (SHA-256 abababababababab…)",
+        "kinefit 9.9", "(OpenPose (Cao et al. 2021, IEEE TPAMI 43:172) BODY_25B)",
+        "a stated standard deviation of 8 px", "calib.toml (SHA-256 abababababababab…)",
         "window 500", "every keypoint (median 4.5 px) was estimated", "poor 0.5", "3 moments were",
     ):  # fmt: skip
         assert part in text, part

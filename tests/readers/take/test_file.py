@@ -194,7 +194,7 @@ def test_markers_alone(data_dir, tmp_path):
 
 
 WRONG = {
-    "unknown sensor": (take_text(more='[[lidar]]\nfile = "x"'), r"no sensor or table 'lidar'; there are: take, start"),
+    "unknown sensor": (take_text(more='[[lidar]]\nfile = "x"'), r"no sensor or table 'lidar'; there are: take, s"),
     "unknown key": (take_text(a='vidoe = "x.mp4"'), r"\[\[camera\]\] 1: no key 'vidoe'; there are: name, video"),
     "unknown key of take": (take_text(head="fps = 50"), r"\[take\]: no key 'fps'; there are: name, rate, up"),
     "unknown option": (take_text(a='image = "cropped"'), r"camera\[0\].image: Invalid value 'cropped'.*'scaled'"),

@@ -32,11 +32,11 @@ from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.subject.fit import Subject, fit_subject
-from kinefit.subject.keypoints import Subject as Person
+from kinefit.subject.fit import fit_subject
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
+from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.take_recording import marker_sensor, recording_of
@@ -115,7 +115,7 @@ class _Problem:
     """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
 
     def __init__(
-        self, recording: Recording, motion: Motion, person: Person, depth: frozenset[str], origins: dict[str, NDArray]
+        self, recording: Recording, motion: Motion, person: Subject, depth: frozenset[str], origins: dict[str, NDArray]
     ) -> None:
         self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
         self.person, self.origins, self.centre = person, origins, np.zeros(3)
@@ -241,7 +241,7 @@ class _Problem:
     def fit(
         self, some: Sequence[_Look], values: Mapping[str, Mapping[str, float]], parameters: Sequence[Parameters],
         start: NDArray, **options: Any,
-    ) -> Subject:  # fmt: skip
+    ) -> SubjectFit:  # fmt: skip
         """Parameters of some frames from a start, at which the sensors have `values`."""
         return fit_subject(
             self.body, self.recording.rig, self.measured(some, values, self.sensors), [look.state for look in some],
@@ -253,7 +253,7 @@ class _Problem:
         """What else is unknown: the surface where depth is seen, places of markers and of detectors' points."""
         scales, covariance = self.person.scales, self.person.covariance
         assert covariance is not None  # of a fit
-        known = covariance[: len(scales), : len(scales)] / np.outer(scales, scales)
+        known = covariance[: len(scales), : len(scales)]
         out: list[Parameters] = [KnownLengths(self.body, scales=np.ones(len(scales)), covariance=known)]
         surfaces = self.body.surfaces if any(isinstance(f, DepthFrame) for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
 from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
-from kinefit.calibration.refine.sightings import Progress, Sighting, pixel_frames, sight, spread_frames, static_pixels
+from kinefit.calibration.refine.sightings import (
+    Progress,
+    Sighting,
+    body_model,
+    pixel_frames,
+    sight,
+    spread_frames,
+    static_pixels,
+)
 from kinefit.calibration.refine.uncertainty import bias, chance
 from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
@@ -120,10 +128,9 @@ def refine_from(
         chosen = spread_frames(seen, _MOST_FRAMES)
         _check_frames(seen, chosen)
         pixels, velocity = pixel_frames(seen, chosen)
-        assert seen.subject.shape is not None
-        model = seen.subject.shape.parameters
+        model, theta = body_model(seen, body)
         bundle = fit_body_and_cameras(
-            model, rig, pixels, velocity, [seen.motion.state(int(f)) for f in chosen], seen.subject.shape.theta, prior,
+            model, rig, pixels, velocity, [seen.motion.state(int(f)) for f in chosen], theta, prior,
             static=static, x_static=static_start(rig, static),
         )  # fmt: skip
         change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))

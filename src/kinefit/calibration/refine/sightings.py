@@ -15,14 +15,17 @@ from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import PointPixels
-from kinefit.solvers.shape import PixelFrames
-from kinefit.subject.keypoints import Subject, fit_subject
+from kinefit.solvers.shape import PROPORTIONS, PixelFrames, ShapeParameters, shape_parameters
+from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.parameters import PointOffsets
+from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
 Progress = Callable[[str, int, int], None]
 
 _INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
+_POINT = 0.01  # [m] standard deviation of a detector's points about the body's, where no fit tells
 _TRACKED = 0.3  # quality of a frame that counts
 
 
@@ -110,6 +113,21 @@ def sight(
     own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)
     confidence = np.where(own, channels.confidence, channels.confidence[:, channels.partner])
     return Sighting(channels, subject, motion, uv, np.where(np.isfinite(uv).all(axis=-1), confidence, 0.0))
+
+
+def body_model(sighting: Sighting, body: Body) -> tuple[ShapeParameters, NDArray]:
+    """The generic body's lengths and points as parameters with their prior, and (p,) what the subject's fit found."""
+    subject, points = sighting.subject, sighting.channels.points
+    found = () if subject.fit is None else subject.fit.parameters
+    stds = [float(np.max(one.std)) for one in found if isinstance(one, PointOffsets)]
+    model = shape_parameters(body, points, subject.scales, PROPORTIONS, max(stds, default=_POINT))
+    moved = sighting.channels.with_points(subject.body).points.points
+    moved = moved - sighting.channels.with_points(body.scaled(subject.scales)).points.points
+    theta, first = model.mean.copy(), len(subject.scales)
+    theta[:first] = subject.scales
+    moved[:, 2] *= model.mirror
+    theta[first + model.shift[:, None] + np.arange(3)] = moved
+    return model, theta
 
 
 def spread_frames(sighting: Sighting, most: int) -> NDArray:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, write_lines
+from kinefit.exporters.pictures.privacy import without_face
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -33,6 +34,7 @@ def write_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     time_offset: float = 0.0,
+    blur: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> None:
     """Write a video (H.264 where the codec is there, else MPEG-4) of every picture with the fit drawn on it.
@@ -53,6 +55,8 @@ def write_overlay(
         By default those that the motion holds under the camera's name.
     time_offset : float [s]
         Added to frame / rate to get the time of the take.
+    blur : bool
+        Whether the person's face is made unrecognisable; see `without_face`.
     progress : callable, optional
         Called with the number of pictures done.
 
@@ -66,8 +70,9 @@ def write_overlay(
         for i, image in enumerate(video.frames()):
             frame = nearest_frame(motion, i / video.rate + time_offset)
             drawn = draw_overlay(
-                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}"
-            )
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}",
+                blur=blur,
+            )  # fmt: skip
             encode(drawn[:height, :width])
             if progress:
                 progress(i + 1)
@@ -90,13 +95,14 @@ def draw_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     label: str | None = None,
+    blur: bool = False,
 ) -> NDArray[np.uint8]:
     """One picture with the fit drawn on it.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 RGB; left as it is.
-    motion, camera, image_frame, residuals : see `write_overlay`.
+    motion, camera, image_frame, residuals, blur : see `write_overlay`.
     frame : frame of the motion, None for a picture outside of it.
     label : str, optional
         By default the number of the frame.
@@ -105,8 +111,8 @@ def draw_overlay(
     -------
     (H, W, 3) uint8 RGB
     """
-    out = np.array(image, order="C")
     image_frame = image_frame or ImageFrame.identity()
+    out = without_face(image, motion, frame, camera, image_frame) if blur else np.array(image, order="C")
     residuals = motion.residuals.get(camera.name) if residuals is None else residuals
     if residuals is not None and (residuals.unit != "px" or not residuals.of_points):
         residuals = None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.opensim.files import root_coordinates
 from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
+from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
 from kinefit.exporters.skeletons.common import euler_zxy
 from kinefit.motion import Motion
@@ -78,7 +79,7 @@ def curves(motion: Motion) -> list[Curve]:
 def joint_plots(motion: Motion) -> dict[str, Html]:
     """{joint: plot} of all coordinates over time with bands of ±2 standard deviations."""
     out = {}
-    for joint, rows in _by_joint(curves(motion)).items():
+    for joint, rows in by_joint(curves(motion)).items():
         traces: list[dict] = []
         ranges = []
         for row, sides in enumerate(rows.values()):
@@ -89,20 +90,22 @@ def joint_plots(motion: Motion) -> dict[str, Html]:
     return out
 
 
-def cycle_plots(motion: Motion, cycles: Cycles) -> dict[str, Html]:
-    """{joint: plot} of all coordinates over the cycle: mean, ±1 standard deviation, few cycles singly."""
+def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> dict[str, Html]:
+    """{joint: plot} of all coordinates over the cycle: mean, ±1 standard deviation, few cycles singly; norms behind."""
     spans = {side.name: side.spans for side in cycles.sides}
     other = next(iter(spans))  # of the middle of the body: the cycles of this side
     marks = {s.name: float(np.nanmean(s.toe_off)) for s in cycles.sides if np.isfinite(s.toe_off).any()}
     out = {}
     found = [c for c in curves(motion) if not c.name.endswith(("_tx", "_tz"))]  # the way over ground is no cycle
-    for joint, rows in _by_joint(found).items():
+    for joint, rows in by_joint(found).items():
         traces: list[dict] = []
         shown: dict[str, list[Curve]] = {}
         for stem, sides in rows.items():
             usable = [c for c in sides if c.side in spans or not c.side or "both" in spans]
             if not usable:
                 continue
+            wanted = dict.fromkeys((*(c.name for c in usable), stem))
+            traces += [_norm(norms[name], len(shown)) for name in wanted if norms and name in norms]
             for curve in usable:
                 side = curve.side if curve.side in spans else other
                 values = normalised(curve.values, spans[side])
@@ -128,7 +131,8 @@ def _side(name: str) -> str:
     return {"_l": "left", "_r": "right"}.get(name[-2:], "")
 
 
-def _by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
+def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
+    """{joint: {name without the side: curves}}, in the order of interest, with the joints' names in words."""
     order = list(_JOINTS)
     joints = dict.fromkeys(sorted({c.joint for c in found}, key=lambda j: order.index(j) if j in order else len(order)))
     out: dict[str, dict[str, list[Curve]]] = {}
@@ -189,6 +193,10 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
             "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}, not observed<extra></extra>", "showlegend": False,
         })  # fmt: skip
     return out
+
+
+def _norm(values: NDArray, row: int) -> dict:
+    return _filled(*_band(*values.T), _GREY, "norm", _axes(row))
 
 
 def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:

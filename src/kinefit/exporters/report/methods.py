@@ -14,6 +14,13 @@ from kinefit.exporters.report.fit import UNITS, overall_median, sensor_fits
 from kinefit.exporters.report.moments import listed
 from kinefit.motion import Motion
 
+_DETECTORS = {
+    "openpose": "OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)",
+    "mediapipe": "MediaPipe Pose (Bazarevsky et al. 2020, BlazePose)",
+    "detect": "MediaPipe's pose networks as kinefit runs them (Bazarevsky et al. 2020, BlazePose)",
+    "caliscope": "the landmarks that Caliscope recorded",
+}  # fmt: skip
+
 
 def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
     """A paragraph for a paper and the same as JSON; only what the motion and its provenance tell."""
@@ -42,7 +49,8 @@ def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
     stature = f" (stature of the model {body.stature:.2f} m)" if body.stature else ""
     out.append(
         f"The body model \"{body.name}\" has {len(body.tree.segments)} rigid segments and {len(body.tree.coordinates)} "
-        f"joint coordinates, named and signed as in OpenSim; its lengths are {of}{stature}."
+        "joint coordinates, named and signed as in OpenSim (Rajagopal et al. 2016, IEEE TBME 63:2068); its lengths are "
+        f"{of}{stature}."
     )
     if motion.residuals:
         out.append("All measurements were fitted together by robust weighted least squares over the joint coordinates.")
@@ -101,7 +109,8 @@ def _cameras(told: Mapping[str, Any], names: list[str]) -> str:
     if not names:
         return ""
     keypoints = [entry for entry in told.get("keypoints", []) if isinstance(entry, Mapping)]
-    kinds = dict.fromkeys(f"{e.get('format', '')} {e.get('set') or ''}".strip() for e in keypoints)
+    formats = [(str(e.get("format", "")), e.get("set") or "") for e in keypoints]
+    kinds = dict.fromkeys(f"{_DETECTORS.get(name, name)} {points}".strip() for name, points in formats)
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
     text = f"2D keypoints {f'({listed([k for k in kinds if k])}) ' if any(kinds) else ''}of {listed(names, 12)}"
     stated = f" with a stated standard deviation of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""

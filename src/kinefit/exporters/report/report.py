@@ -2,8 +2,9 @@
 
     write_report(motion, "report.html")
 
-Doubtful moments come first. Angles are those of OpenSim in degrees, with bands of ±2 standard deviations; what nothing
-observes is said to be so. Cycles are shown only where the movement repeats itself.
+Who, when and how far every joint moved come first, in a sentence beside them how far that can be trusted; then the
+moving figure, angles and cycles; then what is doubtful, and why. Angles are those of OpenSim in degrees, with ±2
+standard deviations; what nothing observes is said to be so. Cycles are shown only where the movement repeats itself.
 """
 
 from __future__ import annotations
@@ -14,33 +15,30 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import cycle_plots, joint_plots
+from kinefit.exporters.report.angles import curves, cycle_plots, joint_plots
 from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
+from kinefit.exporters.report.flagged import Pictures, flagged
 from kinefit.exporters.report.methods import lengths_table, methods
-from kinefit.exporters.report.moments import (
-    DOUBTFUL,
-    Moment,
-    doubt_sentence,
-    doubtful_moments,
-    listed,
-    never_observed,
-    place,
-    span,
-)
-from kinefit.exporters.report.pictures import MOMENTS, report_frames
+from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubt_sentence, doubtful_moments, listed, never_observed
+from kinefit.exporters.report.norms import Norms
+from kinefit.exporters.report.pictures import report_frames
+from kinefit.exporters.report.ranges import ranges_table
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
 _BUDGET = 40  # pictures at 640 px: about 3 MB; more of them are made smaller
 
-Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
+SESSION = {
+    "subject": "Subject", "date": "Date of the recording", "movement": "Movement", "side": "Side", "visit": "Visit",
+    "operator": "Operator", "notes": "Notes",
+}  # fmt: skip
+"""Entries of a take's `[session]`, as the page heads them."""
 
 
 def write_report(
@@ -51,6 +49,7 @@ def write_report(
     pictures: Pictures | None = None,
     files: Mapping[str, str] | None = None,
     findings: Iterable[tuple[str, str, str]] = (),
+    norms: Norms | None = None,
     date: str | None = None,
 ) -> Path:
     """Write one self-contained HTML page about a motion.
@@ -68,8 +67,10 @@ def write_report(
         Other results, as links relative to the page.
     findings : (severity, title, text), optional
         What else the reader should know first, such as what a check of the take found; severity as in `page.callout`.
+    norms : {coordinate: (N, 3)}, optional
+        Normative values, drawn as grey bands behind the cycles; see `read_norms`.
     date : str, optional
-        By default today's. The same motion and date give the same bytes.
+        Of the report; by default today's. The same motion and date give the same bytes.
 
     Returns
     -------
@@ -86,19 +87,21 @@ def write_report(
     date = date or datetime.date.today().isoformat()
     moments, shown = doubtful_moments(motion), pictures or {}
     cycles = find_cycles(motion)
+    _check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
     sections = [
         _summary(motion, moments, list(findings), date),
-        p.section("Doubtful moments", *_moments(motion, moments, shown, width)),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
             "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; grey was not "
             "seen. Times anywhere on this page, and clicks into plots over time, move the figure there.", small=True)),
         p.section("Angles", *_angles(motion)),
-        p.section("Cycles", *_cycles(motion, cycles)),
+        p.section("Cycles", *_cycles(motion, cycles, norms or {})),
+        p.section("Doubtful moments", *flagged(motion, moments, shown, width)),
         p.section("Fit to the measurements", *_fit(motion, moments)),
     ]  # fmt: skip
     if shown:
-        sections.append(p.section("Pictures", *_pictures(motion, shown, width)))
+        about = "First, middle and last frame, and the one of lowest quality"
+        sections.append(p.section("Pictures", p.folded(about, *_pictures(motion, shown, width))))
     sections.append(p.section("Methods", *methods(motion, date, len(moments))))
     if files:
         rows = [(p.file_link(name), about) for name, about in files.items()]
@@ -152,7 +155,10 @@ def _summary(
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         parts.append(p.callout("bad" if most else "note", f"Not observed: {listed(blind, 8)}.", text))
     body = motion.body
-    facts = {
+    session, facts = motion.provenance.get("session"), {}
+    if isinstance(session, Mapping):
+        facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
+    facts |= {
         "Date of the report": date, "Duration": f"{len(motion) / motion.rate:.2f} s", "Frames": f"{len(motion)}",
         "Rate": f"{motion.rate:g} Hz", "Body": f"{body.name}, {len(body.tree.coordinates)} angles",
         "Sensors": f"{len(motion.residuals)}", "Quality, mean (0–1)": f"{motion.quality.mean():.2f}",
@@ -160,33 +166,15 @@ def _summary(
     }  # fmt: skip
     if body.stature:
         facts["Stature of the body"] = f"{body.stature:.2f} m"
-    return p.section("Summary", *parts, p.facts(facts), p.folded("Lengths of the body", lengths_table(motion)))
-
-
-def _moments(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
-    if not motion.residuals and not moments:
-        return [p.callout("note", "This motion comes without measurements, so nothing shows where it is doubtful.")]
-    if not moments:
-        return [p.callout("good", "None: every frame is supported by its measurements and fits like the others.")]
-    out = []
-    for m in moments[:MOMENTS]:
-        shots = [
-            p.picture(frames[m.worst], caption=f"{camera}, frame {m.worst}", width=width)
-            for camera, frames in pictures.items() if m.worst in frames
-        ]  # fmt: skip
-        severity = "bad" if motion.quality[m.worst] <= 0 else "warning"
-        parts = [" ".join(m.what + m.causes), *([p.gallery(shots, smallest=170)] if shots else [])]
-        out.append(p.callout(severity, _when(motion, m), *parts))
-    if len(moments) > MOMENTS:
-        rest = moments[MOMENTS : MOMENTS + 200]
-        rows = [(_when(motion, m), " ".join(m.what), " ".join(m.causes) or "–") for m in rest]
-        more = f"{len(moments) - MOMENTS} more, less severe"
-        out.append(p.folded(more, p.table(["when", "what", "why"], rows, first_left=3)))
-    return out
-
-
-def _when(motion: Motion, m: Moment) -> p.Html:
-    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(m)}")
+    about = (
+        "± is two standard deviations. That of a range takes its two ends to err on their own. A * marks what was "
+        "observed in a part of the frames only; an angle with a standard deviation above 45° counts as not observed. "
+        "The greatest speed is of the angles as they are, without a deviation of its own."
+    )
+    return p.section(
+        "Summary", p.facts(facts), *parts, p.heading("How far every joint moved"), ranges_table(motion),
+        p.paragraph(about, small=True), p.folded("Lengths of the body", lengths_table(motion)),
+    )  # fmt: skip
 
 
 def _angles(motion: Motion) -> list[p.Html]:
@@ -199,7 +187,15 @@ def _angles(motion: Motion) -> list[p.Html]:
     ]
 
 
-def _cycles(motion: Motion, cycles: Cycles | None) -> list[p.Html]:
+def _check_norms(motion: Motion, norms: Norms | None, path: str | PathLike[str]) -> None:
+    """Refuse normative values of coordinates that the body does not have."""
+    stems = {name for c in curves(motion) for name in (c.name, c.stem)}
+    unknown = [name for name in norms or {} if name not in stems]
+    if unknown:
+        raise ExportError(choices("normative coordinate", unknown[0], sorted(stems)), file=path)
+
+
+def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]:
     if cycles is None:
         text = (
             "Two or more cycles that last about as long and look alike were not found: neither strides nor another "
@@ -224,7 +220,9 @@ def _cycles(motion: Motion, cycles: Cycles | None) -> list[p.Html]:
     parts = [p.paragraph(text)]
     if rows:
         parts.append(p.table(["mean ± SD", *(s.name for s in cycles.sides)], rows))
-    return [*parts, p.chooser("Joint", cycle_plots(motion, cycles))]
+    if norms:
+        parts.append(p.paragraph("The grey band is the normative mean ±1 standard deviation of the table given."))
+    return [*parts, p.chooser("Joint", cycle_plots(motion, cycles, norms))]
 
 
 def _mean(mean: float, spread: float) -> str:

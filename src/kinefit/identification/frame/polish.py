@@ -117,7 +117,7 @@ def disentangle(
         least = sorted(users, key=lambda s: (len(below[s]), s))
         # branches that take points twice themselves: from the last segments on, it ends
         trials = [anew(search, chosen, below[s]) for s in least[: 1 if tries > len(chosen) else GIVE_WAY]]
-        left = [int(np.bitwise_count(shared(search, trial)).sum()) for trial in trials]
+        left = [int(np.unpackbits(shared(search, trial).view(np.uint8)).sum()) for trial in trials]
         chosen = trials[min(range(len(trials)), key=lambda k: (left[k], cost_of(search, trials[k])))]
     return chosen
 

@@ -256,7 +256,7 @@ def _files(take: Take) -> None:
     named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
     named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
-    named += [("[take] subject", take.subject), ("[take] start", take.start)]
+    named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
     named += [("markers", entry.file) for entry in take.markers]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 from typing import Literal
 
@@ -33,6 +34,24 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
     upward: tuple[float, float, float] | None = None  # and its y; default: the take's `up`
     angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
     step: int | None = None  # of the common time; default: the first
+
+
+class SessionEntry(_Entry, frozen=True, kw_only=True):
+    """`[session]`: whom and what the recording shows, for the report; nothing is computed from it."""
+
+    subject: str = ""  # a code rather than a name
+    date: datetime.date | None = None  # of the recording, 2026-03-02
+    movement: str = ""
+    side: Literal["left", "right", "both", ""] = ""  # that is affected, or that the movement is about
+    visit: str = ""
+    operator: str = ""
+    notes: str = ""
+    norms: Path | None = None  # table of normative values over the cycle: coordinate, percent, mean, sd
+
+    @property
+    def told(self) -> dict[str, str]:
+        """What was stated, as texts."""
+        return {k: str(v) for k in self.__struct_fields__ if (v := getattr(self, k)) and k != "norms"}
 
 
 class CalibrationEntry(_Entry, frozen=True, kw_only=True):

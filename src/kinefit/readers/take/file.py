@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -23,6 +23,7 @@ from kinefit.readers.take.entries import (
     KeypointsEntry,
     LinesEntry,
     MarkersEntry,
+    SessionEntry,
     SilhouetteEntry,
     StartEntry,
     StereoEntry,
@@ -38,6 +39,7 @@ __all__ = [
     "KeypointsEntry",
     "LinesEntry",
     "MarkersEntry",
+    "SessionEntry",
     "SilhouetteEntry",
     "StartEntry",
     "StereoEntry",
@@ -48,6 +50,7 @@ __all__ = [
 
 class _File(_Entry, frozen=True, kw_only=True):
     take: _Head = _Head()
+    session: SessionEntry = SessionEntry()
     start: StartEntry | None = None
     calibration: CalibrationEntry | None = None
     camera: tuple[CameraEntry, ...] = ()
@@ -60,13 +63,13 @@ class _File(_Entry, frozen=True, kw_only=True):
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
-    "take": _Head, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
+    "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     "silhouette": SilhouetteEntry, "lines": LinesEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
-_ONCE = ("take", "start", "calibration")
+_ONCE = ("take", "session", "start", "calibration")
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,7 @@ class Take:
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
+    session : SessionEntry, whom and what the recording shows
     cameras, keypoints, markers, depth, stereo, silhouettes, skin, lines : tuples of entries
         `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
@@ -122,6 +126,7 @@ class Take:
     size: bool | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    session: SessionEntry = field(default_factory=SessionEntry)
 
 
 def read_take(path: str | PathLike[str]) -> Take:
@@ -164,7 +169,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size,
+        pose=content.start, size=head.size, session=content.session,
     )  # fmt: skip
     check_take(take)
     return take

@@ -1,0 +1,67 @@
+"""Faces made unrecognisable in pictures, where the fitted head lies."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import PointSet
+from kinefit.errors import ExportError
+from kinefit.geometry.camera import Camera, ImageFrame
+from kinefit.motion import Motion
+
+_REACH = 0.8  # of the head's length, from its middle to where nothing is shown sharp: beyond chin, crown and ears
+_BLOCKS = 4  # over the head: a face is known down to about ten
+
+
+def without_face(
+    image: NDArray[np.uint8], motion: Motion, frame: int | None, camera: Camera, image_frame: ImageFrame | None = None
+) -> NDArray[np.uint8]:
+    """A picture (H, W, 3) uint8 with the tracked person's head blurred; all of it where the head was not tracked.
+
+    What is blurred is three standard deviations larger than the head. Other people in the picture stay as they are.
+
+    Raises
+    ------
+    ExportError
+        The body has no head.
+    """
+    tree, ends = motion.body.tree, motion.body.segment_ends()
+    if "head" not in tree.segments or tree.segments.index("head") not in ends:
+        raise ExportError("pictures with faces blurred, of a body without a head", remedy="Leave pictures out.")
+    head = tree.segments.index("head")
+    if frame is None or motion.quality[frame] <= 0 or not motion.segment_quality[frame, head] > 0:
+        return _coarse(image, max(image.shape[:2]) / 12)
+    tip = np.asarray(ends[head], float)
+    points = PointSet(("neck", "crown"), np.array([head, head]), np.stack([np.zeros(3), tip]))
+    std = float(np.linalg.norm(motion.joint_std[frame, head]))
+    middle = motion.body.positions(motion.state(frame), points).mean(axis=0)
+    reach = _REACH * float(np.linalg.norm(tip)) + 3 * std
+    if not np.isfinite(reach):
+        return _coarse(image, max(image.shape[:2]) / 12)
+    image_frame = image_frame or ImageFrame.identity()
+    around = middle + reach * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
+    uv = image_frame.from_calibration(camera.project(around))
+    if not np.isfinite(uv).all():  # behind the camera, or beside its lens
+        return np.array(image)
+    centre = uv[-1]
+    radius = float(np.linalg.norm(uv[:-1] - centre, axis=1).max())
+    box = np.clip(np.stack([centre - radius, centre + radius + 1]), 0, image.shape[1::-1]).astype(int)
+    (left, top), (right, bottom) = box
+    out = np.array(image, order="C")
+    if right <= left or bottom <= top:
+        return out
+    mask = np.zeros(image.shape[:2], np.uint8)
+    cv2.circle(mask, [round(c) for c in centre], max(1, round(radius)), 1, -1)
+    part, inside = out[top:bottom, left:right], mask[top:bottom, left:right] > 0
+    part[inside] = _coarse(part, 2 * radius / _BLOCKS)[inside]
+    return out
+
+
+def _coarse(image: NDArray[np.uint8], block: float) -> NDArray[np.uint8]:
+    """The picture in blocks of so many pixels, blended."""
+    height, width = image.shape[:2]
+    few = (max(1, round(width / block)), max(1, round(height / block)))
+    small = cv2.resize(image, few, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)

@@ -1,0 +1,119 @@
+"""How far every joint moved: lowest, highest, range and fastest, left beside right, each with its uncertainty.
+
+What the measurements did not observe is left out of the numbers, and said to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.exporters.report import page as p
+from kinefit.exporters.report.angles import Curve, by_joint, curves
+from kinefit.motion import Motion
+
+WIDE = 45.0
+"""[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
+
+_HEAD = ("lowest", "highest", "range", "fastest")
+
+NAMES = {
+    "hip_flexion": "Hip flexion", "hip_adduction": "Hip adduction", "hip_rotation": "Hip inward rotation",
+    "knee_angle": "Knee flexion", "ankle_angle": "Ankle dorsiflexion", "subtalar_angle": "Subtalar inversion",
+    "mtp_angle": "Toe extension", "clav_prot": "Shoulder girdle protraction", "clav_elev": "Shoulder girdle elevation",
+    "arm_flex": "Shoulder flexion", "arm_add": "Shoulder adduction", "arm_rot": "Shoulder inward rotation",
+    "elbow_flex": "Elbow flexion", "pro_sup": "Forearm pronation", "wrist_flex": "Wrist flexion",
+    "wrist_dev": "Wrist ulnar deviation", "pelvis_tilt": "Pelvic tilt (backward)",
+    "pelvis_list": "Pelvic obliquity (right down)", "pelvis_rotation": "Pelvic rotation (to the left)",
+    "lumbar_extension": "Lumbar extension", "lumbar_bending": "Lumbar bending (to the right)",
+    "lumbar_rotation": "Lumbar rotation (to the left)", "thorax_extension": "Thoracic extension",
+    "thorax_bending": "Thoracic bending (to the right)", "thorax_rotation": "Thoracic rotation (to the left)",
+    "neck_extension": "Neck extension", "neck_bending": "Neck bending (to the right)",
+    "neck_rotation": "Neck rotation (to the left)",
+}  # fmt: skip
+"""Clinical names of OpenSim's coordinates, in the direction that counts as positive."""
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """How far one coordinate moved, each with two standard deviations [deg, deg/s].
+
+    Parameters
+    ----------
+    lowest, highest, span : (value, two standard deviations)
+        Those of the span as if both ends erred on their own: an error that lasts is in neither.
+    fastest : largest speed.
+    share : of the frames in which the coordinate was observed.
+    """
+
+    lowest: tuple[float, float]
+    highest: tuple[float, float]
+    span: tuple[float, float]
+    fastest: float
+    share: float
+
+
+def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
+    """Of one angle over time; None where it was observed in no two frames.
+
+    Parameters
+    ----------
+    curve : Curve [deg]
+    rate : float [Hz]
+    tracked : (F,) bool, frames in which somebody was seen.
+    """
+    known = tracked & (curve.std < WIDE)
+    if known.sum() < 2:
+        return None
+    at = np.flatnonzero(known)
+    low, high = (int(at[k]) for k in (np.argmin(curve.values[at]), np.argmax(curve.values[at])))
+    span = float(curve.values[high] - curve.values[low])
+    speed = np.abs(np.gradient(curve.values)) * rate
+    inside = known & np.roll(known, 1) & np.roll(known, -1)
+    inside[[0, -1]] = False
+    fastest = float(speed[inside].max()) if inside.any() else np.nan
+    ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
+    return Extremes(ends[0], ends[1], (span, float(np.hypot(ends[0][1], ends[1][1]))), fastest, float(known.mean()))
+
+
+def ranges_table(motion: Motion) -> p.Html:
+    """Two tables: what the body has twice, left beside right, and its middle."""
+    paired: list[tuple[str, ...]] = []
+    single: list[tuple[str, ...]] = []
+    tracked = motion.quality > 0
+    for rows in by_joint(curves(motion)).values():
+        for stem, found in rows.items():
+            of = {c.side: extremes(c, motion.rate, tracked) for c in found if c.unit == "deg"}
+            name = NAMES.get(stem, stem.replace("_", " "))
+            if "" in of:
+                single.append((name, *_cells(of[""])))
+            elif of:
+                left, right = of.get("left"), of.get("right")
+                paired.append((name, *_cells(left), *_cells(right), _difference(left, right)))
+    parts = []
+    if paired:
+        columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
+        parts.append(p.table(["[°], [°/s]", *columns, "left less right, range"], paired))
+    if single:
+        parts.append(p.table(["[°], [°/s]", *_HEAD], single))
+    return p.joined(*parts)
+
+
+def _cells(found: Extremes | None) -> tuple[str, ...]:
+    if found is None:
+        return ("not observed", "", "", "")
+    part = "" if found.share > 0.995 else "*"
+    fastest = f"{found.fastest:.0f}" if np.isfinite(found.fastest) else "–"
+    return (*(_told(*pair) for pair in (found.lowest, found.highest)), _told(*found.span) + part, fastest)
+
+
+def _difference(left: Extremes | None, right: Extremes | None) -> str:
+    if left is None or right is None:
+        return "–"
+    return _told(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
+
+
+def _told(value: float, twice: float) -> str:
+    return f"{value:.0f} ± {twice:.0f}".replace("-0 ", "0 ").replace("-", "−")

@@ -1,0 +1,122 @@
+"""Who is seen: the records of a person that fits leave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.solvers.border import Prior
+from kinefit.subject.parameters import Parameters, World
+
+Progress = Callable[[str, int, int], None]
+"""(what is done, how many of it, of how many)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unmeasured:
+    """A combination of parameters that the prior alone holds.
+
+    Parameters
+    ----------
+    direction : (p,) in prior standard deviations, of length 1.
+    share : of the prior's variance in it that data explain, below `fit.TOLD`.
+    names : of the parameters that make up most of it, the largest first.
+    """
+
+    direction: NDArray
+    share: float
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SubjectFit:
+    """A person, cameras and sensors as a fit found them.
+
+    Parameters
+    ----------
+    body, rig, values : the world that was found; see `World`.
+    names, mean : (p,) of the parameters.
+    covariance : (p, p) posterior, with the poses unknown and an excess above 1 counted.
+    states : K poses, refined along.
+    information : (p, p) what the sensors measure, without the prior, an excess above 1 counted.
+    prior : Prior
+    excess : {sensor: factor} by which what its frames measure together is less certain than its rows say; more certain
+        below 1.
+    unmeasured : directions that the prior alone holds, the least measured first.
+    cost : float
+    rounds : of match and solve
+    parameters : the kinds of them
+    prior_world : the world that they apply to
+    """
+
+    body: Body
+    rig: Rig
+    values: Mapping[str, Mapping[str, float]]
+    names: tuple[str, ...]
+    mean: NDArray
+    covariance: NDArray
+    states: tuple[BodyState, ...]
+    information: NDArray
+    prior: Prior
+    excess: Mapping[str, float]
+    unmeasured: tuple[Unmeasured, ...]
+    cost: float
+    rounds: int
+    parameters: tuple[Parameters, ...]
+    prior_world: World
+
+    @property
+    def std(self) -> NDArray:
+        """(p,) posterior standard deviation of each parameter."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def value(self, name: str) -> tuple[float, float]:
+        """A parameter by name: its estimate and standard deviation.
+
+        Raises
+        ------
+        ObservationError
+            No such parameter.
+        """
+        if name not in self.names:
+            raise ObservationError(f"no parameter '{name}' was fitted", remedy=f"Fitted are: {', '.join(self.names)}.")
+        k = self.names.index(name)
+        return float(self.mean[k]), float(self.std[k])
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
+
+    `fit` is the fit of keypoints that it came from, `covariance` (p, p) how sure each of its parameters is, logarithms
+    of the scales first; both None for a body that was given. `length_share` (G,) is each scale's standard deviation
+    over it, where other sensors gave it. `sets` are the detectors' keypoint sets that it was found from.
+    """
+
+    body: Body
+    scales: NDArray
+    fit: SubjectFit | None = None
+    covariance: NDArray | None = None
+    length_share: NDArray | None = None
+    sets: tuple[str, ...] = ()
+
+    @property
+    def length_std(self) -> dict[str, float]:
+        """[m] standard deviation of each length, from one segment's joint to the next's: "thigh_l-shank_l"."""
+        share = self.length_share
+        if self.covariance is not None:
+            share = np.sqrt(np.diag(self.covariance)[: len(self.scales)])
+        if share is None:
+            return {}
+        tree = self.body.tree
+        lengths = np.linalg.norm(tree.offsets, axis=1)
+        return {
+            f"{tree.segments[p]}-{tree.segments[s]}": float(lengths[s] * share[self.body.segment_scale[p]])
+            for s, p in enumerate(tree.parents) if p >= 0
+        }  # fmt: skip

@@ -1,0 +1,52 @@
+"""How far every joint moved: the numbers of the table are those of the curves, with their deviations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.exporters.report.test_page import own
+from tests.exporters.synthetic import smooth_motion
+
+from kinefit.exporters.report.angles import Curve, curves
+from kinefit.exporters.report.ranges import NAMES, WIDE, extremes, ranges_table
+
+RATE = 50.0
+TIMES = np.arange(101) / RATE
+
+
+def curve(std=2.0, values=None):
+    values = 30 + 20 * np.sin(2 * np.pi * TIMES) if values is None else values
+    return Curve("knee_angle_l", "knee", "left", "deg", values, np.broadcast_to(std, values.shape).astype(float))
+
+
+def test_of_a_sine_its_ends_range_and_speed():
+    found = extremes(curve(), RATE, np.ones(101, bool))
+    assert found.lowest == pytest.approx((10.0, 4.0), abs=0.05)
+    assert found.highest == pytest.approx((50.0, 4.0), abs=0.05)
+    assert found.span == pytest.approx((40.0, 4 * 2**0.5), abs=0.1)
+    assert found.fastest == pytest.approx(20 * 2 * np.pi, rel=0.01) and found.share == 1.0
+
+
+def test_what_was_not_observed_takes_no_part():
+    values = curve().values.copy()
+    values[40:50] = 500.0
+    std = np.full(101, 2.0)
+    std[40:50] = np.inf
+    found = extremes(curve(std, values), RATE, np.ones(101, bool))
+    assert found.highest[0] < 51 and found.fastest < 150 and found.share == pytest.approx(91 / 101)
+    tracked = np.arange(101) < 20
+    assert extremes(curve(), RATE, tracked).lowest[0] == pytest.approx(30.0)
+    assert extremes(curve(WIDE), RATE, np.ones(101, bool)) is None
+
+
+def test_the_table_has_left_beside_right_and_says_what_is_unknown():
+    motion = smooth_motion(40)
+    motion = replace(motion, quality=np.ones(40), dof_std=np.full_like(motion.dof_std, 0.01))
+    text = own(ranges_table(motion))
+    assert text.count("<table>") == 2 and "not observed" not in text
+    blind = np.array(motion.dof_std)
+    blind[:, 6 + list(motion.body.tree.coordinates).index("knee_angle_l")] = np.inf
+    rows = own(ranges_table(replace(motion, dof_std=blind))).split("<tr>")
+    knee = next(row for row in rows if "Knee flexion" in row)
+    assert knee.count("not observed") == 1 and knee.count("±") == 3  # of the right knee
+    assert {c.stem for c in curves(motion) if c.unit == "deg"} <= set(NAMES)
