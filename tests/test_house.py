@@ -13,8 +13,8 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
 LEVELS = [
     {"errors", "_jit"},
-    {"geometry", "_kernels_rendering", "_kernels_losses"},
-    {"bodies", "observations", "motion"},
+    {"geometry", "_files", "_kernels_rendering", "_kernels_losses"},
+    {"bodies", "observations", "motion", "motion_columns"},
     {"readers", "images", "rendering", "rows", "losses"},
     {"correspondences"},
     {"solvers"},
@@ -22,7 +22,7 @@ LEVELS = [
     {"multiview", "frame"},
     {"initialization", "subject"},
     {"smoothing"},
-    {"markers"},
+    {"markers", "preparing"},
     {"tracking"},
     {"calibration"},
     {"simulation", "recipes"},
@@ -31,15 +31,16 @@ LEVELS = [
     {"cli", "__main__"},
 ]
 BESIDE = {
-    ("motion", "bodies"), ("readers", "images"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
+    ("motion", "bodies"), ("motion", "motion_columns"), ("motion_columns", "motion"),
+    ("readers", "images"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
     ("subject", "initialization"),
 }
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {
-    "exporters": {"recipes", "batch", "cli"},
+    "exporters": {"recipes", "batch", "cli", "preparing"},
     "viewers": {"recipes", "batch", "cli"},
-    "assets": {"cli"},
+    "assets": {"cli", "preparing"},
 }
 LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds
 

@@ -1,13 +1,16 @@
 """Motions: what they hold, and turning them to another vertical axis."""
 
+import sys
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
 from tests.oracle import posture
 
 from kinefit.bodies import load_body
-from kinefit.errors import ObservationError
+from kinefit.errors import ExportError, ObservationError
+from kinefit.exporters.tables import tables
 from kinefit.geometry import se3
 from kinefit.motion import UP_AXES, Motion, Residuals, rotation_between_up
 
@@ -110,3 +113,47 @@ def test_a_motion_must_be_finite(name):
 def test_arrays_are_read_only_copies():
     with pytest.raises(ValueError, match="read-only"):
         MOTION.angles[0, 0] = 1.0
+
+
+def test_five_lines_tell_what_a_motion_is():
+    lines = repr(replace(MOTION, name="a <walk>")).split("\n")
+    assert len(lines) == 5 and lines[0] == "Motion a <walk>: 4 frames at 50 Hz (0.08 s), y up"
+    assert lines[1].startswith(f"body humanoid10: {len(BODY.tree.segments)} segments")
+    lab, cam = (np.median(MOTION.residuals[name].norms) for name in ("lab", "cam"))
+    assert f"lab ({1000 * lab:.1f} mm), cam ({cam:.1f} px)" in lines[2]
+    assert lines[3] == "quality: 1.00 of 1 on average, lowest 1.00 in frame 0"
+    assert "angles (4, " in lines[4] and "to_dataframe()" in lines[4]
+    assert len(repr(replace(MOTION, residuals=dict.fromkeys(map(str, range(50)), MOTION.residuals["cam"])))) < 700
+    html = replace(MOTION, name="a <walk>")._repr_html_()
+    assert "<b>Motion a &lt;walk&gt;: 4 frames" in html and html.count("<br>") == 4
+
+
+def test_joint_centres_are_the_origins_of_the_segments():
+    np.testing.assert_array_equal(MOTION.joint_centres, MOTION.segment_poses()[..., :3, 3])
+    assert MOTION.joint_centres.shape == (4, len(BODY.joints), 3)
+
+
+def test_a_data_frame_has_the_columns_of_the_tables(monkeypatch):
+    pandas = ModuleType("pandas")
+    pandas.DataFrame = lambda columns, index: (columns, index)
+    pandas.RangeIndex = lambda count, name: (count, name)
+    monkeypatch.setitem(sys.modules, "pandas", pandas)
+    columns, index = MOTION.to_dataframe()
+    known = tables(MOTION)
+    assert index == (4, "frame")
+    assert list(columns) == ["time [s]", *list(known["angles"])[2:], *list(known["joints"])[2:], "quality"]
+    for name in columns:
+        values = next(table[name] for table in known.values() if name in table)
+        np.testing.assert_array_equal(columns[name], values)
+
+
+def test_a_data_frame_without_pandas_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ExportError, match="pip install pandas"):
+        MOTION.to_dataframe()
+
+
+def test_a_data_frame_of_pandas():
+    pytest.importorskip("pandas")
+    frame = MOTION.to_dataframe()
+    assert frame.shape[0] == 4 and frame["quality"].mean() == 1.0

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
+from collections.abc import Iterable
 from os import PathLike
+from pathlib import Path
 
 
 class KinefitError(Exception):
@@ -30,10 +35,20 @@ class KinefitError(Exception):
         place: str | None = None,
         remedy: str | None = None,
     ) -> None:
-        self.problem, self.file, self.place, self.remedy = problem, file, place, remedy
-        where = ", ".join(str(part) for part in (file, place) if part)
-        text = f"{where}: {problem}" if where else problem
-        super().__init__(f"{text.rstrip('.')}. {remedy}" if remedy else text)
+        self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
+        self.remedy = shortened(remedy, _ALL - len(self.problem) - len(self.place or "")) if remedy else remedy
+        where = ", ".join(str(part) for part in (file, self.place) if part)
+        text = f"{where}: {self.problem}" if where else self.problem
+        super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
+
+
+_LONGEST, _ALL = 300, 570  # characters of a problem, and of all parts: what a file gives them may be of any length
+
+
+def shortened(text: str, longest: int = _LONGEST) -> str:
+    """A text of a message, its middle left out where a file gave it more than `longest` characters."""
+    half = longest // 2 - 3
+    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
 
 
 class FileError(KinefitError):
@@ -72,3 +87,29 @@ def choices(kind: str, name: str, valid: object) -> str:
     """Sentence that names an unknown thing and lists what exists: for messages."""
     listed = ", ".join(str(v) for v in valid) or "none"  # type: ignore[attr-defined]
     return f"no {kind} '{name}'; there are: {listed}"
+
+
+def spelled(text: str, valid: Iterable[str]) -> str:
+    """The one of `valid` that a text spells with other capitals, blanks or hyphens; the text where none is."""
+    plain = text.lower().translate(dict.fromkeys(map(ord, " -_.")))
+    return next((name for name in valid if name.lower() == plain), text)
+
+
+def command(*words: str | PathLike[str]) -> str:
+    """A line that works when it is pasted where the user is: `kinefit`, then words and paths, quoted for the shell.
+
+    A path is told from the current folder on, where it lies below it.
+    """
+    told = ["kinefit", *(nearest(word) if isinstance(word, PathLike) else word for word in words)]
+    return subprocess.list2cmdline(told) if os.name == "nt" else shlex.join(told)
+
+
+def nearest(path: str | PathLike[str]) -> str:
+    """A path from the current folder on, where it lies in it or one folder above it; else as it was given."""
+    path = Path(path)
+    try:
+        relative = os.path.relpath(path)
+    except (ValueError, OSError):  # another drive; a current folder that is gone
+        return str(path)
+    up = relative.split(os.sep).count(os.pardir)
+    return relative if up <= 1 else str(path)

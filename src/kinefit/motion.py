@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -11,8 +13,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.state import BodyState
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.geometry import se3
+from kinefit.motion_columns import angle_columns, joint_columns
 
 UP_AXES = {
     "x": (1.0, 0.0, 0.0),
@@ -80,6 +83,12 @@ class Residuals:
         return np.linalg.norm(self.values, axis=-1)
 
 
+def _middle(r: Residuals) -> str:
+    seen = r.norms[np.isfinite(r.norms)]
+    factor, unit = (1000.0, "mm") if r.unit == "m" else (1.0, "px")
+    return f"{factor * np.median(seen):.1f} {unit}" if len(seen) else "nothing seen"
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A body's motion.
@@ -138,6 +147,29 @@ class Motion:
     def __len__(self) -> int:
         return len(self.times)
 
+    def __repr__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        first, *rest = map(escape, self._lines())
+        return f"<b>{first}</b><br>" + "<br>".join(rest)
+
+    def _lines(self) -> list[str]:
+        """Five lines that tell what it is."""
+        tree, worst = self.body.tree, int(np.argmin(self.quality)) if len(self) else 0
+        stature = f", {self.body.stature:.2f} m tall" if self.body.stature else ""
+        told = [f"{name} ({_middle(r)})" for name, r in self.residuals.items()]
+        sensors = ", ".join(told[:6]) + (f" and {len(told) - 6} more" if len(told) > 6 else "")
+        quality = f"{self.quality.mean():.2f} of 1 on average, lowest {self.quality[worst]:.2f} in frame {worst}"
+        return [
+            f"Motion {self.name}: {len(self)} frames at {self.rate:g} Hz ({len(self) / self.rate:.2f} s), {self.up} up",
+            f"body {self.body.name}: {len(tree.segments)} segments, {len(tree.coordinates)} coordinates{stature}",
+            f"sensors, with their median residual: {sensors or 'none'}",
+            f"quality: {quality if len(self) else 'no frame'}",
+            f"angles {self.angles.shape} [rad], joint_centres {self.joint_std.shape} [m], to_dataframe()",
+        ]
+
     def state(self, frame: int) -> BodyState:
         """State of the body in one frame."""
         return BodyState(self.Ts_world_root[frame], self.angles[frame])
@@ -145,6 +177,33 @@ class Motion:
     def segment_poses(self) -> NDArray:
         """T_world_segment (F, S, 4, 4); the translation is the joint centre [m]."""
         return self.body.tree.segment_poses(self.Ts_world_root, self.angles)
+
+    @property
+    def joint_centres(self) -> NDArray:
+        """(F, S, 3) [m] joint centres in the world, in the order of `body.joints`; `joint_std` are their deviations."""
+        return self.segment_poses()[..., :3, 3]
+
+    def to_dataframe(self) -> Any:
+        """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.
+
+        Angles are in degrees, lengths in metres, as the names of the columns tell; "inf" is the deviation of what
+        nothing observed.
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        ExportError
+            pandas is not installed.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise ExportError("pandas is not installed", remedy="Run: pip install pandas") from error
+        columns = {"time [s]": self.times, **angle_columns(self), **joint_columns(self), "quality": self.quality}
+        return pandas.DataFrame(columns, index=pandas.RangeIndex(len(self), name="frame"))
 
     def positions(self, points: PointSet | None = None) -> NDArray:
         """(F, K, 3) [m] points in the world; by default the body's landmarks."""

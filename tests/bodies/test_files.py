@@ -153,7 +153,7 @@ BAD = {
     "keypoint without landmark": (changed('Tip = "tip"', 'Tip = "top"'), ("no landmark 'top'", "tip, elbow"), "keypoints.CAM.Tip"),
     "marker without landmark": (changed('points = ["tip"]', 'points = ["top"]'), ("no landmark 'top'",), "markers.SET"),
     "marker without segment": (changed('m1 = { segment = "arm"', 'm1 = { segment = "leg"'), ("no segment 'leg'",), "m1"),
-    "bad TOML": (changed("[body]", "[body"), ("not valid TOML", "line 2"), None),
+    "bad TOML": (changed("[body]", "[body"), ("not TOML", "line 2"), None),
     "unknown key": (changed("stature", "statur"), ("unknown field `statur`", "docs/"), "body"),
     "unknown key of a joint": (changed("axes = [\"-y\"]", "axis = [\"-y\"]"), ("unknown field `axis`",), "segment[2].joint"),
     "missing key": (changed('name = "flange", ', ""), ("missing required field `name`",), "segment[3].joint"),

@@ -42,7 +42,7 @@ def test_sets_go_by_all_their_names():
 
 
 BAD_SETS = {
-    "not valid TOML": "name = ",
+    "not TOML": "name = ",
     "not a marker set": "name = 3",
     "landmark, or on a segment": 'name = "a"\n[markers]\nA = { segment = "thigh_r" }',
     "not finite": 'name = "a"\n[markers]\nA = { landmark = "r_asis", spread = -1.0 }',

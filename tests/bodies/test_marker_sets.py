@@ -74,7 +74,7 @@ def test_a_file_of_ones_own(tmp_path):
         ("RA = 0.02", "RZ = 0.02", "RZ"),
         ('"RA"]', '"RA", "RA"]', "twice"),
         ("name = ", "nme = ", "not a marker set"),
-        ("[places]", "[places", "not valid TOML"),
+        ("[places]", "[places", "not TOML"),
     ],
 )
 def test_a_wrong_file_says_what_and_where(tmp_path, old, new, said):

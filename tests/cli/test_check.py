@@ -134,10 +134,10 @@ def test_a_turned_camera_is_refined_beside_the_old_calibration(take):
     pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
     path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.01}", text, count=1))
     before = path.read_bytes()
-    told = run(take, "--refine", "--take")
+    told = run(take, "--refine")
     assert told.exit_code == 0, told.output
     assert path.read_bytes() == before
-    assert 'write file = "calibration_refined.toml"' in told.stdout
+    assert 'with file = "calibration_refined.toml" in [calibration]' in told.stdout
     old, new = read_calibration(path), read_calibration(take.with_name("calibration_refined.toml"))
     assert new.names == old.names
     copy = take.with_name("take_refined.toml")
@@ -190,7 +190,7 @@ def test_a_marker_system_that_does_not_fit_the_videos_is_named_and_moved(tmp_pat
     head = '[take]\nrate = 15.0\nup = "y"\n[calibration]\nfile = "calibration.toml"\n'
     take = tmp_path / "take.toml"
     take.write_text(head + names + "".join(map(table.format, rig.names)) + '[[markers]]\nfile = "markers.trc"\n')
-    told = run(take, "--refine", "--take", "--strict")
+    told = run(take, "--refine", "--strict")
     assert told.exit_code == 2, told.output
     assert re.search(r"fault: markers does not fit the videos: its frame is off by (1\.[89]|2\.[01])", told.stdout)
     assert not tmp_path.joinpath("calibration_refined.toml").exists()  # the videos' cameras stay

@@ -78,7 +78,7 @@ def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
         (["--to", "usd", "--up", "x"], "USD knows y and z up. --up of usd is one of: y, z; not x"),
         (["--to", "bvh", "--names", "maya"], "--names of bvh is one of: bvh, kinefit, mixamo"),
         (["--to", "c3d", "--rest", "t"], "--rest is of bvh, glb, usd; not of c3d"),
-        (["--to", "fbx"], "'bvh', 'glb'"),
+        (["--to", "fbx"], "there are: csv, parquet, bvh, glb"),
         ([], "--to"),
     ],
 )

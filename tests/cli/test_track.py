@@ -17,6 +17,7 @@ import kinefit
 from kinefit.cli import main
 from kinefit.cli._results import NAMES, USUAL
 from kinefit.cli._summary import bone_lengths, frame_ranges
+from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.interrupted import TrackingInterrupted
@@ -221,7 +222,11 @@ def test_frames_without_anybody_and_bystanders_are_no_error(openpose_take):
     crowded, plain = (kinefit.read_motion(openpose_take.with_name(n) / "motion.npz") for n in ("take-kinefit", "plain"))
     gap = np.linalg.norm(crowded.positions() - plain.positions(), axis=-1)
     assert np.median(gap) < 0.02
-    assert "doubtful frames: none" in told.stdout
+    moments = doubtful_moments(crowded)
+    report = openpose_take.with_name("take-kinefit").joinpath("report.html").read_text("utf-8")
+    assert f"doubtful moments: {doubt_sentence(crowded, moments)}\n" in told.stdout
+    assert f"doubtful moments: {doubt_sentence(crowded, moments)}." in report or not moments
+    assert all(when(crowded, m) in told.stdout for m in moments[:5])
 
 
 def test_with_v_a_failed_track_shows_which_cameras_agree(take):

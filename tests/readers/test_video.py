@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.readers.video import Video, VideoSet, _rotation, common_frames
+from kinefit.readers.video import Video, VideoSet, common_frames
+from kinefit.readers.video_files import _rotation
 
 COUNT, WIDTH, HEIGHT = 40, 160, 96
 MATRICES = {  # clockwise turn: a, b, c, d of the display matrix, tx, ty

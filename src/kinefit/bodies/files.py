@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
@@ -105,11 +105,7 @@ def parse_body(text: str, source: str = "body") -> Body:
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     """The record of a body file, with what its base says."""
     try:
-        record = msgspec.convert(tomllib.loads(text), FileRecord)
-    except tomllib.TOMLDecodeError as error:
-        raise BodyError(
-            f"not valid TOML ({error})", file=source, remedy="Correct it there; see https://toml.io."
-        ) from error
+        record = msgspec.convert(parse_toml(text, source, BodyError), FileRecord)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         raise BodyError(

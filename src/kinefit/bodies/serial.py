@@ -26,7 +26,6 @@ Names that are part of a key are percent-encoded.
 from __future__ import annotations
 
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -35,6 +34,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.serial_morphs import (
     morphs_from_arrays,
@@ -148,12 +148,12 @@ def saved_body(path: str | PathLike[str]) -> Body:
         A file that cannot be read, or does not hold a body.
     """
     remedy = "Give a file written by save_body, or a body file in TOML."
+    arrays = read_npz(path, remedy=remedy, error=BodyError)
     try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return body_from_arrays({key: arrays[key] for key in arrays.files})
+        return body_from_arrays(arrays)
     except BodyError as error:
         raise BodyError(error.problem, file=path, remedy=error.remedy or remedy) from error
-    except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise BodyError(f"cannot read the body ({error})", file=path, remedy=remedy) from error
 
 

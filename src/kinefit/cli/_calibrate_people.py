@@ -35,18 +35,22 @@ def people(
 
     from kinefit.bodies import load_body
     from kinefit.calibration.people.calibrate import calibrate_people
-    from kinefit.cli._detecting import with_detections
+    from kinefit.cli._results import check_file
     from kinefit.errors import ExportError
+    from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.find import find_take
     from kinefit.tracking.take import load_keypoints
 
-    entry = read_take(take)
+    take = find_take(take)
     out = out or take.with_name(f"{take.stem}-people.toml")
     if out.exists():
         raise ExportError("there is a file of this name already", file=out, remedy="Name another one with --out.")
+    check_file(out)
+    entry = read_take(take)
     with _screen.bars() as step:
-        entry = with_detections(entry, step)
+        entry = with_detections(entry, step, _screen.note)
         step("reading", 0, 0)
         seen = load_keypoints(entry, exteriors=False)
         step("reading", 1, 1)

@@ -70,7 +70,7 @@ def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFra
     if seen is not None and entry is not None and camera.name in seen.videos:
         at = frame + seen.frames[0] - round(entry.time_offset * seen.rate) - check.frames_late.get(camera.name, 0)
         try:
-            with Video(seen.videos[camera.name]) as video:
+            with Video(seen.videos[camera.name], rate=seen.rate) as video:
                 return np.array(video.read(min(max(at, 0), len(video) - 1))), seen.images[camera.name]
         except KinefitError:
             pass

@@ -12,6 +12,7 @@ from kinefit.calibration.check.sensor_fit import SensorFit, marker_index
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, told
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
+from kinefit.errors import TakeError, command
 from kinefit.geometry.camera import Rig
 
 if TYPE_CHECKING:
@@ -90,10 +91,11 @@ def _refine(
     )  # fmt: skip
 
 
-def write_refined(found: Check, refined: Refined, path: Path, *, copy: bool) -> None:
-    """Write the refined calibration beside the old one and say what to change in the take at `path`, or copy that."""
+def write_refined(found: Check, refined: Refined, path: Path) -> None:
+    """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it."""
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.calibration.write import write_calibration_like
+    from kinefit.readers.take.file import read_take
 
     assert found.take is not None and found.take.calibration is not None and found.observations is not None
     take, old, text = found.take, found.take.calibration, path.read_text("utf-8")
@@ -106,23 +108,32 @@ def write_refined(found: Check, refined: Refined, path: Path, *, copy: bool) -> 
         _screen.say(f"Written: {new}\n")
     for line in refined.told():
         _screen.say(line)
+    if not len(rig) and not markers:
+        _screen.say(f"Next:\n  {command('track', path)}")
+        return
+    changed: list[str] = []
     if len(rig):
         file = _relative(new, path.absolute().parent)
-        _screen.say(f'\nTo use it, write file = "{file}" into [calibration] of {path.name}.')
+        changed.append(f'file = "{file}" in [calibration]')
         text = with_calibration(text, file)
     for number, lines in markers.items():
-        _screen.say(f"Write {' and '.join(lines)} into [[markers]] {number + 1} of {path.name}.")
+        changed.append(f"{' and '.join(lines)} in [[markers]] {number + 1}")
         text = with_keys(text, "markers", number, dict(line.split(" = ") for line in lines))
     late = refined.cameras.time_offsets if refined.cameras is not None else {}
     for number, entry in enumerate(take.cameras):
         if abs(late.get(entry.name, 0.0)) > 1e-5:
             value = f"{entry.time_offset + late[entry.name]:.6f}"
-            _screen.say(f"And time_offset = {value} into [[camera]] {entry.name}.")
+            changed.append(f"time_offset = {value} in [[camera]] {entry.name}")
             text = with_keys(text, "camera", number, {"time_offset": value})
-    if copy and (len(rig) or refined.moved):
-        beside = free_name(path)
-        write_text(beside, text)
-        _screen.say(f"Written: {beside}")
+    beside = free_name(path)
+    write_text(beside, text)
+    used = read_take(beside)
+    if len(rig) and (used.calibration is None or used.calibration.file != new.absolute()):
+        beside.unlink()
+        remedy = f"Write into it: {'; '.join(changed)}."
+        raise TakeError("a form of [calibration] that cannot be changed here", file=path, remedy=remedy)
+    _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {', '.join(changed)}.")
+    _screen.say(f"Next:\n  {command('track', beside)}")
 
 
 def _relative(path: Path, folder: Path) -> str:

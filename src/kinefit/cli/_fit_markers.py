@@ -74,7 +74,7 @@ def fit_file(
     folder = Path(out) if out is not None else source.with_name(f"{source.stem}-kinefit")
     unknown = [name for name in formats if name not in (*_results.NAMES, "markers")]
     if unknown:
-        raise ExportError(f"no format {unknown[0]!r}", remedy=f"There are: {', '.join(_results.NAMES)}, markers.")
+        raise ExportError(_results.no_format(unknown[0], (*_results.NAMES, "markers")), remedy="Leave it out.")
     _results.check_folder(folder)
     generic = body if isinstance(body, Body) else load_body(Path(body) if isinstance(body, PathLike) else body)
     people = split_people(read_markers(source, unit=unit))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
+from kinefit.cli._results import check_file
 from kinefit.cli._screen import Step
 from kinefit.errors import ObservationError
 from kinefit.identification.model.files import load_model
@@ -98,6 +99,7 @@ def identify_file(
 
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
+    check_file(target)
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
     markers = read_markers(source, unit=unit)

@@ -62,7 +62,7 @@ def take_pictures(
         step("pictures", number, len(seen.videos))
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
-        with Video(path) as video:
+        with Video(path, rate=seen.rate) as video:
             for frame in frames:
                 shown = round((motion.times[frame] - offset) * video.rate)
                 if 0 <= shown < len(video):

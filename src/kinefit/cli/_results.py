@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,15 +42,34 @@ ABOUT = {
 """What each is for."""
 
 
-def check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written, before anything is computed; make nothing."""
+def no_format(name: str, valid: Iterable[str]) -> str:
+    """What to say of a format that there is not."""
+    told = f"there is no format '{name}'; there are: {', '.join(valid)}"
+    if name.lower().strip(".") == "fbx":
+        told += ". FBX is a closed format: write glb or bvh, which Blender, Unity and Unreal read"
+    return told
+
+
+def check_folder(folder: Path, option: str = "--out") -> None:
+    """Refuse a folder that cannot be written, before anything is computed; leave nothing there."""
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
+    remedy = f"Name another place by {option}."
     if not there.is_dir():
-        raise ExportError("a file of that name is in the way", file=there, remedy="Name another folder by --out.")
-    if not os.access(there, os.W_OK):
-        raise ExportError("this folder cannot be written", file=there, remedy="Name another folder by --out.")
+        raise ExportError("a file of that name is in the way", file=there, remedy=remedy)
+    try:
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        problem = f"this folder cannot be written ({error.strerror})"
+        raise ExportError(problem, file=there, remedy=remedy) from error
+
+
+def check_file(path: Path, option: str = "--out") -> None:
+    """Refuse a file that cannot be written, before anything is computed; leave nothing there."""
+    if path.is_dir():
+        raise ExportError("a folder of that name is in the way", file=path, remedy=f"Name a file by {option}.")
+    check_folder(path.absolute().parent, option)
 
 
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
@@ -94,7 +113,7 @@ def write_overlays(
     for name, path in seen.videos.items():
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
-        with Video(path) as colour:
+        with Video(path, rate=seen.rate) as colour:
             shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
             at = nearest_frame(motion, shown / colour.rate + offset)
             pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)

@@ -16,13 +16,15 @@ if TYPE_CHECKING:
 
     from kinefit.motion import Motion, Residuals
 
-DOUBTFUL = 0.5  # quality below which a frame is named
+MOMENTS = 5  # doubtful moments that are told, the worst first
 _UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 
 
 def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
     from rich.table import Table
+
+    from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
@@ -33,8 +35,12 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         console().print(table)
     worst = int(np.argmin(motion.quality))
     say(f"quality: {motion.quality.mean():.2f} of 1 on average, lowest {motion.quality[worst]:.2f} in frame {worst}")
-    doubtful = np.flatnonzero(motion.quality < DOUBTFUL)
-    say(f"doubtful frames: {frame_ranges(doubtful)}" if len(doubtful) else "doubtful frames: none")
+    moments = doubtful_moments(motion)
+    say(f"doubtful moments: {doubt_sentence(motion, moments)}")
+    for moment in moments[:MOMENTS]:
+        say(f"  {when(motion, moment)}: {' '.join(moment.what)}")
+    if len(moments) > MOMENTS:
+        say(f"  and {len(moments) - MOMENTS} more, less severe")
     nobody = np.flatnonzero(motion.quality <= 0)
     if len(nobody):
         say(f"nobody seen: frames {frame_ranges(nobody)}")

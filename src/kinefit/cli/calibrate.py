@@ -69,6 +69,7 @@ def board(
     from kinefit.calibration.board.calibrate import calibrate_board
     from kinefit.calibration.board.detection import Board
     from kinefit.calibration.board.sources import camera_sources, find_boards
+    from kinefit.cli._results import check_file
     from kinefit.errors import ExportError
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
@@ -76,6 +77,7 @@ def board(
     found = camera_sources(sources)
     if out.exists() and not overwrite:
         raise ExportError("there is a file of this name already", file=out, remedy="Add --overwrite, or name another.")
+    check_file(out)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     frame = _frame(floor, found)
     with _screen.bars() as step:

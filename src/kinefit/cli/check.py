@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit check take.toml                    findings, and a page with images
-  kinefit check take.toml --refine           a better calibration too, beside the old one
-  kinefit check take.toml --refine --take    and a copy of the take that uses it
+  kinefit check take.toml --refine           a better calibration and a take that uses it, beside the old ones
 """
 _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r exchanged")
 _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
@@ -26,7 +25,7 @@ _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "gree
 @click.command(short_help="Find out what is wrong with a recording; refine its calibration.", epilog=_EXAMPLES)
 @click.argument("take", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Page to write.  [default: TAKE-check.html]")
-@click.option("--refine", is_flag=True, help="Write a refined calibration beside the old one, never over it.")
+@click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, never over the old.")
 @click.option("--focal", is_flag=True, help="With --refine: focal lengths too.")
 @click.option("--distortion", is_flag=True, help="With --refine: lens distortion too.")
 @click.option("--time-offsets", is_flag=True, help="With --refine: time offsets too.")
@@ -34,13 +33,12 @@ _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "gree
     "--points", type=click.Path(path_type=Path),
     help="With --refine: TOML of static points, [name] and camera = [u, v] px in the calibration's image.",
 )
-@click.option("--take", "copy", is_flag=True, help="With --refine: write a copy of the take file that uses it.")
 @click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
 @_screen.verbose_option
 @click.pass_context
 def check(
     ctx: click.Context, take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, copy: bool, strict: bool, verbose: bool,
+    points: Path | None, strict: bool, verbose: bool,
 ) -> None:  # fmt: skip
     """Find out what is wrong with a recording, how sure that is, and what would fix it.
 
@@ -48,22 +46,27 @@ def check(
     of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
     up, what each camera sees, and whether depth cameras and marker systems fit the videos.
     """
-    if (focal or distortion or time_offsets or copy or points) and not refine:
-        raise click.UsageError("--focal, --distortion, --time-offsets, --points and --take only go with --refine.")
+    if (focal or distortion or time_offsets or points) and not refine:
+        raise click.UsageError("--focal, --distortion, --time-offsets and --points only go with --refine.")
     from kinefit.calibration.check.check import check_take
     from kinefit.cli._check_page import check_page
     from kinefit.cli._check_refine import refined_of, write_refined
-    from kinefit.cli._detecting import with_detections
+    from kinefit.cli._results import check_file
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
+    from kinefit.preparing.take import with_detections
     from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.find import find_take
 
-    entry, out = read_take(take), out or take.with_name(f"{take.stem}-check.html")
+    take = find_take(take)
+    out = out or take.with_name(f"{take.stem}-check.html")
+    check_file(out)
+    entry = read_take(take)
     refined: Refined | None = None
     failed: KinefitError | None = None
     with _screen.bars() as step:
         try:
-            entry = with_detections(entry, step)
+            entry = with_detections(entry, step, _screen.note)
         except KinefitError as error:  # the rest can be checked without
             _screen.note(f"note: no keypoints: {error}")
         found = check_take(entry, progress=step)
@@ -80,7 +83,7 @@ def check(
     if failed is not None:
         raise failed
     if refined is not None:
-        write_refined(found, refined, take, copy=copy)
+        write_refined(found, refined, take)
     if strict and found.faults:
         ctx.exit(2)
 

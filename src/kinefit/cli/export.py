@@ -8,6 +8,7 @@ from typing import NamedTuple
 import click
 
 from kinefit.cli import _results, _screen
+from kinefit.errors import spelled
 
 
 class Freedom(NamedTuple):
@@ -63,10 +64,18 @@ Choices, the default first (csv, parquet and c3d keep the take's vertical axis; 
 )
 
 
+def _format(ctx: click.Context, parameter: click.Parameter, value: str) -> str:
+    """A format; where there is none of the name, what would do instead."""
+    format = spelled(value, FREEDOM)
+    if format not in FREEDOM:
+        raise click.BadParameter(_results.no_format(value, FREEDOM))
+    return format
+
+
 @click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
 @click.argument("motion", type=click.Path(path_type=Path))
 @click.option(
-    "--to", "format", required=True, type=click.Choice(list(FREEDOM)),
+    "--to", "format", required=True, callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
     help="Format; csv and parquet are a folder of tables.",
 )
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: beside MOTION]")
@@ -77,23 +86,25 @@ Choices, the default first (csv, parquet and c3d keep the take's vertical axis; 
 @_screen.verbose_option
 def export(motion: Path, format: str, out: Path | None, verbose: bool, **choices: str | None) -> None:
     """Write a motion file, as `kinefit track` leaves it, in another format."""
-    options = {key: value for key, value in choices.items() if value is not None}
-    for key, value in options.items():
-        _check_choice(format, key, value)
+    options = {
+        key: _choice(format, key, value if key == "up" else spelled(value, getattr(FREEDOM[format], key)))
+        for key, value in choices.items() if value is not None
+    }  # fmt: skip
     from kinefit.readers.motion import read_motion
 
-    recorded = read_motion(motion)
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
+    (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
+    recorded = read_motion(motion)
     _results.write_format(recorded, format, out, **options)
     told = ", ".join(f"{key} {value}" for key, value in options.items())
     _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
 
 
-def _check_choice(format: str, key: str, value: str) -> None:
-    """Refuse an option that the format has no freedom for, and say why and what there is."""
+def _choice(format: str, key: str, value: str) -> str:
+    """An option, refused where the format has no freedom for it, with why and what there is."""
     valid = getattr(FREEDOM[format], key)
     if value in valid:
-        return
+        return value
     why = f"{FREEDOM[format].why}. " if FREEDOM[format].why else ""
     if valid:
         raise click.UsageError(f"{why}--{key} of {format} is one of: {', '.join(valid)}; not {value}.")

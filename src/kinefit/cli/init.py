@@ -27,18 +27,23 @@ def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
     Everything is guessed from names and contents, and reported with how sure it is, here and as comments in the file.
     Nothing else is changed. Look at what is a guess or open, then run kinefit check.
     """
-    from kinefit.errors import TakeError
+    from kinefit.cli._results import check_file
+    from kinefit.errors import TakeError, command
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.guess.folder import guess_take
 
     out = out or folder / "take.toml"
     if out.exists() and not force:
-        remedy = "Name another file by --out, or replace it by --force."
+        remedy = f"Use it: {command('check', out)}. Name another file by --out, or replace it by --force."
         raise TakeError("there is a take file already", file=out, remedy=remedy)
+    if folder.is_dir():
+        check_file(out)
     guess = guess_take(folder, beside=out.absolute().parent)
     write_text(out, guess.text)
     _show(guess.notes)
-    _screen.say(f"\n{out}: written. Next: kinefit check {out}, then kinefit track {out}")
+    asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
+    first = "Write its rate, in frames a second, into it. Then" if asked else "Next"
+    _screen.say(f"\n{out}: written. {first}:\n  {command('check', out)}\n  {command('track', out)}")
 
 
 def _show(notes: tuple) -> None:

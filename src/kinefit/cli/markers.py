@@ -54,10 +54,13 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best one in which every joint moves."""
     from kinefit.cli._name_markers import learn_files
+    from kinefit.cli._results import check_file
     from kinefit.identification.model.files import save_model
 
     if no_set and (marker_set or frame is not None):
         raise click.UsageError("--no-set learns from motion alone: without --set and --frame.")
+    if out is not None:
+        check_file(out)
     model, findings = learn_files(takes, name=name, marker_set="" if no_set else marker_set, frame=frame, unit=unit)
     out = out or Path(f"{model.name}.json")
     save_model(model, out)

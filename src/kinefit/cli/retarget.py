@@ -24,6 +24,7 @@ Examples:
 @_screen.verbose_option
 def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
     """Put a recorded motion onto the humanoid, by the directions of its bones."""
+    from kinefit.cli._results import check_file
     from kinefit.exporters import write_motion
     from kinefit.readers.skeletons.amc import read_amc
     from kinefit.readers.skeletons.bvh import read_bvh
@@ -35,6 +36,7 @@ def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | 
     if (asf is not None) != (suffix == ".amc"):
         raise click.UsageError("An .amc file needs its skeleton, --asf FILE; a .bvh file takes none.")
     out = out or recording.with_suffix(".npz")
+    check_file(out)
     skeleton = read_amc(asf, recording) if asf else read_bvh(recording)
     with _screen.bars() as step:
         step("retargeting", 0, 0)

@@ -60,6 +60,7 @@ def simulate(
     """
     import math
 
+    from kinefit.errors import command
     from kinefit.exporters import write_csv, write_motion
     from kinefit.simulation import cut, write_recording
 
@@ -78,7 +79,7 @@ def simulate(
         )  # fmt: skip
     _screen.say(f"{take}: {len(known)} frames at {known.rate:g} Hz of the body {known.body.name}")
     _screen.say(f"{out / 'truth'}: motion.npz, joints.csv and more: what they should find")
-    _screen.say(f"Next:\n  kinefit track {take}")
+    _screen.say(f"Next:\n  {command('track', take)}")
 
 
 def _known(path: Path, body: str | None, asf: Path | None, rate: float | None, step: _screen.Step) -> Motion:

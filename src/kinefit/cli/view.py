@@ -43,6 +43,10 @@ def view(
     SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote; further motions are
     shown beside the first one. Ctrl-C ends it.
     """
+    from kinefit.cli._results import check_file
+
+    if html is not None:
+        check_file(html, "--html")
     recording = gather(sources, take)
     if html is not None:
         _write(recording, html)
@@ -56,6 +60,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
 
     from kinefit.readers.motion import read_motion
     from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.find import takes_in
     from kinefit.readers.take.load import load_observations
     from kinefit.viewers.pictures import Pictures
     from kinefit.viewers.show import Recording
@@ -66,6 +71,9 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
         if source.suffix.lower() == ".toml":
             if take_file is not None:
                 raise click.UsageError("One take is shown at a time: give one .toml file.")
+            take_file = source
+            continue
+        if source.is_dir() and not (source / "motion.npz").is_file() and takes_in(source) and take_file is None:
             take_file = source
             continue
         if source.is_dir():
@@ -87,7 +95,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
     return Recording(
         tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
         points=None if motions else _triangulated(take, seen),
-        pictures=Pictures(cameras, seen.videos, seen.images, offsets) if seen.videos else None,
+        pictures=Pictures(cameras, seen.videos, seen.images, offsets, rate=seen.rate) if seen.videos else None,
         markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
     )  # fmt: skip
 

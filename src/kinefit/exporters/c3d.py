@@ -10,7 +10,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
 from kinefit.exporters.report.angles import Curve, curves
-from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, plain_names, turned
+from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.motion import Motion
 
 
@@ -41,7 +41,7 @@ def write_c3d(
         No frame, too many points, unknown unit, axis or names, or the file cannot be written.
     """
     body, factor, up = motion.body, length_factor(unit, UNITS, path), up or motion.up
-    bones = list(body.joints) if names == "kinefit" else bone_names(body, names, path)
+    bones = list(body.joints) if convention(names) == "kinefit" else bone_names(body, names, path)
     angles = _angles(motion)
     labels = plain_names([*bones, *body.landmarks.names, *angles])
     about = [f"joint centre {joint}" for joint in body.joints] + ["landmark"] * len(body.landmarks)

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
-from kinefit.exporters.skeletons.common import UNITS, bone_names, continuous_quaternions, length_factor, turned
+from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.motion import Motion, Residuals
+from kinefit.motion_columns import angle_columns, joint_columns, place_columns
 
 Table = dict[str, NDArray]  # column -> (rows,)
 
@@ -105,33 +106,15 @@ def tables(
     segments = bone_names(body, names or "kinefit", place)
     bones = tuple(segments) if names else body.joints
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
-    centres = _xyz(bones, factor * motion.segment_poses()[..., :3, 3], unit)
     quality = {name: motion.segment_quality[:, s] for s, name in enumerate(segments)}
     residuals = [_residuals(motion, sensor, r, factor, unit, segments) for sensor, r in motion.residuals.items()]
     return {
-        "angles": start | _angles(motion, factor, unit),
-        "joints": start | centres | _xyz(bones, factor * motion.joint_std, unit, " std"),
-        "landmarks": start | _xyz(body.landmarks.names, factor * motion.positions(), unit),
+        "angles": start | angle_columns(motion, factor, unit),
+        "joints": start | joint_columns(motion, bones, factor, unit),
+        "landmarks": start | place_columns(body.landmarks.names, factor * motion.positions(), unit),
         "quality": start | {"quality": motion.quality} | quality,
         "residuals": _long(residuals),
     }
-
-
-def _angles(motion: Motion, factor: float, unit: str) -> Table:
-    body = motion.body
-    units = [unit] * 3 + ["deg"] * 3 + [unit if slides else "deg" for slides in body.tree.prismatic]
-    factors = np.array([np.degrees(1.0) if u == "deg" else factor for u in units])
-    stds, angles = motion.dof_std * factors, motion.angles * factors[6:]
-    quaternions = continuous_quaternions(motion.Ts_world_root[:, :3, :3])
-    out = {f"root_t{axis} [{unit}]": factor * motion.Ts_world_root[:, i, 3] for i, axis in enumerate("xyz")}
-    out |= {f"root_q{part}": quaternions[:, i] for i, part in enumerate("wxyz")}
-    out |= {f"{name} [{unit}]": angles[:, d] for d, (name, unit) in enumerate(zip(body.tree.coordinates, units[6:]))}
-    return out | {f"{name} std [{unit}]": stds[:, d] for d, (name, unit) in enumerate(zip(body.dof_names, units))}
-
-
-def _xyz(names: tuple[str, ...], positions: NDArray, unit: str, suffix: str = "") -> Table:
-    axes = list(enumerate("xyz"))
-    return {f"{n} {axis}{suffix} [{unit}]": positions[:, k, i] for k, n in enumerate(names) for i, axis in axes}
 
 
 def _residuals(

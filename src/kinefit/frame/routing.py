@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, LineFrame, MarkerFrame, PointCloud, SilhouetteFrame
+from kinefit.observations.arrays import is_number
 from kinefit.sensors.background import Background
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.depth_image import DepthImageSensor
@@ -197,8 +198,17 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
         step than `TrackSettings.pause`.
     """
     names = [sensor.name for sensor in own]
+    if isinstance(frames, str) or not isinstance(frames, Sequence):
+        problem = f"a {type(frames).__name__} in place of a list of frames"
+        raise ObservationError(problem, remedy="Give a list, also of one: tracker.update([frame]).")
+    if time is not None and not is_number(time):
+        raise ObservationError(f"a time that is a {type(time).__name__}", remedy="Give seconds.")
     for frame in frames:
-        if isinstance(frame, Frame | Measurement):
+        if isinstance(frame, Frame):
+            continue
+        if not is_number(getattr(frame, "time", 0.0)):
+            raise ObservationError(f"a frame whose time is a {type(frame.time).__name__}", remedy="Give seconds.")
+        if isinstance(frame, Measurement):
             continue
         if not isinstance(getattr(frame, "sensor", None), str):
             kinds = ", ".join(kind.__name__ for kind in get_args(Frame))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.observations.arrays import check_seen, frozen, numbers
 
 _FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
 
@@ -18,12 +20,6 @@ def _typical(depth: NDArray) -> float:
     few.sort()
     first = int(few.searchsorted(0.0, "right"))
     return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0
-
-
-def _frozen(array: NDArray, dtype: type) -> NDArray:
-    array = np.array(array, dtype=dtype)
-    array.flags.writeable = False
-    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +45,8 @@ class DepthFrame:
     depth: NDArray
 
     def __post_init__(self) -> None:
-        depth = np.array(self.depth, dtype=np.float32)
+        check_seen(self.sensor, self.time)
+        depth = numbers(self.depth, np.float32, f"a depth image of {self.sensor}")
         if depth.ndim != 2 or not depth.size:
             raise ObservationError(
                 f"a depth image of {self.sensor} has shape {depth.shape}", remedy="Give (height, width) in metres."
@@ -94,12 +91,13 @@ class PointCloud:
     segment: str | None = None
 
     def __post_init__(self) -> None:
-        points = np.asarray(self.points, float)
+        check_seen(self.sensor, self.time)
+        points = numbers(self.points, float, f"a cloud of {self.sensor}")
         if points.ndim != 2 or points.shape[1] != 3:
             raise ObservationError(f"a cloud of {self.sensor} has shape {points.shape}", remedy="Give (points, 3).")
-        object.__setattr__(self, "points", _frozen(points[np.isfinite(points).all(axis=1)], float))
+        object.__setattr__(self, "points", frozen(points[np.isfinite(points).all(axis=1)]))
         if self.viewpoint is not None:
-            eye = _frozen(self.viewpoint, float)
+            eye = frozen(self.viewpoint, float, f"the viewpoint of {self.sensor}")
             if eye.shape != (3,) or not np.isfinite(eye).all():
                 problem = f"a cloud of {self.sensor} has the viewpoint {self.viewpoint}"
                 raise ObservationError(problem, remedy="Give three numbers in metres, or None.")
@@ -133,7 +131,9 @@ class KeypointFrame:
     keypoint_set: str = ""
 
     def __post_init__(self) -> None:
-        uv, confidence = _frozen(self.uv, float), _frozen(self.confidence, float)
+        check_seen(self.sensor, self.time, self.names)
+        what = f"a record of keypoints of {self.sensor}"
+        uv, confidence = frozen(self.uv, float, what), frozen(self.confidence, float, what)
         if uv.shape != (len(self.names), 2) or confidence.shape != (len(self.names),):
             raise ObservationError(
                 f"keypoints of {self.sensor} have shape {uv.shape} with confidence {confidence.shape}",
@@ -164,7 +164,8 @@ class MarkerFrame:
     marker_set: str = ""
 
     def __post_init__(self) -> None:
-        positions = _frozen(self.positions, float)
+        check_seen(self.sensor, self.time, self.names)
+        positions = frozen(self.positions, float, f"a record of markers of {self.sensor}")
         if positions.shape != (len(self.names), 3):
             raise ObservationError(
                 f"markers of {self.sensor} have shape {positions.shape}", remedy=f"Give ({len(self.names)}, 3)."
@@ -196,12 +197,13 @@ class SilhouetteFrame:
     mask: NDArray
 
     def __post_init__(self) -> None:
-        mask = np.asarray(self.mask)
+        check_seen(self.sensor, self.time)
+        mask = numbers(self.mask, None, f"a mask of {self.sensor}")
         mask = 255 * mask.astype(np.uint8) if mask.dtype == bool else mask
         if mask.ndim != 2 or not mask.size or mask.dtype != np.uint8:
             problem = f"a mask of {self.sensor} has shape {mask.shape} and type {mask.dtype}"
             raise ObservationError(problem, remedy="Give (height, width), of bool, or of uint8 from 0 to 255.")
-        object.__setattr__(self, "mask", _frozen(mask, np.uint8))
+        object.__setattr__(self, "mask", frozen(mask, np.uint8))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -237,7 +239,10 @@ class LineFrame:
     ends: NDArray
 
     def __post_init__(self) -> None:
-        ends = _frozen(self.ends, float)
+        check_seen(self.sensor, self.time, self.names)
+        for own in self.landmarks if isinstance(self.landmarks, Sequence) else [None]:
+            check_seen(self.sensor, self.time, own)
+        ends = frozen(self.ends, float, f"a record of lines of {self.sensor}")
         if ends.shape != (len(self.names), 2, 2) or len(self.landmarks) != len(self.names):
             problem = f"lines of {self.sensor} have shape {ends.shape}, with landmarks of {len(self.landmarks)}"
             raise ObservationError(problem, remedy=f"Give ({len(self.names)}, 2, 2), and landmarks for each line.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,9 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
+from kinefit.observations.arrays import frozen
 
+_MOST_PIXELS = 200_000_000  # of an image; beyond, a size is damaged
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
 _PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
 MEDIAPIPE_33 = (
@@ -17,12 +20,6 @@ MEDIAPIPE_33 = (
     *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
 )  # fmt: skip
 """Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector gives the same."""
-
-
-def _frozen(array: NDArray, dtype: type = float) -> NDArray:
-    array = np.array(array, dtype=dtype)
-    array.flags.writeable = False
-    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +55,7 @@ class Keypoints:
     source: str = ""
 
     def __post_init__(self) -> None:
-        points, confidence = _frozen(self.points), _frozen(self.confidence)
+        points, confidence = frozen(self.points), frozen(self.confidence)
         if points.ndim != 4 or points.shape[2:] != (len(self.names), 2) or confidence.shape != points.shape[:3]:
             raise ObservationError(
                 f"keypoints of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}",
@@ -108,8 +105,8 @@ class Detections:
     source: str = ""
 
     def __post_init__(self) -> None:
-        points, confidence = _frozen(self.points), _frozen(self.confidence)
-        starts, runs = _frozen(self.mask_starts, int), _frozen(self.mask_runs, np.uint32)
+        points, confidence = frozen(self.points), frozen(self.confidence)
+        starts, runs = frozen(self.mask_starts, int), frozen(self.mask_runs, np.uint32)
         cells = points.shape[0] * points.shape[1] if points.ndim == 4 else -1
         fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3] and len(starts) == cells + 1
         if not fits or starts[0] != 0 or starts[-1] != len(runs) or np.any(np.diff(starts) < 0):
@@ -118,6 +115,13 @@ class Detections:
                 f"{len(starts)} starts of masks and {len(runs)} runs", file=self.source or None,
                 remedy="Give (frames, people, 33, 2), (frames, people, 33) and frames * people + 1 starts.",
             )
+        ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
+        sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
+        if min(self.size) < 1 or pixels > _MOST_PIXELS or np.any(sizes != pixels):
+            raise ObservationError(
+                f"masks of {', '.join(map(str, np.unique(sizes)[:3])) or 'no'} pixels in images of {self.size}",
+                file=self.source or None, remedy="Give runs that sum up to the image's pixels.",
+            )  # fmt: skip
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "confidence", confidence)
         object.__setattr__(self, "mask_runs", runs)
@@ -220,7 +224,7 @@ class Markers:
     events: tuple[MarkerEvent, ...] = ()
 
     def __post_init__(self) -> None:
-        positions = _frozen(self.positions)
+        positions = frozen(self.positions)
         if positions.ndim != 3 or positions.shape[1:] != (len(self.names), 3):
             raise ObservationError(
                 f"markers have shape {positions.shape} for {len(self.names)} names",
@@ -229,7 +233,7 @@ class Markers:
             )
         object.__setattr__(self, "positions", positions)
         if self.residual is not None:
-            object.__setattr__(self, "residual", _frozen(self.residual))
+            object.__setattr__(self, "residual", frozen(self.residual))
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -265,9 +269,9 @@ class SkeletonMotion:
     source: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "parents", _frozen(self.parents, int))
-        object.__setattr__(self, "offsets", _frozen(self.offsets))
-        object.__setattr__(self, "Ts_world_joint", _frozen(self.Ts_world_joint))
+        object.__setattr__(self, "parents", frozen(self.parents, int))
+        object.__setattr__(self, "offsets", frozen(self.offsets))
+        object.__setattr__(self, "Ts_world_joint", frozen(self.Ts_world_joint))
 
     def __len__(self) -> int:
         return len(self.Ts_world_joint)

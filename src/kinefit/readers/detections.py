@@ -17,20 +17,18 @@ the video's picture, the centre of the first pixel is (0, 0):
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError
+from kinefit._files import read_npz
+from kinefit.errors import FileError, KinefitError, command
 from kinefit.observations import Detections
 
 FORMAT, VERSION = "kinefit detections", 1
-_REMEDY = "Make it anew: kinefit detect --force."
-_DAMAGE = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError)
+_DAMAGE = (OSError, ValueError, KeyError, TypeError)
 
 
 def detections_file(take: str | PathLike[str], camera: str) -> Path:
@@ -49,23 +47,24 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         No such file, not one of the detector's, damaged, or of a later version.
     """
     file = Path(path)
+    again = f"Make it anew: {_anew(file, '--force')}"
     if not file.is_file():
-        raise FileError("no such file of detections", file=file, remedy="Run: kinefit detect TAKE.")
+        raise FileError("no such file of detections", file=file, remedy=f"Run: {_anew(file)}")
     try:
         arrays = _load(file)
     except _DAMAGE as error:
         problem = f"not a file of the built-in detector, or damaged ({error})"
-        raise FileError(problem, file=file, remedy=_REMEDY) from error
+        raise FileError(problem, file=file, remedy=again) from error
     try:
         width, height = (int(n) for n in arrays["size"])
         found = Detections(
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
             arrays["mask_runs"], arrays["mask_starts"], str(file),
         )
-    except (KinefitError, KeyError, ValueError, TypeError, IndexError) as error:
-        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=_REMEDY) from error
+    except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
+        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error
     if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
-        raise FileError("numbers that cannot be", file=file, remedy=_REMEDY)
+        raise FileError("numbers that cannot be", file=file, remedy=again)
     return found
 
 
@@ -77,16 +76,25 @@ def detections_key(path: str | PathLike[str]) -> str | None:
         return None
 
 
+def _anew(file: Path, *options: str) -> str:
+    """The command that makes a file of detections."""
+    take = file.parent.with_name(f"{file.parent.name.removesuffix('-detect')}.toml")
+    video = next((p for p in file.parent.glob(f"{file.stem.removesuffix('-detect')}.*") if p.suffix != ".npz"), None)
+    return command("detect", take if take.is_file() else video or "VIDEO", *options)
+
+
 def _load(file: Path, *names: str) -> dict[str, NDArray]:
     """Arrays of these names, default all, of a file that is whole and of the right kind."""
-    if not zipfile.is_zipfile(file):
-        raise ValueError("no whole archive of arrays")
-    with np.load(file, allow_pickle=False) as archive:
-        if str(archive["format"]) != FORMAT:
-            raise ValueError("another format")
-        if int(archive["version"]) != VERSION:
-            raise FileError(
-                f"detections of version {int(archive['version'])}; this kinefit reads version {VERSION}", file=file,
-                remedy="Use the kinefit that wrote it, or a newer one; or make it anew: kinefit detect --force.",
-            )
-        return {name: archive[name] for name in names or archive.files}
+    wanted = {*names, "format", "version"} if names else ()
+    try:
+        arrays = read_npz(file, *wanted, remedy="")
+    except FileError as error:
+        raise ValueError(error.problem) from error
+    if "format" not in arrays or str(arrays["format"]) != FORMAT:
+        raise ValueError("another format")
+    if arrays["version"].shape or int(arrays["version"]) != VERSION:
+        raise FileError(
+            f"detections of version {arrays['version']}; this kinefit reads version {VERSION}", file=file,
+            remedy=f"Use the kinefit that wrote it, or a newer one; or make it anew: {_anew(file, '--force')}",
+        )
+    return arrays

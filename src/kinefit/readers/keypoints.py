@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npy
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 
@@ -142,17 +143,10 @@ def read_mediapipe(
     """
     path = Path(path)
     names = KEYPOINT_SETS["MEDIAPIPE_33"]
-    try:
-        data = np.load(path, allow_pickle=False)
-    except FileNotFoundError as error:
-        raise FileError("no such file", file=path, remedy="Check the path.") from error
-    except (OSError, ValueError, EOFError) as error:
-        raise FileError(f"not a numpy array file ({error})", file=path, remedy="Write it by numpy.save.") from error
-    if not isinstance(data, np.ndarray) or data.dtype.kind not in "fiu" or data.shape[1:] != (len(names), 3):
-        raise ObservationError(
-            f"landmarks have shape {getattr(data, 'shape', None)}", file=path,
-            remedy=f"Give (frames, {len(names)}, 3) numbers: x, y [px], visibility.",
-        )
+    data = read_npy(path, remedy="Write it by numpy.save.")
+    if data.dtype.kind not in "fiu" or data.shape[1:] != (len(names), 3):
+        remedy = f"Give (frames, {len(names)}, 3) numbers: x, y [px], visibility."
+        raise ObservationError(f"landmarks have shape {data.shape}", file=path, remedy=remedy)
     data, start = _cut(data, frames, path)
     data = np.array(data, dtype=float)
     data[np.isnan(data).all(axis=(1, 2))] = 0
@@ -168,6 +162,9 @@ def read_mediapipe(
             remedy="Check that the detector ran on this camera's video; or leave this camera out.",
         )
     return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
+
+
+_GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
 
 
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
@@ -201,14 +198,21 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
             table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
     except FileNotFoundError as error:
         raise FileError("no such file", file=path, remedy="Check the path.") from error
-    except (ValueError, TypeError, UnicodeDecodeError) as error:
-        problem = f"a cell is not a number ({error})"
-        raise ObservationError(problem, file=path, remedy="Export the table again.") from error
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise ObservationError(f"a cell is not a number ({error})", file=path, remedy="Export it again.") from error
     table = table[(table[:, 3] < len(names)) & np.isfinite(table).all(axis=1)]
     if not len(table):
         raise ObservationError("no landmark of the body in this table", file=path, remedy="Track the whole pose.")
-    frame, port, point = (table[:, k].astype(int) for k in (0, 1, 3))
+    numbers = table[:, (0, 1, 3)]
+    if (wrong := (numbers < 0) | (numbers > 2**31) | (numbers % 1 != 0)).any():
+        row, k = np.argwhere(wrong)[0]
+        problem = f"{('sync_index', 'port', 'point_id')[k]} = {numbers[row, k]:g}"
+        raise ObservationError(problem, file=path, remedy="They are whole numbers from 0 on: export the table again.")
+    frame, port, point = numbers.astype(int).T
     frame = frame - frame.min()
+    if frame.max() > _GAPS * len(np.unique(frame)) + 1000 or len(np.unique(port)) > _PORTS:
+        problem = f"{len(np.unique(frame))} frames of {len(np.unique(port))} ports in {frame.max() + 1} of sync_index"
+        raise ObservationError(problem, file=path, remedy="Indices follow each other: export the table again.")
     if rate is None:
         first = port == port[0]
         _, at = np.unique(frame[first], return_index=True)

@@ -26,16 +26,14 @@ Sensor names are percent-encoded in keys.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from urllib.parse import unquote
 
-import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npz
 from kinefit.bodies.serial import body_from_arrays
 from kinefit.errors import FileError, KinefitError
 from kinefit.motion import UP_AXES, Motion, Residuals
@@ -80,13 +78,11 @@ def read_motion(path: str | PathLike[str]) -> Motion:
 def _load(file: Path) -> dict[str, NDArray]:
     if not file.is_file():
         raise FileError("no such motion file", file=file, remedy="Check the path.")
-    if not zipfile.is_zipfile(file):
-        raise FileError("this is no motion file of kinefit, or only a part of one", file=file, remedy=_REMEDY)
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, NotImplementedError) as error:
-        raise FileError(f"the motion file is damaged ({error})", file=file, remedy=_REMEDY) from error
+        return read_npz(file, remedy=_REMEDY)
+    except FileError as error:
+        problem = f"this is no motion file of kinefit, or only a part of one: {error.problem}"
+        raise FileError(problem, file=file, remedy=_REMEDY) from error
 
 
 def _motion(arrays: Mapping[str, NDArray]) -> Motion:

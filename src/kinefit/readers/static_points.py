@@ -9,12 +9,11 @@ A TOML file with one table a point, and in it the pixel of each camera that sees
 
 from __future__ import annotations
 
-import math
-import tomllib
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
+from kinefit._files import parse_toml
 from kinefit.errors import FileError, ObservationError, choices
 
 
@@ -32,10 +31,10 @@ def read_static_points(
     """
     file = Path(path)
     try:
-        raw = tomllib.loads(file.read_text(encoding="utf-8"))
+        raw = parse_toml(file.read_text(encoding="utf-8"), file)
     except FileNotFoundError as error:
         raise FileError("no such file of static points", file=file, remedy="Check the path.") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=file, remedy="Give a TOML file in UTF-8.") from error
     form = "Write [name] and below it camera = [u, v] for two or more cameras."
     out: dict[str, dict[str, tuple[float, float]]] = {}
@@ -58,5 +57,5 @@ def read_static_points(
 def _is_pixel(value: object) -> bool:
     return (
         isinstance(value, list) and len(value) == 2
-        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and -1e9 < v < 1e9 for v in value)
     )  # fmt: skip

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
+
+
+def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
+    """ObservationError where an argument, called `what`, is of another type, or one of its values is; or is a text."""
+    if not isinstance(value, kind) or isinstance(value, str):
+        raise ObservationError(f"{what} is a {type(value).__name__}, not a {kind.__name__}", remedy=remedy)
+    if each is not None:
+        for one in value.values() if isinstance(value, Mapping) else value:  # type: ignore[attr-defined]
+            of_kind(one, each, f"one of {what}", remedy)
 
 
 @contextmanager

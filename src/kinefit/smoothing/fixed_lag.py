@@ -14,10 +14,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
+from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult, judged
+from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement
+from kinefit.sensors.checks import of_kind
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
 from kinefit.smoothing.unwrap import boxes, continued
@@ -50,6 +52,9 @@ class FixedLag:
     """
 
     def __init__(self, tracker: Follows, lag: float, *, noise: KnownNoise | None = None) -> None:
+        if not (isinstance(getattr(tracker, "body", None), Body) and is_number(lag)):
+            problem = f"a lag of type {type(lag).__name__} behind a {type(tracker).__name__}"
+            raise ObservationError(problem, remedy="Give a Tracker and seconds: FixedLag(tracker, 0.1).")
         rate, settings = tracker.rate, tracker.settings
         self._lag = lag_frames(lag, rate)
         self.seconds = self._lag / rate
@@ -87,6 +92,7 @@ class FixedLag:
         """
         if result is None or (self._frames and result is self._frames[-1].result):
             return []
+        of_kind(result, FrameResult, "the result", "Give what Tracker.update returns.")
         new = self._costs.frame(result, measurements)
         if not self._frames:
             self._append(new)

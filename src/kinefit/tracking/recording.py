@@ -24,7 +24,9 @@ from kinefit.observations import (
     Markers,
     SilhouetteFrame,
 )
+from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Sensor
+from kinefit.sensors.checks import of_kind
 
 _PARTS = ("keypoint_set", "marker_set", "segment")  # of which one sensor may have several frames at one time
 
@@ -118,6 +120,7 @@ class Recording:
         TrackingError
             Nobody is seen in any frame.
         """
+        of_kind(keypoints or (), Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
         if not keypoints:
             remedy = "Name at least one [[keypoints]] in the take."
             raise ObservationError("there are no keypoints to track", remedy=remedy)
@@ -152,6 +155,10 @@ class Recording:
         ObservationError
             No steps, or steps without any frame; two frames of one sensor in a step; a standard deviation of no sensor.
         """
+        of_kind(rig, Rig, "the rig", "Give a Rig; without cameras Rig(()).")
+        of_kind(steps, Sequence, "steps", "Give a list of steps, each a list of frames.", each=Sequence)
+        if not (is_number(rate) and 0.0 < rate < np.inf):
+            raise ObservationError(f"steps at {rate} Hz", remedy="Give a positive rate.")
         for i, seen in enumerate(steps):
             _check_names(i, seen)
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]

@@ -5,11 +5,13 @@ from __future__ import annotations
 from os import PathLike
 
 from kinefit.bodies import load_body
-from kinefit.errors import TakeError
+from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
+from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
@@ -30,7 +32,8 @@ def track_take(
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file in all that its sensors saw; `smooth`, `contacts`, `lag`, `noise` as in `track`.
 
-    Returns the motion and what the sensors saw (for overlays).
+    Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
+    videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays).
 
     Raises
     ------
@@ -40,6 +43,8 @@ def track_take(
         What reading and tracking raise.
     """
     take = take if isinstance(take, Take) else read_take(take)
+    check_enough(take)
+    take = prepared(take, progress)
     seen = with_names(take, load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
@@ -52,7 +57,7 @@ def track_take(
     if not alone:
         raise TakeError(
             "the take has no [[keypoints]], nor any other sensor", file=take.path,
-            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
         )  # fmt: skip
     named = body if take.start is None or take.body == _USUAL else load_body(take.body)
     if named.tree.segments != body.tree.segments:
@@ -77,7 +82,7 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
         raise TakeError(
             "the take has no [[keypoints]]",
             file=take.path,
-            remedy="Tracking needs 2D keypoints of two or more cameras: `kinefit detect` finds them in its videos.",
+            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
         )
     return observations
 

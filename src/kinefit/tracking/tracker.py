@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from copy import copy
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from kinefit.frame.results import FrameResult
 from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
+from kinefit.observations.arrays import is_number, numbers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
+from kinefit.sensors.checks import of_kind
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
@@ -62,9 +65,18 @@ class Tracker:
         sensors: Sequence[Sensor] = (), values: Mapping[str, Mapping[str, float]] | None = None,
         keep: bool = False,
     ) -> None:  # fmt: skip
-        if not 0.0 < rate < np.inf:
+        of_kind(body, Body, "the body", 'Load it: load_body("humanoid").')
+        of_kind(rig, Rig, "the rig", "Give a Rig, such as read_calibration returns; without cameras Rig(()).")
+        of_kind(settings or TrackSettings(), TrackSettings, "settings", "Give TrackSettings(...), or leave it out.")
+        of_kind(accuracy or {}, Mapping, "accuracy", 'Give {"cam01": 8.0}: a number for each sensor.', each=Real)
+        of_kind(values or {}, Mapping, "values", 'Give {sensor: {name: value}}.', each=Mapping)
+        of_kind(sensors, Sequence, "sensors", "Give a list of sensors.")
+        of_kind(on_body, Collection, "on_body", "Give a list of names, also of one.")
+        if not (is_number(rate) and 0.0 < rate < np.inf):
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
-        self.rig, self.rate, self.up = rig, rate, np.asarray(up, float)
+        self.rig, self.rate, self.up = rig, rate, numbers(up, float, "up")
+        if self.up.shape != (3,):
+            raise ObservationError(f"up has shape {self.up.shape}", remedy="Give three numbers, such as (0, 0, 1).")
         self.settings, self.values = settings or TrackSettings(), values or {}
         self.sensors = Sensors(rig, rate, accuracy or {}, self.settings, sensors, tuple(on_body))
         unknown = [name for name in self.values if name not in {sensor.name for sensor in self.sensors.own}]
@@ -121,6 +133,7 @@ class Tracker:
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
+        of_kind(state, BodyState, "the state", "Give one as body.usual_state(T_world_root), or of a Motion.")
         if len(state.angles) != len(self.body.tree.coordinates):
             problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
@@ -140,6 +153,7 @@ class Tracker:
 
     def change_body(self, body: Body) -> None:
         """Go on with another size, another surface, a part more or less (`bodies.parts`); pose and speed are kept."""
+        of_kind(body, Body, "the body", 'Load it: load_body("humanoid").')
         old, before, seen = self.body, self._prediction, np.concatenate([np.zeros(6), self._seen])
         self._wear(body)
         self._seen = carry_dofs(seen, old, body, missing=-np.inf)[6:]
@@ -205,6 +219,7 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
+        of_kind(others, Sequence, "others", "Give a list of scenes, as `scene_of` returns them.", each=Scene)
         kept = copy(self._prediction), self._last, self._seen.copy()
         before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self._others = self.sensors.learnt(), tuple(others)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
+from kinefit.sensors.checks import of_kind
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import lag_frames
 from kinefit.smoothing.known_noise import KnownNoise
@@ -63,6 +64,8 @@ def track(
     TrackingInterrupted
         Ctrl-C after at least one tracked frame.
     """
+    of_kind(recording, Recording, "the recording", "Give a Recording: Recording.of_keypoints(rig, keypoints).")
+    of_kind(body, Body, "the body", 'Load it: load_body("humanoid").')
     if contacts and not smooth:
         remedy = "Leave smooth as it is: contacts need the whole take."
         raise ObservationError("contacts without smoothing", remedy=remedy)

@@ -101,6 +101,8 @@ class Pictures:
         From the calibration to the video; by default they are the same.
     time_offsets : {name: float [s]}, optional
         Added to frame / rate to get the time of the take.
+    rate : float [Hz], optional
+        Of videos that are folders of images.
 
     Raises
     ------
@@ -114,6 +116,8 @@ class Pictures:
         videos: Mapping[str, Path],
         images: Mapping[str, ImageFrame] | None = None,
         time_offsets: Mapping[str, float] | None = None,
+        *,
+        rate: float | None = None,
     ) -> None:
         self._cameras, self._images, self._offsets = cameras, images or {}, time_offsets or {}
         self._videos: dict[str, Video] = {}
@@ -121,7 +125,7 @@ class Pictures:
         self._kept: OrderedDict[tuple[str, int, int], NDArray[np.uint8]] = OrderedDict()
         try:
             for name, path in videos.items():
-                self._videos[name] = Video(path)
+                self._videos[name] = Video(path, rate=rate)
         except BaseException:
             self.close()
             raise

@@ -95,5 +95,5 @@ def test_one_that_would_move_farther_than_is_usual_is_not_written(walk, tmp_path
     assert re.search(r"depth: not refined, because .*it would move by 4\d cm", "\n".join(refined.told()))
     before = sorted(path.name for path in tmp_path.iterdir())
     found = SimpleNamespace(take=take, observations=seen)
-    write_refined(found, refined, tmp_path / "take.toml", copy=True)
+    write_refined(found, refined, tmp_path / "take.toml")
     assert sorted(path.name for path in tmp_path.iterdir()) == before

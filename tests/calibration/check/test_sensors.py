@@ -1,6 +1,7 @@
 """Sensors that do not fit the videos, found by the person."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,8 +26,7 @@ def fit(sensor="depth", kind="depth", **moved):
 
 
 def take(**entries):
-    path = SimpleNamespace(name="take.toml")
-    return SimpleNamespace(path=path, **{"depth": (), "markers": (), **entries})
+    return SimpleNamespace(path=Path("take.toml"), **{"depth": (), "markers": (), **entries})
 
 
 DEPTH = take(depth=(DepthEntry(name="depth", camera="kinect", file="d", time_offset=0.5),))

@@ -254,7 +254,8 @@ def test_no_take_and_no_toml(tmp_path):
         read_take(tmp_path / "none.toml")
     with pytest.raises(FileError, match="not TOML.*line 2"):
         read_take(written(tmp_path, "[take]\nname = x"))
-    with pytest.raises(FileError, match="cannot be read"):
+    (tmp_path / "take.toml").unlink()
+    with pytest.raises(FileError, match="no take file in this folder.*kinefit init"):
         read_take(tmp_path)
 
 
@@ -274,3 +275,29 @@ def test_a_damaged_video_is_refused(small):
     (small / "a.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     with pytest.raises(FileError, match="0 frames"):
         load(small, take_text(a='video = "a.mp4"'))
+
+
+def test_a_path_whose_backslashes_were_read_as_tabs_is_told(tmp_path):
+    take = tmp_path / "take.toml"
+    take.write_text('[calibration]\nfile = "C:\\temp\\new.toml"\n')
+    with pytest.raises(TakeError, match=r"forward slashes, or single quotes"):
+        read_take(take)
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [('[take]\nrate = "30 Hz"', "without quotes and without its unit"),
+     ("[calibration]\nfile = 'c.toml'\nunit = 0.001", 'unit = "mm"'), ('[take]\nsize = "no"', "true or false")],
+)  # fmt: skip
+def test_a_value_of_another_kind_says_how_to_write_it(tmp_path, line, told):
+    take = tmp_path / "take.toml"
+    take.write_text(line)
+    with pytest.raises(TakeError, match=told):
+        read_take(take)
+
+
+def test_the_unit_of_depth_may_be_a_name(tmp_path):
+    (tmp_path / "depth").mkdir()
+    take = tmp_path / "take.toml"
+    take.write_text('[[depth]]\nname = "tof"\nfile = "depth"\nunit = "mm"\nintrinsics = [500, 500, 320, 240]\n')
+    assert read_take(take).depth[0].unit == 0.001

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from functools import cache
 from importlib import resources
 from os import PathLike
@@ -12,6 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._files import parse_toml
 from kinefit.bodies.marker_sets.labels import plain
 from kinefit.errors import FileError, ObservationError, choices
 
@@ -126,9 +126,7 @@ def parsed(text: str, source: str) -> SetRecord:
         No TOML, or no marker set: with the place.
     """
     try:
-        record = msgspec.convert(tomllib.loads(text), SetRecord)
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"not valid TOML ({error})", file=source, remedy="See https://toml.io.") from error
+        record = msgspec.convert(parse_toml(text, source), SetRecord)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         where = place.strip(".`") or None

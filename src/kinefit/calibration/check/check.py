@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.calibration.check.timing import TimeOffsets, fast_pixels, shifted, time_offsets
 from kinefit.calibration.check.verdicts import bias_findings, explained, side_findings, time_findings
 from kinefit.calibration.check.views import Views, make_views, meet, with_sides_right
-from kinefit.errors import KinefitError
+from kinefit.errors import KinefitError, command
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import Take, read_take
@@ -100,7 +101,7 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
             text = (
                 f"Keypoints of {len({k.camera for k in seen.keypoints})} camera(s): a check needs those of two or more."
             )
-            missing.append(Finding("fault", "load", text, remedy=f"Run: kinefit detect {take.path.name}"))
+            missing.append(Finding("fault", "load", text, remedy=f"Run: {command('detect', take.path)}"))
         if seen is not None and seen.rig is not None:
             missing += lens_findings(seen.rig)
         return Check(take.name, ranked(missing), loaded.take, seen)
@@ -160,7 +161,7 @@ def check_keypoints(
     accuracy : {camera: [px]} of the keypoints; default 8.
     found : findings made before, kept among the others.
     """
-    file, step = take.path.name if take else f"{name}.toml", progress or (lambda *_: None)
+    file, step = take.path if take else Path(f"{name}.toml"), progress or (lambda *_: None)
     findings, known = list(found) + lens_findings(rig), {"take": take, "observations": observations}
 
     def told(done: int) -> None:
@@ -179,7 +180,7 @@ def check_keypoints(
         pictures = {k.camera: k.frame for k in take.keypoints if k.frame is not None}
         more, views = frame_findings(views, observations.images, pictures)
         findings += more
-    gross = mistake_findings(views.spread(_FRAMES), file)
+    gross = mistake_findings(views.spread(_FRAMES), file.name)
     if not gross:
         raw, more = _seen(views)
         findings += more

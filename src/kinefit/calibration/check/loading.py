@@ -57,7 +57,7 @@ def load_leniently(take: Take) -> Loaded:
         return Loaded(take, None, (_told(error),))
     findings: list[Finding] = []
     take = _known_cameras(take, rig, findings)
-    take = replace(take, cameras=tuple(_fitting_picture(entry, rig, findings) for entry in take.cameras))
+    take = replace(take, cameras=tuple(_fitting_picture(entry, rig, findings, take.rate) for entry in take.cameras))
     take = _framed_keypoints(take, rig, findings)
     for _ in range(_ATTEMPTS):
         try:
@@ -99,14 +99,14 @@ def _only(take: Take, names: list[str]) -> Take:
     )  # fmt: skip
 
 
-def _fitting_picture(entry: CameraEntry, rig: Rig, findings: list[Finding]) -> CameraEntry:
+def _fitting_picture(entry: CameraEntry, rig: Rig, findings: list[Finding], rate: float | None) -> CameraEntry:
     """The entry with `image` or `rotation` as the video's picture wants it."""
     if entry.video is None:
         return entry
     calibrated, name = rig[entry.name].size, entry.name
     turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]
     try:
-        with Video(entry.video) as video:
+        with Video(entry.video, rate=rate) as video:
             size, untold = video.size, entry.image == "as calibrated" and video.size != turned
             told = picture(calibrated, video, _EITHER) if untold else {}
             bars = 0 if untold else max(black_bars(video))

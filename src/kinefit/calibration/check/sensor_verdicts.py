@@ -9,6 +9,7 @@ import numpy as np
 
 from kinefit.calibration.check.findings import Finding
 from kinefit.calibration.check.sensor_fit import SURE, SensorFit, marker_index
+from kinefit.errors import command
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.take.entries import MarkersEntry
@@ -36,7 +37,8 @@ def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
             out.append(Finding("fault" if fit.falls else "doubt", "sensor", text, (fit.sensor,), unsure, remedy))
         elif fit in wrong and fit.kind == "depth":
             text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {told} at the person."
-            remedy = f"Run: kinefit check {file} --refine --take (moves it), or calibrate it together with the videos."
+            refine = command("check", take.path, "--refine")
+            remedy = f"To move it run {refine} (or calibrate it together with the videos)."
             out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
         elif fit in wrong:
             text = f"{fit.sensor} does not fit the videos: its frame is off by {told} at the person."

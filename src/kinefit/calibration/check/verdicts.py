@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from kinefit.calibration.check.bias import SHIFT, TURN, CameraBias, Disagreement
 from kinefit.calibration.check.findings import Finding, Severity, listed
 from kinefit.calibration.check.timing import TimeOffsets
 from kinefit.calibration.check.views import Views
+from kinefit.errors import command
 
 _ACCURACY = 8.0  # [px] of keypoints of which nothing else is said, as in a take
 _SURE = 4.0  # standard errors from which a bias or an offset is there
@@ -26,7 +28,7 @@ _OUTLIERS = 0.15  # share of a camera's points that agree with nobody: detectors
 
 
 def bias_findings(
-    biases: Sequence[CameraBias], parts: Disagreement | None, accuracy: Mapping[str, float], take: str
+    biases: Sequence[CameraBias], parts: Disagreement | None, accuracy: Mapping[str, float], take: Path
 ) -> list[Finding]:
     """Cameras whose calibration is off by more than a keypoint is inaccurate, and which of them moved.
 
@@ -36,7 +38,7 @@ def bias_findings(
     accuracy : {camera: [px]}
         Of the take's keypoints: a bias as large does as much harm as all their noise, and never averages out.
     take : str
-        Name of the take file, for remedies.
+        The take file, for remedies.
     """
     out: list[Finding] = []
     for b in biases:
@@ -59,7 +61,7 @@ def bias_findings(
     return out
 
 
-def _one_bias(b: CameraBias, accuracy: float, take: str) -> list[Finding]:
+def _one_bias(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
     significance = float(np.max(np.abs(b.bias) / np.maximum(b.std, 1e-9)))
     if b.size < 0.5 * accuracy or significance < (_SURE if b.size < accuracy else 0.5 * _SURE):
         return []
@@ -80,10 +82,11 @@ def _one_bias(b: CameraBias, accuracy: float, take: str) -> list[Finding]:
     words = "Sure" if significance > 2 * _SURE else "Likely" if significance >= _SURE else "Not sure"
     sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
     how = f"{sure}; more than the keypoints' deviation ({accuracy:g} px)." if severity == "fault" else f"{sure}."
-    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, f"Run: kinefit check {take} --refine")]
+    remedy = f"Run: {command('check', take, '--refine')}"
+    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, remedy)]
 
 
-def _who_moved(parts: Disagreement, accuracy: float, take: str, noticed: bool) -> Finding | None:
+def _who_moved(parts: Disagreement, accuracy: float, take: Path, noticed: bool) -> Finding | None:
     """Which cameras, if they alone had moved, would explain how all disagree.
 
     Where no camera was noticed by its bias, only one that explains nearly all alone is told: a wrong focal length moves
@@ -91,7 +94,7 @@ def _who_moved(parts: Disagreement, accuracy: float, take: str, noticed: bool) -
     """
     cameras = range(len(parts.cameras))
     whole = parts.explained(parts.of(*cameras))
-    refine = f"Run: kinefit check {take} --refine"
+    refine = f"Run: {command('check', take, '--refine')}"
     text = f"The cameras disagree by {whole:.1f} px (root mean square) in a way that does not change over the recording"
     for count in (1, 2):
         if len(cameras) < 2 + count:

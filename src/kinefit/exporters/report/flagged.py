@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, listed, plain
+from kinefit.exporters.report.moments import Moment, listed, place, plain, span
 from kinefit.exporters.report.pictures import MOMENTS
 from kinefit.motion import Motion
 
@@ -73,7 +73,4 @@ def _who(m: Moment) -> str:
 
 
 def _when(motion: Motion, m: Moment) -> p.Html:
-    start, stop = motion.times[m.start], motion.times[m.stop - 1]
-    span = f"{start:.2f} s" if m.stop - m.start == 1 else f"{start:.2f}–{stop:.2f} s"
-    frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    return p.joined(p.moment(motion.times[m.worst], span), f" ({frames}): {_who(m)}")
+    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(m)}")

@@ -66,6 +66,33 @@ def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     return tuple(sorted(told, key=lambda m: (-m.score, m.start)))
 
 
+def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
+    """How many doubtful moments there are: "none", "1 (3 % of the frames)"."""
+    if not moments:
+        return "none" if motion.residuals else "none known, as the motion comes without measurements"
+    frames = np.zeros(len(motion), bool)
+    for m in moments:
+        frames[m.start : m.stop] = True
+    return f"{len(moments)} ({100 * frames.mean():.0f}\u00a0% of the frames)"
+
+
+def when(motion: Motion, m: Moment) -> str:
+    """Times, frames and segments of a moment: "1.20–1.43 s (frames 36–43): head"."""
+    return f"{span(motion, m)} {place(m)}"
+
+
+def span(motion: Motion, m: Moment) -> str:
+    """Times of a moment: "1.20–1.43 s"."""
+    start, stop = motion.times[m.start], motion.times[m.stop - 1]
+    return f"{start:.2f} s" if m.stop - m.start == 1 else f"{start:.2f}–{stop:.2f} s"
+
+
+def place(m: Moment) -> str:
+    """Frames and segments of a moment: "(frames 36–43): head"."""
+    frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
+    return f"({frames}): {listed([plain(s) for s in m.segments]) or 'whole body'}"
+
+
 def never_observed(motion: Motion) -> tuple[str, ...]:
     """Coordinates that nothing observes in most frames (their standard deviation is infinite)."""
     if not len(motion):

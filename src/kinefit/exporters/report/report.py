@@ -25,7 +25,7 @@ from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged
 from kinefit.exporters.report.methods import lengths_table, methods
-from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubtful_moments, listed, never_observed
+from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubt_sentence, doubtful_moments, listed, never_observed
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.pictures import report_frames
 from kinefit.exporters.report.ranges import ranges_table
@@ -118,14 +118,9 @@ def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
         if names:
             parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {told}")
     start = " and ".join(parts) or "comes without measurements to compare it with"
-    count = len(moments)
-    if not count:
+    if not moments:
         return f"The motion {start}; no doubtful moment."
-    frames = np.zeros(len(motion), bool)
-    for m in moments:
-        frames[m.start : m.stop] = True
-    share = 100 * frames.mean()
-    return f"The motion {start}; {count} doubtful moment{'s' if count > 1 else ''} ({share:.0f}\u00a0% of the frames)."
+    return f"The motion {start}; doubtful moments: {doubt_sentence(motion, moments)}."
 
 
 def _subtitle(motion: Motion, date: str) -> str:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.errors import ExportError, choices
-from kinefit.geometry import se3
+from kinefit.errors import ExportError, choices, spelled
 from kinefit.motion import UP_AXES, Motion
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
@@ -61,19 +60,12 @@ def _given_z(R: NDArray, z: NDArray, before: NDArray) -> NDArray:
     return angles + 2.0 * np.pi * np.round((before - angles) / (2.0 * np.pi))
 
 
-def continuous_quaternions(rotations: NDArray) -> NDArray:
-    """Quaternions (F, 4) as (w, x, y, z) of rotations (F, 3, 3); of the two signs the nearer to the frame before."""
-    q = se3.quaternion(rotations)
-    flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
-    q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    return q
-
-
 def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
-    """Name of every segment in one of `NAMES`, each once; `path` for messages.
+    """Name of every segment in one of `NAMES`, however spelled, each once; `path` for messages.
 
     A segment without a counterpart there keeps its own name; a body without any is refused, unless for "bvh".
     """
+    names = convention(names)
     if names not in NAMES:
         raise ExportError(choices("convention of names", names, NAMES), file=path)
     if names not in ("kinefit", "bvh") and not body.aliases.get(names):
@@ -81,6 +73,11 @@ def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
         remedy = f"It has those of: {known}. Or write them into its body file: names = {{ {names} = ... }}."
         raise ExportError(f"body '{body.name}' has no names of {names}", file=path, remedy=remedy)
     return plain_names(body.alias(names, segment) for segment in body.tree.segments)
+
+
+def convention(names: str) -> str:
+    """One of `NAMES`, of a text that spells it in another way: "H-Anim", "OpenSim"; another text as it is."""
+    return spelled(names, NAMES)
 
 
 def length_factor(unit: str, units: Mapping[str, float], path: str | PathLike[str]) -> float:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
-from kinefit.exporters.skeletons.common import bone_names, continuous_quaternions, plain_names, slides
+from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
 from kinefit.motion import Motion
+from kinefit.motion_columns import continuous_quaternions
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}

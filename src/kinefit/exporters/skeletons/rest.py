@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, choices
+from kinefit.exporters.skeletons.common import convention
 from kinefit.exporters.skeletons.tubes import SkinnedMesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion
@@ -73,7 +74,7 @@ def rest_pose(body: Body, rest: str | None, names: str, path: str | PathLike[str
     ExportError
         An unknown rest pose; `path` for the message.
     """
-    rest = rest or ("t" if names == "mixamo" else "body")
+    rest = rest or ("t" if convention(names) == "mixamo" else "body")
     if rest not in RESTS:
         raise ExportError(choices("rest pose", rest, RESTS), file=path)
     tree, count = body.tree, len(body.tree.segments)

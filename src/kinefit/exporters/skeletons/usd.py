@@ -14,11 +14,12 @@ from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
-from kinefit.exporters.skeletons.common import UNITS, bone_names, continuous_quaternions, length_factor, turned
+from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion, rotation_between_up
+from kinefit.motion_columns import continuous_quaternions
 
 ENDINGS = (".usd", ".usda", ".usdc")
 _UPS = ("y", "z")

@@ -103,7 +103,7 @@ def load_model(path: str | PathLike[str]) -> MarkerModel:
         problem, _, place = str(error).partition(" - at `$")
         place = place.strip(".`")
         raise FileError(f"not a marker model: {problem}", file=path, place=place or None, remedy=remedy) from error
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileError(f"not valid JSON ({error})", file=path, remedy=remedy) from error
     if record.format != FORMAT:
         raise FileError(f"format '{record.format}'", file=path, place="format", remedy=f"This reads '{FORMAT}'.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import tomllib
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, transform
@@ -32,19 +33,21 @@ _KEYS = {
     "model": ("distortionmodel", "model", "cameramodel"),
 }  # fmt: skip
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
+_LEVELS = re.compile(r"(?P<open>[\[{]|<\w[^<>]*+(?<!/)>)|(?P<close>[\]}]|</)|(?:-\s++){40}")
+_DEEPEST = 40  # tables within tables; some thousands end the process in OpenCV's parser
 
 
 def read_table(text: str, kind: str, path: Path) -> Table:
     """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage) into nested tables."""
     try:
         if kind == "toml":
-            return tomllib.loads(text)
+            return parse_toml(text, path, CalibrationError)
         if kind == "json":
             tree = _matrices(json.loads(text))
         else:
             tree = _file_storage(text, kind)
         return tree if isinstance(tree, dict) else {"cameras": tree}
-    except (ValueError, TypeError, RecursionError, cv2.error, SystemError) as error:
+    except (ValueError, TypeError, RecursionError, OverflowError, cv2.error, SystemError) as error:
         reason = str(error).strip().splitlines()[-1] if str(error).strip() else "broken syntax"
         raise CalibrationError(
             f"not a readable {kind.upper()} file: {reason}", file=path, remedy="Write the file again; it may be cut."
@@ -52,6 +55,11 @@ def read_table(text: str, kind: str, path: Path) -> Table:
 
 
 def _file_storage(text: str, kind: str) -> Table:
+    depth = 0
+    for level in _LEVELS.finditer(text):
+        depth += {"open": 1, "close": -1, None: _DEEPEST}[level.lastgroup]
+        if depth >= _DEEPEST:
+            raise ValueError("tables within tables, deeper than any calibration")
     if kind == "yaml":  # headers differ: OpenCV 4 writes "%YAML:1.0", OpenCV 5 "%YAML 1.2", hands write none
         lines = [line for line in text.splitlines() if not line.startswith("%")]
         text = "\n".join(["%YAML:1.0", *([] if lines and lines[0].startswith("---") else ["---"]), *lines, ""])
@@ -87,7 +95,7 @@ def _matrix(table: Table) -> Any:
     if not {"dt", "data"} <= table.keys():
         return table
     shape = table.get("sizes") or (table.get("rows", -1), table.get("cols", 1))  # XML gives one length as a number
-    return np.array(table["data"], dtype=float).reshape(np.atleast_1d(shape).astype(int)).tolist()
+    return np.array(table["data"], dtype=float).reshape([int(n) for n in np.ravel(shape).tolist()]).tolist()
 
 
 def find(table: Table, kind: str) -> Any:
@@ -199,7 +207,7 @@ def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -
     try:
         array = np.array(value, dtype=float)
         array = array if shape is None else array.reshape(shape)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "numbers"
         raise CalibrationError(f"expected {wanted}", file=path, place=place, remedy="Repair this entry.") from None
     if not np.isfinite(array).all():
@@ -209,6 +217,8 @@ def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -
 
 def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
     """(4, 4) of a rotation that a file gives with few digits: the nearest exact rotation."""
+    if not np.abs(R).max() <= 2:  # not finite, too
+        R = np.zeros((3, 3))
     left, stretch, right = np.linalg.svd(R)
     if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(R) < 0:
         raise CalibrationError(

@@ -23,6 +23,7 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
+_UNPACKED = 100  # bytes that LZF can make of one: 264 of three
 _MOST = 200_000_000  # points; more is a broken header
 
 
@@ -63,7 +64,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
             return _ply(data, path)
         if b"FIELDS" in data[:2000]:
             return _pcd(data, path)
-    except (ValueError, KeyError, IndexError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise FileError(f"its header cannot be understood ({error})", file=path, remedy=_REMEDY) from error
     raise FileError("neither PCD nor PLY", file=path, remedy=_REMEDY)
 
@@ -85,7 +86,10 @@ def _pcd(data: bytes, path: Path) -> Cloud:
     number = int(header.get("POINTS", [str(width * height)])[0])
     if not 0 <= number == width * height < _MOST:
         raise FileError(f"{number} points, but {width} x {height}", file=path, remedy=_REMEDY)
-    kinds = [f"<{_PCD_TYPES[t]}{s}" for t, s in zip(types, sizes, strict=True)]
+    if not (set(sizes) <= {1, 2, 4, 8} and all(0 < c < 10_000 for c in counts) and len(counts) == len(names)):
+        problem = f"SIZE {' '.join(map(str, sizes[:9]))}, COUNT {' '.join(map(str, counts[:9]))}"
+        raise FileError(problem, file=path, remedy=_REMEDY)
+    kinds = [np.dtype(f"<{_PCD_TYPES[t]}{s}") for t, s in zip(types, sizes, strict=True)]
     where = [_place(axis, names, path) for axis in "xyz"]
     body, kind = data[at:], header["DATA"][0]
     if kind == "ascii":
@@ -112,7 +116,7 @@ def _pcd(data: bytes, path: Path) -> Cloud:
 
 def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
     packed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
-    if len(body) < 8 + packed or size > 64 * _MOST:
+    if len(body) < 8 + packed or size > _UNPACKED * len(body):
         raise FileError(f"{len(body) - 8} of {packed} bytes are there", file=path, remedy=_CUT)
     out = np.empty(size, np.uint8)
     if lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:
@@ -215,6 +219,8 @@ def camera_of(cloud: Cloud, name: str, path: str | PathLike[str] | None = None) 
         A = np.stack([ray, np.ones(len(ray))], axis=1)
         if len(ray) < 100 or np.ptp(ray) < 1e-3:
             raise CalibrationError("too few points to tell the camera", file=path, remedy="Give its intrinsics.")
+        if not np.abs(A).max() < 1e6:
+            raise CalibrationError("points that no camera sees", file=path, remedy="Give its intrinsics.")
         (K[axis, axis], K[axis, 2]), *_ = np.linalg.lstsq(A, pixel[ok], rcond=None)
         fits.append(np.percentile(np.abs(A @ (K[axis, axis], K[axis, 2]) - pixel[ok]), 99))
     if max(fits) > 0.5 or K[0, 0] <= 0 or K[1, 1] <= 0:

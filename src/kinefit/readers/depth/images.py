@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_npz
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import Camera
 
@@ -150,12 +151,8 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
 
 def array_source(path: Path) -> DepthSource:
     """Depth in a numpy archive: `depth` (F, H, W) or (H, W); `times` (F,) [s], `unit` [m], `rate` [Hz] as it has."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            content = {key: archive[key] for key in ("depth", "times", "unit", "rate") if key in archive}
-            keys = sorted(archive)
-    except (OSError, ValueError, AttributeError) as error:
-        raise FileError(f"no numpy archive ({error})", file=path, remedy="Write it with numpy.savez.") from error
+    content = read_npz(path, remedy="Write it with numpy.savez.")
+    keys = sorted(content)
     depth = content.get("depth")
     if depth is None or depth.ndim not in (2, 3) or not depth.size or depth.dtype.kind not in "uif":
         shape = "" if depth is None else f", `depth` has shape {depth.shape} of {depth.dtype}"

@@ -76,6 +76,8 @@ def track_source(path: Path, name: str) -> DepthSource:
             stream = _depth_stream(container, path)
             index, base = stream.index, float(stream.time_base)
             codec = stream.codec_context
+            if codec is None:
+                raise FileError("a codec that FFmpeg does not know", file=path, remedy="Copy the recording again.")
             size, raw = (codec.width, codec.height), codec.codec_tag.lower() == "b16g"
             if not raw and codec.pix_fmt not in _GREY:
                 raise ObservationError(

@@ -16,8 +16,10 @@ from kinefit.readers.guess.draft import Draft, Told
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.names import HOW, Trial, trials
+from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.video import Video
 
+UNSTATED = 1.0  # [Hz] of what states no rate, until the user does
 _LABORATORY = (0.2, 15.0)  # [m] from a desk to a sports hall: how far cameras stand from their middle
 
 
@@ -29,7 +31,8 @@ def describe_cameras(
     usual = [path for path in videos if not OF_CALIBRATION.search(draft.name(path))]
     chosen = _choose_recording(draft, usual if usual or keypoints else videos, rig)
     with ExitStack() as stack:
-        opened = {n: stack.enter_context(Video(path)) for n, path in chosen.files.items()} if chosen else {}
+        files = chosen.files if chosen else {}
+        opened = {name: stack.enter_context(Video(path, rate=UNSTATED)) for name, path in files.items()}
         length = min(map(len, opened.values()), default=0)
         sources = keypoint_sources(draft, keypoints, rig, length, chosen.place if chosen else "")
         records = read_sources(draft, sources)
@@ -54,6 +57,8 @@ def describe_cameras(
         _cut(draft, [*opened.values(), *first.values()])
         for source, record, frame in entries:
             keypoint_entries(draft, source, record, frame, images, active=record is first)
+    if len(names) == 1:
+        draft.note("cameras", "open", f"{names[0]} alone: {ONE_CAMERA}")
     if missing := [name for name in rig.names if name not in names]:
         draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: nothing here fits, left out")
     if opened and not first:
@@ -107,7 +112,7 @@ def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | 
     wanted = {camera.name: camera.size for camera in rig}
     if len(set(wanted.values())) == len(rig):
         for path in paths:
-            with Video(path) as video:
+            with Video(path, rate=UNSTATED) as video:
                 sizes[path] = video.size
     found, left = trials(paths, draft.folder, rig.names, sizes, wanted)
     for path in left:
@@ -159,8 +164,8 @@ def _turn(entry: dict[str, Told]) -> int:
 
 
 def _rate(opened: dict[str, Video], records: dict[str, Keypoints]) -> Told:
-    rates = sorted(video.rate for video in opened.values())
-    tables = [record.rate for record in records.values() if record.rate != 1.0]
+    rates = sorted(video.rate for video in opened.values() if video.path.is_file())
+    tables = [record.rate for record in records.values() if record.rate != UNSTATED]
     if rates and rates[-1] > 1.001 * rates[0]:
         listed = ", ".join(f"{name} {video.rate:.6g}" for name, video in opened.items())
         return Told(None, "open", f"videos of different rate: {listed} Hz; resample them: ffmpeg -i IN -r RATE OUT")

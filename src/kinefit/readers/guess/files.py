@@ -9,14 +9,16 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from kinefit._files import npy_header
 from kinefit.errors import CalibrationError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.names import natural
+from kinefit.readers.image_folders import ENDINGS
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
@@ -161,8 +163,19 @@ def _spread(rig: Rig) -> float:
 
 
 def find_videos(files: list[Path]) -> list[Path]:
-    """Files that are called videos."""
-    return [path for path in files if path.suffix.lower() in VIDEOS]
+    """Files that are called videos, and folders of colour images that are numbered."""
+    folders = [folder for folder, group in _by_folder(files) if _is_film(group)]
+    return [path for path in files if path.suffix.lower() in VIDEOS] + folders
+
+
+def _is_film(group: list[Path]) -> bool:
+    """Whether the files of one folder are images of a camera: many, in colour, of names that differ by numbers."""
+    images = [path for path in group if path.suffix.lower() in ENDINGS]
+    alike = {re.sub(r"\d+", "#", path.name) for path in images}
+    if len(images) < _MANY or len(alike) > 1:
+        return False
+    picture = cv2.imread(str(images[0]), cv2.IMREAD_UNCHANGED)
+    return picture is not None and picture.dtype == np.uint8 and picture.ndim == 3
 
 
 def find_markers(files: list[Path]) -> list[Path]:
@@ -217,11 +230,8 @@ def _openpose_points(numbered: list[Path]) -> int | None:
 
 
 def _array_shape(path: Path) -> tuple[int, ...] | None:
-    try:
-        array: NDArray = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        return None
-    return array.shape if array.dtype.kind in "fiu" else None
+    header = npy_header(path)
+    return header[0] if header and header[1].kind in "fiu" else None
 
 
 def _caliscope_frames(path: Path) -> int:

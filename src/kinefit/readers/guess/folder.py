@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.errors import CalibrationError, KinefitError, TakeError
+from kinefit.errors import CalibrationError, KinefitError, TakeError, command
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras
 from kinefit.readers.guess.draft import Draft, Note, Told
 from kinefit.readers.guess.files import STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
+from kinefit.readers.take.checks import ONE_CAMERA
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, where the cameras' interiors are known, from the person "
@@ -51,6 +52,9 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         A video that is damaged.
     """
     folder = Path(folder).absolute()
+    if folder.is_file():
+        remedy = f"Name its folder: {command('init', folder.parent)}"
+        raise TakeError("a file, not a folder", file=folder, remedy=remedy)
     if not folder.is_dir():
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
@@ -90,6 +94,10 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
+        if len(seen) == 1 and seen[0] in guess_files.find_videos(files):
+            problem = f"one video and no calibration: {ONE_CAMERA}"
+            remedy = "Add videos of other cameras. For keypoints of this one alone: " + command("detect", seen[0])
+            raise CalibrationError(problem, file=draft.folder, remedy=remedy)
         alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
 

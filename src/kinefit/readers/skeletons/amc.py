@@ -104,7 +104,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
             continue
         if words[0].startswith(":"):
             degrees = {":degrees": True, ":radians": False}.get(words[0].lower(), degrees)
-        elif len(words) == 1 and words[0].isdecimal():
+        elif len(words) == 1 and words[0].isdecimal() and len(words[0]) < 12:
             check_whole(n)
             first = first if frames else int(words[0])
             if int(words[0]) != first + frames:

@@ -59,6 +59,7 @@ class AsfSkeleton:
     unit: float
     degrees: bool
     source: str
+_LIMIT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?inf(?:inity)?", re.IGNORECASE)
 
 
 def read_asf(path: str | PathLike[str], *, unit: float | None = None) -> AsfSkeleton:
@@ -128,7 +129,7 @@ def _bones(lines: list[tuple[int, list[str]]], unit: float, angle: float, path: 
         if (word == "begin") == (entries is not None):
             raise FileError("begin and end do not match", file=path, place=f"line {n}", remedy="Give a whole ASF file.")
         if word == "begin":
-            entries = {}
+            entries, key = {}, ""
         elif word == "end":
             yield _bone(entries or {}, n, unit, angle, path)
             entries = None
@@ -171,6 +172,9 @@ def _bone(entries: dict, line: int, unit: float, angle: float, path: str | PathL
                 remedy="Give a pair for each.",
             )
         scale = np.array([angle if dof[0] == "r" else unit for dof in dofs])
+        if not all(map(_LIMIT.fullmatch, numbers)):
+            problem = f"bone '{name}' has limits that are no numbers"
+            raise FileError(problem, file=path, place=f"line {limit_line}", remedy="Give two for each.")
         limits = np.array([float(x) for x in numbers]).reshape(-1, 2) * scale[:, None]  # may be infinite
     vector = direction / np.linalg.norm(direction) * length * unit
     return Bone(name, -1, vector, axes, dofs, limits)

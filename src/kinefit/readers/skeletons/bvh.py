@@ -133,7 +133,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
                 joints.append(_Joint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
             case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
                 count = take(1)[0]
-                channels = tuple(word.lower() for word in take(int(count) if count.isdecimal() else 0))
+                channels = tuple(word.lower() for word in take(int(count) if re.fullmatch(r"\d{1,3}", count) else 0))
                 if (
                     not count.isdecimal()
                     or len(set(channels)) < len(channels)
@@ -163,7 +163,7 @@ def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str])
     """Rate [Hz] and values (F, C); `line` is the number of the line on which `text` begins."""
     lines = [(n, content) for n, content in enumerate(text.split("\n"), line) if content.strip()]
     found = []
-    for i, pattern in enumerate((r"\s*Frames\s*:\s*(\d+)\s*", r"\s*Frame\s+Time\s*:\s*(\S+)\s*")):
+    for i, pattern in enumerate((r"\s*Frames\s*:\s*(\d{1,12})\s*", r"\s*Frame\s+Time\s*:\s*(\S+)\s*")):
         match = re.fullmatch(pattern, lines[i][1], flags=re.I) if i < len(lines) else None
         if match is None:
             raise FileError(

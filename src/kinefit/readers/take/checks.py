@@ -30,6 +30,28 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 """Formats for which a key means something: with any other it is refused."""
 
 
+_MOST = 10**9  # steps of a take
+ONE_CAMERA = "one camera does not tell how far a person is; two cameras do, or one beside depth or markers"
+
+
+def check_enough(take: Take) -> None:
+    """Refuse to track a take with a single camera and nothing else, before anything is read or detected.
+
+    Raises
+    ------
+    TakeError
+        With what to add.
+    """
+    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.lines)
+    seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
+    if len(seeing) == 1 and not (any(others) or take.start or take.pose):
+        raise TakeError(
+            ONE_CAMERA, file=take.path, place=f"camera {next(iter(seeing))}",
+            remedy="Add [[camera]] of a second one, calibrated with the first, or [[depth]]; or tell by [start] where "
+            "the body is.",
+        )  # fmt: skip
+
+
 def check_take(take: Take) -> None:
     """Refuse a take whose values cannot be, whose names do not agree, whose files are missing, or keys without use.
 
@@ -63,10 +85,10 @@ def _values(take: Take) -> None:
             refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Leave one of both out.")
     if take.pose is not None:
         _pose(take, take.pose, refuse)
-    if take.frames is not None and not take.frames[0] < take.frames[1]:
+    if take.frames is not None and not -_MOST < take.frames[0] < take.frames[1] < _MOST:
         refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
     for camera in take.cameras:
-        if not abs(camera.time_offset) < 1e6 or (camera.size and min(camera.size) < 1):
+        if not abs(camera.time_offset) < 1e6 or (camera.size and not _is_size(camera.size)):
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
     for source in (*take.keypoints, *take.skin):
         place = f"keypoints of camera {source.camera}"
@@ -80,7 +102,7 @@ def _values(take: Take) -> None:
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
         if not 0 < source.sigma < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
             refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
-        if source.frames is not None and not source.frames[0] < source.frames[1]:
+        if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
     for shape in take.silhouettes:
         place = f"silhouette of camera {shape.camera}"
@@ -116,6 +138,11 @@ def _values(take: Take) -> None:
         refuse(problem, place, remedy)
 
 
+def _is_size(size: tuple[int, int]) -> bool:
+    """Whether an image may have a size [px]."""
+    return 1 <= min(size) and max(size) < 100_000
+
+
 def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:
     """Refuse a start that is none."""
     if take.start is not None:
@@ -143,7 +170,7 @@ def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
                 yield f"{key} = {value:g}", place, "Give a positive number: unit in metres a count, rate in Hz."
         if entry.range is not None and not 0 <= entry.range[0] < entry.range[1]:
             yield f"range = {list(entry.range)}", place, "Give [near, far] in metres."
-        if entry.size is not None and min(entry.size) < 1:
+        if entry.size is not None and not _is_size(entry.size):
             yield f"size = {list(entry.size)}", place, "Give [width, height] in pixels."
         if entry.camera is not None and take.calibration is None:
             yield f"camera = {entry.camera}, but no [calibration]", place, "Add one, or give intrinsics."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,7 +11,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from kinefit.errors import FileError, TakeError, choices
+from kinefit._files import BACKSLASHES, parse_toml
+from kinefit.errors import FileError, TakeError, choices, shortened
+from kinefit.readers.markers import UNITS
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
@@ -29,6 +30,7 @@ from kinefit.readers.take.entries import (
     _Entry,
     _Head,
 )
+from kinefit.readers.take.find import find_take
 
 __all__ = [
     "CalibrationEntry",
@@ -128,7 +130,7 @@ class Take:
 
 
 def read_take(path: str | PathLike[str]) -> Take:
-    """Read a take file; relative paths in it start at its own folder.
+    """Read a take file, or the one in a folder; relative paths in it start at its own folder.
 
     Raises
     ------
@@ -137,17 +139,18 @@ def read_take(path: str | PathLike[str]) -> Take:
     TakeError
         Unknown sensors, keys or values (the message lists what exists), no sensor at all, names that do not agree.
     """
-    path = Path(path).absolute()
+    path = find_take(path).absolute()
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = parse_toml(path.read_text(encoding="utf-8"), path)
     except FileNotFoundError as error:
         raise FileError("no such take file", file=path, remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(f"not TOML: {error}", file=path, remedy="Put texts in quotes and numbers not.") from error
     _check_keys(raw, path)
     _rename(raw, path)
+    for row in raw.get("depth", []):
+        if str(row.get("unit")).lower() in UNITS:
+            row["unit"] = UNITS[str(row["unit"]).lower()]
     folder = path.parent
     try:
         content = msgspec.convert(raw, _File, dec_hook=_path_in(folder))
@@ -155,7 +158,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         problem, _, place = str(error).partition(" - at `$.")
         place = place.rstrip("`")
         listed = ", ".join(map(repr, _options(place)))
-        remedy = f"There are: {listed}." if listed and "enum" in problem else None
+        remedy = f"There are: {listed}." if listed and "enum" in problem else _form(problem, place)
         raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
     head = content.take
     body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
@@ -178,6 +181,10 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder is a text")
+        if any(len(part.encode()) > 255 for part in Path(value).parts):
+            raise ValueError(f"{shortened(value, 60)!r} is no path: a name in it is too long")
+        if any(ord(character) < 32 for character in value):
+            raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
         return folder / value
 
     return make
@@ -191,6 +198,18 @@ def _options(place: str) -> tuple[Any, ...]:
         return ()
     hint = get_type_hints(entry)[key]
     return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
+
+
+def _form(problem: str, place: str) -> str | None:
+    """How a value is written, of which msgspec says that it is of another type."""
+    wanted, _, given = problem.partition(", got ")
+    if "str" in wanted and place.endswith("unit"):
+        return 'Write it in quotes: unit = "mm", "cm" or "m".'
+    if "str" in given and ("float" in wanted or "int" in wanted):
+        return "Write a number, without quotes and without its unit: 1.75."
+    forms = {"str": "Write it in quotes.", "bool": "Write true or false.", "array": "Write a list: [1, 2].",
+             "object": "Write a table: { key = value }."}  # fmt: skip
+    return next((form for kind, form in forms.items() if kind in wanted), None)
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
         try:
             frame, name = int(row["frame"]), str(row["line"]).strip()
             ends = [float(row[key]) for key in _COLUMNS[2:]]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise FileError(f"no line of a table of lines ({error})", file=path, place=place, remedy=_REMEDY) from error
         if name not in names:
             raise ObservationError(
@@ -66,7 +66,7 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
                 raise FileError("no list of objects", file=path, remedy=_REMEDY)
             return [(f"entry {i}", row) for i, row in enumerate(content)]
         return [(f"line {i}", row) for i, row in enumerate(csv.DictReader(text.splitlines()), 2)]
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
         raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
 
 

@@ -112,7 +112,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     sizes: dict[str, tuple[int, int]] = {}
     for entry in take.cameras:
         if entry.video is not None:
-            with Video(entry.video) as video:
+            with Video(entry.video, rate=take.rate) as video:
                 stream = f"video {entry.name}"
                 rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
                 sizes[entry.name] = video.size

@@ -105,10 +105,10 @@ def _silhouettes(
             image_frame=frame if entry.frame == "video" and not same else None, time_offset=offset,
         )  # fmt: skip
     if entry.format == "threshold":
-        return _coloured(entry, camera, size, frame)
+        return _coloured(entry, camera, size, frame, take.rate)
     if entry.format == "background":
         assert camera.video is not None
-        scene = _BeforeBackground(camera.video, entry.file, size, frame)
+        scene = _BeforeBackground(Video(camera.video, rate=take.rate), entry.file, size, frame)
         times = offset + np.arange(len(scene.video)) / scene.video.rate
         return SilhouetteVideo(entry.camera, scene.video.rate, times, size, scene.mask, str(camera.video))
     found = read_detections(entry.file or detections_file(take.path, entry.camera))
@@ -122,7 +122,7 @@ _SPACES = {"hsv": cv2.COLOR_RGB2HSV, "lab": cv2.COLOR_RGB2Lab, "ycrcb": cv2.COLO
 
 
 def _coloured(
-    entry: SilhouetteEntry, camera: CameraEntry, size: tuple[int, int], frame: ImageFrame
+    entry: SilhouetteEntry, camera: CameraEntry, size: tuple[int, int], frame: ImageFrame, rate: float | None
 ) -> SilhouetteVideo:
     """What has the body's colour in a camera's video (P1 4.1).
 
@@ -130,7 +130,7 @@ def _coloured(
     where an outline is looked for.
     """
     assert camera.video is not None and entry.low is not None and entry.high is not None
-    video, low, high = Video(camera.video), entry.low, entry.high
+    video, low, high = Video(camera.video, rate=rate), entry.low, entry.high
     smooth, space = 1.0 if entry.smooth is None else entry.smooth, _SPACES.get(entry.channels or "rgb")
 
     def image(i: int) -> NDArray:
@@ -145,8 +145,8 @@ def _coloured(
 class _BeforeBackground:
     """Masks of a video before its background, which is learnt when it is first asked for."""
 
-    def __init__(self, video: Path, plate: Path | None, size: tuple[int, int], frame: ImageFrame) -> None:
-        self.video, self._file, self._size, self._frame = Video(video), plate, size, frame
+    def __init__(self, video: Video, plate: Path | None, size: tuple[int, int], frame: ImageFrame) -> None:
+        self.video, self._file, self._size, self._frame = video, plate, size, frame
         if plate is not None:
             assert self.plate  # told now where it does not fit
 

@@ -41,7 +41,7 @@ def load_skin(take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str,
 
 
 def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path) -> KeypointVideo:
-    video = Video(file)
+    video = Video(file, rate=take.rate)
     offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
     rate = take.rate or video.rate
     used = entry.frames or take.frames or (round(offset * rate), round((offset + len(video) / video.rate) * rate))

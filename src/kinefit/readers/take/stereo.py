@@ -61,7 +61,7 @@ def _pair(take: Take, seen: Observations, entry: StereoEntry) -> DepthVideo:
         rectifier = StereoRectifier(left, right, near=near, far=far, name=entry.name)
     except KinefitError as error:
         raise CalibrationError(error.problem, file=take.path, place=error.place, remedy=error.remedy) from error
-    both = _Pair(rectifier, Video(seen.videos[entry.left]), Video(seen.videos[entry.right]))
+    both = _Pair(rectifier, *(Video(seen.videos[name], rate=seen.rate) for name in (entry.left, entry.right)))
     count = min(len(both.left), len(both.right))
     return DepthVideo(
         sensor=entry.name, rate=seen.rate, times=np.arange(count) / seen.rate, size=rectifier.camera.size,

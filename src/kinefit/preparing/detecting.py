@@ -1,4 +1,4 @@
-"""The built-in detector over the videos of a take: side by side, kept beside the take, not done twice."""
+"""The built-in detector over videos: side by side, kept, not done twice."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.cli import _screen
-from kinefit.errors import ObservationError, TakeError
+from kinefit.errors import TakeError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +25,12 @@ PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
 
 _METHOD = "1"  # raise it when the detector gives other numbers for the same video
+Step = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
+
+Tell = Callable[[str], None]
+"""Called with what is worth saying."""
+
 _ENDS = 2**20  # [bytes] of a video's begin and end by which it is recognised
 
 
@@ -39,18 +44,23 @@ class Job:
     video : Path
     file : Path
         Of the detections.
+    rate : float [Hz], optional
+        Of a video that is a folder of images.
     """
 
     camera: str
     video: Path
     file: Path
+    rate: float | None = None
 
 
 def jobs_of_take(take: Take) -> list[Job]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.detections import detections_file
 
-    found = [Job(c.name, c.video, detections_file(take.path, c.name)) for c in take.cameras if c.video is not None]
+    found = [
+        Job(c.name, c.video, detections_file(take.path, c.name), take.rate) for c in take.cameras if c.video is not None
+    ]
     if not found:
         raise TakeError(
             "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
@@ -58,71 +68,9 @@ def jobs_of_take(take: Take) -> list[Job]:
     return found
 
 
-def ensure_detections(
-    take: Take, *, people: int | None = None, masks: bool | None = None, force: bool = False,
-    progress: _screen.Step | None = None,
-) -> dict[str, Path]:
-    """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
-
-    Parameters
-    ----------
-    people : int, optional
-        How many are followed at most; default: as it was done, or `PEOPLE`.
-    masks : bool, optional
-        Whether outlines are wanted; default: as it was done, or yes.
-    force : bool
-        Make them anew.
-    progress : called with (camera, pictures done, pictures in all).
-
-    Returns
-    -------
-    {camera: Path}
-        For `[[keypoints]]` with format = "detect"; a camera that sees nobody is left out, with a note on stderr.
-
-    Raises
-    ------
-    TakeError, ObservationError
-        No camera has a video; nobody is seen by any; the extra `detect` is not installed.
-    AssetError, FileError, ExportError
-        What fetching the networks, reading a video and writing the file raise.
-    """
-    jobs = jobs_of_take(take)
-    detect(jobs, people=people, masks=masks, force=force, progress=progress)
-    return somebody(jobs)
-
-
-def with_detections(take: Take, step: _screen.Step) -> Take:
-    """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
-    from kinefit.readers.take.file import KeypointsEntry
-
-    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
-    videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo or take.silhouettes)
-    if not asked and (take.keypoints or take.skin or take.lines or not videos):
-        return take
-    files = ensure_detections(take, progress=step)
-    if take.keypoints:
-        return take
-    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
-    return replace(take, keypoints=entries)
-
-
-def somebody(jobs: Sequence[Job]) -> dict[str, Path]:
-    """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
-    from kinefit.readers.detections import read_detections
-
-    empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
-    remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
-    if len(empty) == len(jobs):
-        told = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
-        raise ObservationError(f"the detector finds nobody in {told}", file=jobs[0].video, remedy=remedy)
-    for camera, frames in empty.items():
-        _screen.note(f"note: the detector finds nobody in camera {camera} ({frames} pictures): left out. {remedy}")
-    return {job.camera: job.file for job in jobs if job.camera not in empty}
-
-
 def detect(
     jobs: Sequence[Job], *, people: int | None = None, masks: bool | None = None, force: bool = False,
-    progress: _screen.Step | None = None,
+    progress: Step | None = None, tell: Tell,
 ) -> list[Job]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
 
@@ -130,18 +78,18 @@ def detect(
     """
     from kinefit.readers.detections import detections_key
 
-    keys = {job: _video_key(job.video) for job in jobs}
+    keys = {job: _video_key(job) for job in jobs}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], people, masks)
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks)]
     if not todo:
         return []
-    folder = _networks(progress)
+    folder = _networks(progress, tell)
     number, outlines = people or PEOPLE, True if masks is None else masks
     stop, lock = threading.Event(), threading.Lock()
 
-    def tell(camera: str, done: int, total: int) -> None:
+    def step(camera: str, done: int, total: int) -> None:
         if stop.is_set():
             raise _Stopped
         if progress:
@@ -149,7 +97,7 @@ def detect(
                 progress(camera, done, total)
 
     def work(job: Job) -> None:
-        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines)}", tell)
+        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines)}", step)
 
     _hush(folder)
     with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
@@ -196,7 +144,7 @@ def _look_through(
     from kinefit.readers.video import Video
 
     models = Models(networks)
-    with Video(job.video) as video:
+    with Video(job.video, rate=job.rate) as video:
 
         def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
             for number, image in enumerate(images):
@@ -211,7 +159,7 @@ def _look_through(
     write_detections(found, job.file, key=key)
 
 
-def _networks(progress: _screen.Step | None) -> Path:
+def _networks(progress: Step | None, tell: Tell) -> Path:
     """Folder with the networks; their licence is shown when they are fetched."""
     from kinefit.assets import MODELS_CREDIT, detector_models
     from kinefit.images.models import check_runtime
@@ -221,7 +169,7 @@ def _networks(progress: _screen.Step | None) -> Path:
 
     def told(done: int, total: int) -> None:
         if not fetched:
-            _screen.note(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
+            tell(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
         fetched.append(done)
         if progress:
             progress("fetching MB", done // 10**6, total // 10**6)
@@ -229,20 +177,26 @@ def _networks(progress: _screen.Step | None) -> Path:
     return detector_models(told)
 
 
-def _video_key(video: Path) -> str:
+def _video_key(job: Job) -> str:
     """Text that another video, or another detector, does not have."""
     from kinefit.assets import MODELS_PACKAGE
     from kinefit.errors import FileError
+    from kinefit.readers.image_folders import images_in
 
-    digest = hashlib.sha256()
+    digest, size, path = hashlib.sha256(), 0, job.video
+    images = images_in(path) if path.is_dir() or "*" in path.name else []
     try:
-        with video.open("rb") as file:
-            size = file.seek(0, os.SEEK_END)
-            for start in (0, max(0, size - _ENDS)):
-                file.seek(start)
-                digest.update(file.read(_ENDS))
+        for part in images or [path]:
+            with part.open("rb") as file:
+                length = file.seek(0, os.SEEK_END)
+                for start in (0, max(0, length - _ENDS // max(1, len(images)))):
+                    file.seek(start)
+                    digest.update(file.read(_ENDS // max(1, len(images))))
+            size += length
     except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=video, remedy="Check the path.") from error
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
+    if images:
+        digest.update(f"{len(images)} {job.rate}".encode())
     return f"{digest.hexdigest()[:32]} {size} {MODELS_PACKAGE} {_METHOD}"
 
 

@@ -1,0 +1,140 @@
+"""Damage to files, the same for the same seed: cut, flipped, spliced, numbers made extreme, members of archives."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import struct
+import zipfile
+import zlib
+
+import numpy as np
+
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_WORDS = (
+    b"0", b"-1", b"1", b"65536", b"2147483647", b"-2147483648", b"4294967296", b"9223372036854775808", b"1e11", b"1e20",
+    b"1e308", b"-1e308", b"1e-320", b"0.5", b"1.0", b"100000", b"-0.0", b"1e999",
+    b"nan", b"inf", b"-inf", b"NaN", b"Infinity", b"0x7f", b"1,5", b"", b"-", b'"text"', b"null", b"true", b"[]", b"{}",
+    b"9" * 400, b"9" * 5000, b"\xff\xfe", b"\0",
+)  # fmt: skip
+_PLAIN = 18  # of these are numbers in every format, so that what follows them is read
+_INTEGERS = (0, 1, *(2**n - 1 for n in (7, 8, 15, 16, 31, 32, 64)), *(2**n for n in (7, 15, 31, 40, 63)))
+_FLOATS = (0.0, -0.0, 1e-40, 1e30, -1e30, float("inf"), float("-inf"), float("nan"), 1e300)
+
+
+def mutated(data: bytes, seed: list[int]) -> bytes:
+    """The bytes of a file, damaged in one to three ways."""
+    rng = np.random.default_rng(seed)
+    for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
+        data = _inside(data, rng) if rng.random() < 0.7 else _once(data, rng)
+    return data
+
+
+def _inside(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage within what the bytes pack, where they pack something; else to the bytes."""
+    if data[:2] == b"PK":
+        try:
+            return _member(data, rng)
+        except Exception:
+            return _once(data, rng)
+    if data[:2] == b"\x1f\x8b":
+        try:
+            return gzip.compress(_once(gzip.decompress(data), rng), 1, mtime=0)
+        except Exception:
+            return _once(data, rng)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _chunk(data, rng)
+    return _once(data, rng)
+
+
+def _member(data: bytes, rng: np.random.Generator) -> bytes:
+    """An archive with one member damaged, left out, of another name, or much larger than its packed bytes."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = [(info.filename, archive.read(info)) for info in archive.infolist()]
+    chosen, way = int(rng.integers(len(members))), rng.random()
+    name, content = members[chosen]
+    if way < 0.05:
+        del members[chosen]
+    elif way < 0.1:
+        members[chosen] = f"{name}x", content
+    elif way < 0.15:
+        members[chosen] = name, content + bytes(int(rng.choice([10_000, 20_000_000])))
+    elif way < 0.2:
+        members[chosen] = name, members[int(rng.integers(len(members)))][1]
+    elif content[:6] == b"\x93NUMPY" and way < 0.6:  # what its header says, padded so that it is read
+        end = 10 + struct.unpack("<H", content[8:10])[0]
+        head = _once(content[10:end].strip(), rng)[:60_000]
+        head += b" " * (-(len(head) + 11) % 64) + b"\n"
+        members[chosen] = name, content[:8] + struct.pack("<H", len(head)) + head + content[end:]
+    else:
+        members[chosen] = name, _once(content, rng)
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if rng.random() < 0.5 else zipfile.ZIP_STORED) as archive:
+        for name, content in members:
+            archive.writestr(zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0)), content)
+    return out.getvalue()
+
+
+def _chunk(data: bytes, rng: np.random.Generator) -> bytes:
+    """A PNG image with one chunk damaged and its sum made right again."""
+    parts, at = [], 8
+    while at + 12 <= len(data):
+        size = struct.unpack(">I", data[at : at + 4])[0]
+        parts.append([data[at + 4 : at + 8], data[at + 8 : at + 8 + size]])
+        at += 12 + size
+    if not parts:
+        return _once(data, rng)
+    part = parts[int(rng.integers(len(parts)))]
+    part[1] = _once(part[1], rng)
+    chunks = (struct.pack(">I", len(c)) + kind + c + struct.pack(">I", zlib.crc32(kind + c)) for kind, c in parts)
+    return data[:8] + b"".join(chunks)
+
+
+def _once(data: bytes, rng: np.random.Generator) -> bytes:
+    """One kind of damage."""
+    if not data:
+        return bytes(rng.integers(0, 256, 8, dtype=np.uint8))
+    a, b, c = sorted(int(v) for v in rng.integers(0, len(data) + 1, 3))
+    way = rng.choice(["cut", "flip", "copy", "leave", "bytes", "number", "number", "number", "word", "lines", "deep"])
+    if way == "cut":
+        return data[:a]
+    if way == "flip":
+        out = bytearray(data)
+        for place in rng.integers(0, len(data), int(rng.choice([1, 2, 8, 64]))):
+            out[place] ^= 1 << int(rng.integers(8))
+        return bytes(out)
+    if way == "copy":
+        return data[:a] + data[b : min(c, b + 4096)] * int(rng.choice([1, 1, 2, 50])) + data[a:]
+    if way == "leave":
+        return data[:a] + data[min(b, a + 256) :]
+    if way == "bytes":
+        return data[:a] + bytes(rng.integers(0, 256, int(rng.integers(1, 64)), dtype=np.uint8)) + data[a:]
+    if way == "word":
+        return data[:a] + _pack(rng) + data[a + 4 :]
+    if way == "deep":
+        sign = rng.choice([b"[", b"{", b"(", b"<a>", b'{"a":', b"a.", b"- "])
+        return data[:a] + bytes(sign) * int(rng.choice([3, 5000, 50_000])) + data[a:]
+    if way == "lines":
+        lines = data.split(b"\n")
+        i, j = (int(v) for v in rng.integers(0, len(lines), 2))
+        lines[i] = lines[j] if rng.random() < 0.5 else lines[i] + lines[j]
+        return b"\n".join(lines)
+    found = list(_NUMBER.finditer(data[:200_000]))
+    if not found:
+        return data[:a] + _pack(rng) + data[a + 4 :]
+    place = found[int(rng.integers(len(found)))]
+    word = _WORDS[int(rng.integers(_PLAIN if rng.random() < 0.6 else len(_WORDS)))]
+    return data[: place.start()] + word + data[place.end() :]
+
+
+def _pack(rng: np.random.Generator) -> bytes:
+    """An extreme number in bytes."""
+    order = "<" if rng.random() < 0.7 else ">"
+    if rng.random() < 0.5:
+        value, kind = _FLOATS[int(rng.integers(len(_FLOATS)))], f"{order}f{rng.choice([4, 8])}"
+        with np.errstate(over="ignore"):
+            return np.array(value).astype(kind).tobytes()
+    size = int(rng.choice([1, 2, 4, 8]))
+    value = _INTEGERS[int(rng.integers(len(_INTEGERS)))] % 256**size
+    return value.to_bytes(size, "little" if order == "<" else "big")

@@ -1,0 +1,12 @@
+"""What a stranger's machine and a stranger's files do to kinefit: `python -m benchmarks.product [PART ...]`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "fuzz": "every reader on damaged files: a typed error or a valid result, soon and in little memory",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)

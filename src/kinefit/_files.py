@@ -1,0 +1,171 @@
+"""Files that may hold anything: TOML and numpy archives are read here, within bounds of time and memory."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, KinefitError
+
+_LARGEST = 4_000_000  # characters of a TOML file, which tomllib reads in about 2 s; kinefit's own have some thousands
+_DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
+BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes, or single quotes."
+"""What to do about C:\\Users in a TOML file."""
+
+
+def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
+    """The tables of a TOML text.
+
+    Parameters
+    ----------
+    file : of the text, for messages.
+    error : what is raised.
+
+    Raises
+    ------
+    `error`
+        No TOML, with line and column; or tables so deep, keys or numbers so long that nobody wrote them.
+    """
+    if len(text) > _LARGEST:
+        raise error(f"a TOML file of {len(text) / 1e6:.0f} MB", file=file, remedy="Is it another file?")
+    if (dotted := _DOTTED.search(text)) is not None:  # tomllib's time grows with the square of their number
+        place = f"line {text.count(chr(10), 0, dotted.start()) + 1}"
+        raise error("not TOML: a key of more than 50 parts", file=file, place=place, remedy="Correct it there.")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as problem:
+        raise error(f"not TOML: {problem}", file=file, remedy=_remedy(text, str(problem))) from problem
+    except (RecursionError, ValueError) as problem:
+        told = "not TOML: nested too deep, or a number too long"
+        raise error(told, file=file, remedy="Correct it there.") from problem
+
+
+def _remedy(text: str, problem: str) -> str:
+    """What would work, by the line at fault."""
+    at = re.search(r"at line (\d+)", problem)
+    line = text.splitlines()[int(at[1]) - 1] if at and int(at[1]) <= len(text.splitlines()) else ""
+    value = line.partition("=")[2].partition("#")[0].strip()
+    if ("hex value" in problem or "Unescaped" in problem) and "\\" in line:
+        path = re.search(r"\"([^\"]*)\"?", line)
+        return f"{BACKSLASHES} Write '{path[1]}'." if path and len(path[1]) < 120 else BACKSLASHES
+    if value in ("True", "False", "yes", "no", "Yes", "No"):
+        return f"Write {'true' if value in ('True', 'yes', 'Yes') else 'false'}."
+    return "Put texts in quotes and numbers not, and give numbers a point, not a comma: 1.5."
+
+
+_ROOM, _RATIO = 256_000_000, 200  # [bytes] that any archive may unpack to; and how often its own size a larger one may
+_KINDS = "biufSU"  # of numbers and texts
+_Shape = tuple[int, ...]
+
+
+def read_npz(
+    file: str | os.PathLike[str], *names: str, remedy: str, error: type[KinefitError] = FileError
+) -> dict[str, NDArray]:
+    """The arrays of a numpy archive, each no larger than the bytes that are there.
+
+    Parameters
+    ----------
+    names : which arrays; those that are not there are left out. Default: all.
+    remedy : of the message.
+    error : what is raised.
+
+    Raises
+    ------
+    `error`
+        No such file, no archive, damaged, an array of objects, or one that would unpack to very much more than it is.
+    """
+    path = Path(file)
+    if not path.is_file():
+        raise error("no such file", file=path, remedy="Check the path.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            room = max(_ROOM, _RATIO * path.stat().st_size)
+            return _members(archive, set(names), room)
+    except _Refused as problem:
+        raise error(str(problem), file=path, remedy=remedy) from problem
+    except Exception as problem:  # zipfile, zlib and numpy have a dozen kinds of errors for what is damaged
+        raise error(f"no numpy archive, or damaged ({_told(problem)})", file=path, remedy=remedy) from problem
+
+
+def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
+    """The array of a numpy file; FileError where it is none, of objects, or longer than the file."""
+    path = Path(file)
+    try:
+        with path.open("rb") as stream:
+            return _array(stream, path.stat().st_size, path.name)
+    except FileNotFoundError as problem:
+        raise FileError("no such file", file=path, remedy="Check the path.") from problem
+    except Exception as problem:
+        told = str(problem) if isinstance(problem, _Refused) else _told(problem)
+        raise FileError(f"not a numpy array, or damaged ({told})", file=path, remedy=remedy) from problem
+
+
+def npy_header(file: str | os.PathLike[str]) -> tuple[_Shape, np.dtype] | None:
+    """Shape and type of the array in a numpy file, which is not read; None where it is none."""
+    try:
+        with Path(file).open("rb") as stream:
+            shape, _, dtype = _header(stream)
+    except Exception:
+        return None
+    return shape, dtype
+
+
+class _Refused(Exception):
+    """What a message says of an archive."""
+
+
+def _told(problem: Exception) -> str:
+    return f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
+
+
+def _members(archive: zipfile.ZipFile, names: set[str], room: int) -> dict[str, NDArray]:
+    found: dict[str, NDArray] = {}
+    for info in archive.infolist():
+        name = info.filename.removesuffix(".npy")
+        if not info.filename.endswith(".npy") or (names and name not in names):
+            continue
+        room -= info.file_size
+        if room < 0:
+            raise _Refused(f"array {name!r} of {info.file_size / 1e6:.0f} MB, which the file is far too small for")
+        with archive.open(info) as stream:
+            found[name] = _array(stream, info.file_size, name)
+    return found
+
+
+def _array(stream: IO[bytes], size: int, name: str) -> NDArray:
+    """The array of a stream of `size` bytes, read at once."""
+    shape, fortran, dtype = _header(stream)
+    count = 1
+    for n in shape:
+        count *= n
+    if dtype.kind not in _KINDS or dtype.fields is not None:
+        raise _Refused(f"array {name!r} is of {dtype}, not of numbers or texts")
+    if len(shape) > 8 or any(n < 0 for n in shape) or count * max(dtype.itemsize, 1) > size:
+        raise _Refused(f"array {name!r} of shape {shape}, but there are {size} bytes")
+    data = stream.read(count * dtype.itemsize)
+    if len(data) < count * dtype.itemsize:
+        raise _Refused(f"array {name!r} is cut")
+    if isinstance(stream, zipfile.ZipExtFile):
+        stream.read()  # to its end, where its sum is checked
+    array = np.frombuffer(data, dtype, count) if dtype.itemsize else np.zeros(count, dtype)
+    if dtype.kind == "U" and dtype.itemsize:
+        codes = array.view(f"{dtype.byteorder}u4")
+        if (codes > 0x10FFFF).any() or ((codes >= 0xD800) & (codes < 0xE000)).any():
+            raise _Refused(f"array {name!r} has characters that there are not")
+    return array.reshape(shape, order="F" if fortran else "C").copy()
+
+
+def _header(stream: IO[bytes]) -> tuple[_Shape, bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    try:
+        return read(stream)
+    except MemoryError:  # what Python's parser says of brackets within brackets
+        raise ValueError("a header that cannot be understood") from None

@@ -1,0 +1,44 @@
+"""What records of observations hold, in the types that they say: arrays of numbers, names, a sensor and a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+
+def numbers(values: Any, dtype: type | None = float, what: str = "an observation") -> NDArray:
+    """A copy of one type (None: their own); ObservationError where the values are no numbers."""
+    try:
+        return np.array(values, dtype=dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        problem = f"{what} holds a {type(values).__name__} that is no array of numbers"
+        raise ObservationError(problem, remedy="Give an array, or lists of numbers of one length.") from error
+
+
+def frozen(values: Any, dtype: type = float, what: str = "an observation") -> NDArray:
+    """The same copy, that cannot be written."""
+    array = numbers(values, dtype, what)
+    array.flags.writeable = False
+    return array
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is one real number."""
+    return isinstance(value, Real)
+
+
+def check_seen(sensor: Any, time: Any, names: Any = ()) -> None:
+    """ObservationError where a sensor's name is no text, a time no number, or names are no sequence of texts."""
+    if not isinstance(sensor, str):
+        raise ObservationError(f"a sensor called {type(sensor).__name__}", remedy="Give its name, a text.")
+    if not is_number(time):
+        raise ObservationError(f"a time of '{sensor}' is a {type(time).__name__}", remedy="Give seconds.")
+    if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
+        problem = f"the names of '{sensor}' are a {type(names).__name__}"
+        raise ObservationError(problem, remedy="Give a tuple of texts.")

@@ -1,0 +1,1 @@
+"""What a take needs before it is tracked."""

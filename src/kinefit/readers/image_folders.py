@@ -1,0 +1,103 @@
+"""Folders of PNG or JPEG images as a camera's video."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.readers.depth.images import listed
+
+ENDINGS = (".png", ".jpg", ".jpeg")
+_MISSING = 1.5  # times the usual step of the numbers in the names, from which an image between two is missing
+
+
+class ImageFolder:
+    """Images of a folder, or of a pattern of names, as the frames of a video; each is read when it is asked for.
+
+    Parameters
+    ----------
+    path : Path
+    rate : float [Hz]
+        Images state none: None is refused.
+
+    Raises
+    ------
+    FileError
+        No images; an image that cannot be decoded.
+    ObservationError
+        No rate; numbers in the names that leave some out.
+    """
+
+    def __init__(self, path: Path, rate: float | None) -> None:
+        files = images_in(path)
+        if not files:
+            raise FileError("no images here", file=path, remedy="Name a video, or a folder of PNG or JPEG images.")
+        if rate is None or not 0 < rate < 1e6:
+            problem = "a folder of images states no frame rate"
+            raise ObservationError(problem, file=path, remedy="Write rate = ... (frames per second) into [take].")
+        _check_numbers(files)
+        self._files, self.rate = files, float(rate)
+        self._picture: tuple[int, NDArray[np.uint8]] = (0, _decoded(files[0]))
+        self.size: tuple[int, int] = self._picture[1].shape[1::-1]
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+    @property
+    def times(self) -> NDArray:
+        """(N,) [s] from the first frame."""
+        return np.arange(len(self)) / self.rate
+
+    def image(self, i: int) -> NDArray[np.uint8]:
+        """Frame `i` as (H, W, 3) uint8 RGB."""
+        if self._picture[0] != i:
+            picture = _decoded(self._files[i])
+            if picture.shape[1::-1] != self.size:
+                sizes = [f"{width}x{height}" for width, height in (picture.shape[1::-1], self.size)]
+                problem = f"{sizes[0]} px, but the first image has {sizes[1]}"
+                raise FileError(problem, file=self._files[i], remedy="All images of a camera are of one size.")
+            self._picture = i, picture
+        return self._picture[1].copy()
+
+
+def images_in(path: Path) -> list[Path]:
+    """PNG and JPEG files of a folder or a pattern, in the order of the numbers in their names."""
+    return [file for file in listed(path) if file.suffix.lower() in ENDINGS]
+
+
+def _check_numbers(files: list[Path]) -> None:
+    numbers = [re.findall(r"\d+", file.stem)[-1:] for file in files]
+    if not all(numbers):
+        return
+    steps = np.diff([float(number[0]) for number in numbers])
+    if len(steps) and (steps <= 0).any():
+        i = int(np.argmax(steps <= 0))
+        raise ObservationError(
+            f"two images of one number, as {files[i].name} and {files[i + 1].name}", file=files[0].parent,
+            remedy="Name those of this camera by a pattern: video = \"folder/left_*.png\".",
+        )  # fmt: skip
+    if len(steps) and (steps > _MISSING * np.sort(steps)[(len(steps) - 1) // 2]).any():
+        i = int(np.argmax(steps))
+        raise ObservationError(
+            f"images are missing between {files[i].name} and {files[i + 1].name}", file=files[0].parent,
+            remedy="Copy them again; or leave out what comes after, and number the rest without a gap.",
+        )  # fmt: skip
+
+
+def _decoded(file: Path) -> NDArray[np.uint8]:
+    try:
+        data = np.frombuffer(file.read_bytes(), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
+    except (OSError, cv2.error) as error:
+        raise FileError("cannot be read, or is no image", file=file, remedy="Copy it again.") from error
+    if picture is None:
+        raise FileError("an image that cannot be decoded", file=file, remedy="It is cut or damaged: copy it again.")
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)

@@ -1,0 +1,166 @@
+"""Video files as FFmpeg decodes them, frame-exact: what `Video` reads a file with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError
+
+_FORWARD = 64  # frames that are decoded and dropped rather than sought over
+_HIDDEN = ("vp8",)  # codecs with packets that show nothing, so that packets cannot be counted
+_REMEDY = "Copy the file again from its source, or re-encode it."
+
+
+class VideoFile:
+    """One video file: the frames are counted by walking through it, not taken from its header."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._container = _open(path)
+        try:
+            self._stream = self._container.streams.video[0]
+            self._pts = _presentation_times(self.path)
+            self._index = {pts: i for i, pts in enumerate(self._pts)}
+            self._restart()
+            first = self._decode(0)
+            self._quarter_turns = round(_rotation(first) / 90) % 4
+        except BaseException:
+            self.close()
+            raise
+        height, width = (first.height, first.width) if self._quarter_turns % 2 == 0 else (first.width, first.height)
+        self.size: tuple[int, int] = (width, height)
+        self.rate: float = self._measure_rate()
+        self._restart()
+
+    def __len__(self) -> int:
+        return len(self._pts)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    @property
+    def times(self) -> NDArray:
+        """(N,) [s] when each frame is shown, from the first frame; uneven where the rate varies."""
+        return (np.array(self._pts) - self._pts[0]) * float(self._stream.time_base or 0)
+
+    def image(self, i: int) -> NDArray[np.uint8]:
+        """Frame `i` as (H, W, 3) uint8 RGB, upright."""
+        image = self._decode(i).to_ndarray(format="rgb24")
+        return np.ascontiguousarray(np.rot90(image, self._quarter_turns)) if self._quarter_turns else image
+
+    def _restart(self, i: int = 0) -> None:
+        """Let the decoder continue at or before frame `i`."""
+        if i:
+            self._container.seek(self._pts[i], stream=self._stream, backward=True)
+        else:
+            self._container.close()
+            self._container = _open(self.path)
+            self._stream = self._container.streams.video[0]
+            self._stream.thread_type = "AUTO"
+        self._decoder = self._container.decode(self._stream)
+        self._next = 0  # lower bound of the frame that comes next
+
+    def _decode(self, i: int) -> Any:
+        if not self._next <= i <= self._next + _FORWARD:
+            self._restart(i)
+        for attempt in ("here", "from the start"):
+            try:
+                for frame in self._decoder:
+                    found = self._index.get(frame.pts)
+                    if found is None or found < i:
+                        continue
+                    self._next = found + 1
+                    if found == i:
+                        return frame
+                    break  # the seek overshot
+            except (av.FFmpegError, ValueError) as error:
+                if attempt != "here":
+                    raise FileError(f"frame {i} cannot be decoded ({error})", file=self.path, remedy=_REMEDY) from error
+            if attempt == "here":
+                self._restart()
+        raise FileError(f"frame {i} of {len(self)} is missing or damaged", file=self.path, remedy=_REMEDY)
+
+    def _measure_rate(self) -> float:
+        stated, span = float(self._stream.average_rate or 0), self.times[-1]
+        measured = (len(self) - 1) / span if span > 0 else 0.0
+        if not (stated or measured):
+            raise FileError("the video tells no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
+        return stated if stated and (not measured or abs(measured / stated - 1) < 0.02) else measured
+
+
+def _open(path: Path) -> Any:
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise FileError(f"not a readable video, 0 frames ({_reason(error)})", file=path, remedy=_REMEDY) from error
+    if not container.streams.video:
+        container.close()
+        raise FileError("there is no video stream in this file", file=path, remedy="Name a video file.")
+    if container.streams.video[0].codec_context is None:
+        container.close()
+        raise FileError("a video of a codec that FFmpeg does not know", file=path, remedy=_REMEDY)
+    return container
+
+
+def _reason(error: Exception) -> str:
+    """What FFmpeg says, without its error number and the path."""
+    return str(getattr(error, "strerror", None) or error)
+
+
+def _presentation_times(path: Path) -> list[int]:
+    """Times of all frames that are shown, sorted, in the stream's time base."""
+    pts: list[int | None] = []
+    packets, problem = 0, ""
+    with _open(path) as container:
+        stream = container.streams.video[0]
+        stated, rate, base = stream.frames, float(stream.average_rate or 0), float(stream.time_base or 0)
+        if not stated and len(container.streams) == 1 and container.duration and container.size > 0:
+            stated = int(container.duration / av.time_base * rate * 0.98) - 2  # of the duration, which is rounded
+        try:
+            for packet in container.demux(stream):
+                if packet.size and packet.is_corrupt:
+                    problem = problem or "damaged packet"
+                elif packet.size:
+                    packets += 1
+                    if not packet.is_discard:
+                        pts.append(packet.pts)
+        except (av.FFmpegError, ValueError) as error:
+            problem = str(error)
+        hidden = stream.codec_context.name in _HIDDEN
+    if problem or packets < stated:
+        told = f" of {stated}" if stated > packets else ""
+        raise FileError(
+            f"the video is truncated: {packets}{told} frames can be read" + (f" ({problem})" if problem else ""),
+            file=path, remedy="Copy the file again, or keep its readable part: ffmpeg -i IN -c copy OUT.",
+        )
+    if hidden or None in pts or len(set(pts)) < len(pts) or not base:
+        pts = _decoded_times(path)
+    if not pts:
+        raise FileError("no frame of this video can be decoded", file=path, remedy=_REMEDY)
+    return sorted(pts)  # type: ignore[type-var,arg-type]
+
+
+def _decoded_times(path: Path) -> list[int | None]:
+    with _open(path) as container:
+        try:
+            pts = [frame.pts for frame in container.decode(video=0)]
+        except (av.FFmpegError, ValueError) as error:
+            raise FileError(f"the video cannot be decoded ({error})", file=path, remedy=_REMEDY) from error
+    if None in pts or len(set(pts)) < len(pts):
+        raise FileError("frames without times", file=path, remedy="Repack it: ffmpeg -i IN -c copy OUT.mp4.")
+    return pts
+
+
+def _rotation(frame: Any) -> float:
+    """Counterclockwise rotation [deg] that the file asks for."""
+    data = frame.side_data.get("DISPLAYMATRIX")  # by name: PyAV up to 18 iterates over values, from 19 on over keys
+    if data is None:
+        return 0.0
+    a, b = np.frombuffer(bytes(data), np.int32)[:2]
+    return float(-np.degrees(np.arctan2(b, a)))

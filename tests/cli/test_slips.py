@@ -1,0 +1,152 @@
+"""Everyday slips of a user: each is answered with what would work, and printed commands work when pasted."""
+
+import re
+import shlex
+
+import pytest
+from click.testing import CliRunner
+
+from kinefit.cli import main
+from kinefit.readers.take.file import read_take
+
+
+def run(*args):
+    return CliRunner().invoke(main, [str(arg) for arg in args])
+
+
+def commands(text):
+    """Words of every command line that a text shows."""
+    return [shlex.split(line.strip())[1:] for line in re.findall(r"^ *kinefit .*$", text, re.M)]
+
+
+@pytest.mark.parametrize(("typed", "meant"), [("trak", "track"), ("tarck", "track"), ("Export", "export")])
+def test_a_mistyped_command_names_the_nearest(typed, meant):
+    told = run(typed, "take.toml")
+    assert told.exit_code == 2 and f"Did you mean '{meant}'?" in told.stderr
+
+
+def test_a_command_like_no_other_is_answered_with_all():
+    told = run("xyz")
+    assert told.exit_code == 2 and "There are: demo, init" in told.stderr
+
+
+def test_a_folder_stands_for_the_take_in_it(take):
+    told = run("check", take.parent)
+    assert told.exit_code == 0, told.output
+    assert take.with_name("take-check.html").is_file()
+
+
+def test_a_folder_without_a_take_is_answered_with_init(take, monkeypatch):
+    take.unlink()
+    folder = take.parent.rename(take.parent.with_name("my take"))
+    monkeypatch.chdir(folder.parent)
+    for command in ("track", "check"):
+        told = run(command, "my take")
+        assert told.exit_code == 2 and "no take file in this folder" in told.stderr
+        assert "kinefit init 'my take'" in told.stderr
+
+
+def test_several_takes_in_a_folder_are_named(take):
+    text = take.read_text()
+    take.unlink()
+    for name in ("monday.toml", "tuesday.toml"):
+        take.with_name(name).write_text(text)
+    told = run("track", take.parent)
+    assert told.exit_code == 2 and "2 take files in this folder: monday.toml, tuesday.toml" in told.stderr
+    take.with_name("tuesday.toml").unlink()
+    assert read_take(take.parent).path.name == "monday.toml"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("cam01.mp4", "kinefit track take.toml"), ("walk.c3d", "kinefit markers fit walk.c3d"),
+     ("motion.npz", "kinefit view motion.npz")],
+)  # fmt: skip
+def test_another_file_than_a_take_is_answered_with_its_command(take, monkeypatch, name, told):
+    monkeypatch.chdir(take.parent)
+    take.with_name(name).touch()
+    answer = run("track", name)
+    assert answer.exit_code == 2 and told in answer.stderr
+
+
+def test_a_video_alone_is_answered_with_init(take, monkeypatch):
+    take.unlink()
+    monkeypatch.chdir(take.parent)
+    told = run("track", "cam01.mp4").stderr
+    assert "kinefit init ." in told and "kinefit detect cam01.mp4" in told
+    assert f"kinefit init {take.parent}" not in run("init", "cam01.mp4").stderr
+    assert "kinefit init ." in run("init", "cam01.mp4").stderr
+
+
+def test_init_prints_commands_that_work_where_the_user_is(take, monkeypatch):
+    take.unlink()
+    folder = take.parent.rename(take.parent.with_name("my take"))
+    monkeypatch.chdir(folder.parent)
+    told = run("init", "my take")
+    assert commands(told.stdout) == [["check", "my take/take.toml"], ["track", "my take/take.toml"]]
+    assert run(*commands(told.stdout)[0]).exit_code == 0
+
+
+def test_after_refine_the_next_command_works_as_printed(take, change, monkeypatch):
+    path = take.with_name("calibration.toml")
+    pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
+    path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.03}", path.read_text(), count=1))
+    folder = take.parent.rename(take.parent.with_name("my take"))
+    monkeypatch.chdir(folder.parent)
+    told = run("check", "my take/take.toml", "--refine")
+    assert "kinefit check 'my take/take.toml' --refine" in told.stdout  # the remedy of the fault
+    words = commands(told.stdout)[-1]
+    assert words == ["track", "my take/take_refined.toml"]
+    assert run(*words, "--no-overlays", "--no-report", "--formats", "motion").exit_code == 0
+
+
+def test_a_calibration_that_cannot_be_put_into_the_take_says_what_to_write(take):
+    path = take.with_name("calibration.toml")
+    pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
+    path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.01}", path.read_text(), count=1))
+    text = take.read_text().replace('[calibration]\nfile = "calibration.toml"\n', "")
+    take.write_text('calibration = { file = "calibration.toml" }\n' + text)
+    told = run("check", take, "--refine")
+    assert told.exit_code == 2 and 'file = "calibration_refined.toml" in [calibration]' in told.stderr
+    assert not take.with_name("take_refined.toml").exists()
+
+
+def test_one_camera_is_told_from_the_start(take, tmp_path):
+    for camera in ("cam02", "cam03", "cam04"):
+        take.with_name(f"{camera}.mp4").unlink()
+        take.with_name(f"mediapipe_{camera}.npy").unlink()
+    take.unlink()
+    told = run("init", take.parent)
+    assert told.exit_code == 0 and "cam01 alone: one camera does not tell how far a person is" in told.stdout
+    told = run("track", take, "--out", tmp_path / "out")
+    assert told.exit_code == 2 and "two cameras do" in told.stderr and "[[depth]]" in told.stderr
+    take.with_name("calibration.toml").unlink()
+    take.unlink()
+    take.with_name("mediapipe_cam01.npy").unlink()
+    told = run("init", take.parent)
+    assert told.exit_code == 2 and "one video and no calibration" in told.stderr and "kinefit detect" in told.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("track", "{take}", "--out", "{file}"), ("check", "{take}", "--out", "{folder}"),
+     ("check", "{take}", "--out", "{file}/page.html"), ("init", "{folder}", "--force", "--out", "{file}/take.toml"),
+     ("export", "none.npz", "--to", "bvh", "--out", "{folder}"),
+     ("export", "none.npz", "--to", "csv", "--out", "{file}"),
+     ("view", "{take}", "--html", "{folder}"), ("calibrate", "people", "{take}", "--out", "{file}/c.toml"),
+     ("retarget", "none.bvh", "--out", "{folder}"), ("markers", "learn", "none.c3d", "--out", "{folder}"),
+     ("markers", "identify", "none.c3d", "none.json", "--out", "{folder}"),
+     ("detect", "none.mp4", "--out", "{file}"),
+     ("markers", "fit", "none.c3d", "--out", "{file}"), ("simulate", "none.npz", "--out", "{file}")],
+)  # fmt: skip
+def test_an_out_that_cannot_be_written_is_refused_before_any_work(take, words):
+    names = {"take": take, "file": take.with_name("calibration.toml"), "folder": take.parent}
+    told = run(*(word.format(**names) for word in words))
+    assert told.exit_code == 2 and "in the way" in told.stderr, told.output
+    assert "Name a" in told.stderr and words[-2] in told.stderr
+
+
+def test_fbx_is_answered_with_glb_and_bvh():
+    for words in (("export", "motion.npz", "--to", "fbx"), ("track", "take.toml", "--formats", "fbx")):
+        told = run(*words)
+        assert told.exit_code == 2 and "write glb or bvh" in told.stderr

@@ -1,0 +1,161 @@
+"""Every reader on damaged files: a typed error or a result, soon and in little memory; and what was found so."""
+
+import os
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from benchmarks.fuzz import SLOW, fuzz
+from benchmarks.fuzz_mutations import mutated
+from benchmarks.fuzz_seeds import ASF, READERS, seed_of
+from benchmarks.fuzz_worker import LONGEST
+
+from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
+from kinefit.readers.keypoints import read_caliscope_csv
+from kinefit.readers.skeletons.asf import read_asf
+from kinefit.readers.static_points import read_static_points
+from kinefit.readers.video import Video
+
+COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
+linux = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="memory is counted as Linux does")
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_are_answered(name, tmp_path):
+    seed = seed_of(name, tmp_path)
+    seed.read()
+    whole = [file.read_bytes() for file in seed.files]
+    for i in range(COPIES):
+        which, began = i % len(whole), time.monotonic()
+        seed.files[which].write_bytes(mutated(whole[which], [zlib.crc32(name.encode()), i]))
+        try:
+            seed.read()
+        except KinefitError as error:
+            assert len(str(error).replace(str(tmp_path), "")) <= LONGEST
+        assert time.monotonic() - began < SLOW
+        seed.files[which].write_bytes(whole[which])
+
+
+@linux
+def test_files_are_counted_in_a_process_of_their_own(monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    found = fuzz("lines csv", 40)
+    assert found.total() == 40 and set(found) == {"read", "typed"}
+
+
+def test_damage_is_the_same_in_every_run():
+    data = b"frame,line\n0,1.5\n1,2.5\n" * 20
+    assert [mutated(data, [1, i]) for i in range(20)] == [mutated(data, [1, i]) for i in range(20)]
+    assert len({mutated(data, [1, i]) for i in range(50)}) > 40
+
+
+@linux
+def test_a_reader_that_fails_is_counted(tmp_path):
+    code = (
+        "import benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w, os, sys, numpy as np\n"
+        "def make(folder):\n"
+        "    (folder / 'a').write_bytes(b'1')\n"
+        "    whole = [True]\n"
+        "    def read():\n"
+        "        if whole: return whole.pop()\n"
+        "        if KIND == 'untyped': raise ValueError('x')\n"
+        "        if KIND == 'memory': return np.ones(10**9)\n"
+        "        os.abort()\n"
+        "    return s.Seed((folder / 'a',), read)\n"
+        "s.READERS['x'] = make; w.main('x', 0, 1, 500)\n"
+    )
+    for kind in ("untyped", "memory", "abort"):
+        words = [sys.executable, "-c", code.replace("KIND", repr(kind))]
+        done = subprocess.run(words, capture_output=True, text=True, cwd=Path(__file__).parents[2], env=os.environ)
+        assert "at 0" in done.stdout
+        assert (f"0 {kind}" in done.stdout) == (kind != "abort") and (done.returncode != 0) == (kind == "abort")
+
+
+def caliscope(path, *rows):
+    path.write_text("sync_index,port,frame_time,point_id,img_loc_x,img_loc_y\n" + "\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("row", "told"),
+    [("1e11,0,0.1,3,5,6", "sync_index = 1e+11"), ("3,0,0.1,-1,5,6", "point_id = -1"),
+     ("3,0,0.1,2.5,5,6", "point_id = 2.5"),
+     ("90000000,0,0.1,3,5,6", "2 frames of 1 ports in 90000001"), ("0,-2,0.1,3,5,6", "port = -2")],
+)  # fmt: skip
+def test_indices_of_a_table_that_cannot_be_are_told(tmp_path, row, told):
+    with pytest.raises(ObservationError, match=told.replace("+", r"\+")):
+        read_caliscope_csv(caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", row))
+
+
+def test_limits_of_a_bone_that_are_no_numbers_are_told(tmp_path):
+    for limits in ("(-90 x)", "(-90 nan)"):
+        (tmp_path / "a.asf").write_text(ASF.replace("(-90 90)", limits))
+        with pytest.raises(FileError, match="limits that are no numbers"):
+            read_asf(tmp_path / "a.asf")
+    (tmp_path / "a.asf").write_text(ASF.replace("     id 2\n", "     (0 1)\n"))
+    assert len(read_asf(tmp_path / "a.asf").bones) == 3  # no limits of the bone before
+
+
+def test_a_matrix_of_rows_without_end_is_told(tmp_path):
+    matrix = '{"type_id": "opencv-matrix", "rows": 100000000000000000000, "cols": 3, "dt": "d", "data": [1.0]}'
+    (tmp_path / "a.json").write_text(f'{{"cam": {{"camera_matrix": {matrix}}}}}')
+    with pytest.raises(CalibrationError, match="not a readable JSON"):
+        read_calibration(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("text", ["a: " + "{" * 50_000, "a: " + "- " * 50_000, "a: " + '{"a":' * 50_000])
+def test_tables_within_tables_do_not_end_the_process(tmp_path, text):
+    (tmp_path / "a.yml").write_text(f"%YAML:1.0\n---\n{text}\n")
+    with pytest.raises(CalibrationError, match="deeper than any calibration"):
+        read_calibration(tmp_path / "a.yml")
+
+
+def test_a_cloud_of_sizes_that_there_are_not_is_told(tmp_path):
+    head = "VERSION .7\nFIELDS x y z\nSIZE {} 4 4\nTYPE F F F\nCOUNT {} 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary\n"
+    for size, count in ((0, 1), (-4, 1), (4, 0), (4, -1), (3, 1)):
+        (tmp_path / "a.pcd").write_bytes(head.format(size, count).encode() + bytes(64))
+        with pytest.raises(FileError, match="SIZE"):
+            read_cloud(tmp_path / "a.pcd")
+
+
+def test_a_pixel_of_five_hundred_digits_is_told(tmp_path):
+    (tmp_path / "points.toml").write_text(f"[beam]\na = [1, 2]\nb = [3, {'9' * 500}]\n")
+    with pytest.raises(ObservationError, match="no pixel") as error:
+        read_static_points(tmp_path / "points.toml", ("a", "b"))
+    assert len(str(error.value)) < 600
+
+
+def test_a_video_of_a_codec_that_nobody_knows_is_told(tmp_path):
+    path = tmp_path / "a.avi"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="rgb24")))
+        container.mux(stream.encode())
+    path.write_bytes(path.read_bytes().replace(b"FMP4", b"zzzz"))
+    with pytest.raises(FileError, match="codec"):
+        Video(path)
+
+
+def test_packed_points_that_claim_gigabytes_are_told(tmp_path):
+    head = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\n"
+    head += "DATA binary_compressed\n"
+    (tmp_path / "a.pcd").write_bytes(head.encode() + np.array([4, 2**33 - 2**32 - 1], "<u4").tobytes() + bytes(4))
+    with pytest.raises(FileError):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_points_at_the_end_of_the_world_are_told(tmp_path):
+    points = np.random.default_rng(0).random((400, 3)) + 0.1
+    points[:, 0] *= 1e300
+    cloud = Cloud(points, (20, 20), np.eye(4))
+    with pytest.raises(CalibrationError, match="no camera sees"):
+        camera_of(cloud, "a", tmp_path / "a.pcd")

@@ -1,0 +1,86 @@
+"""Folders of images as videos: order, rate, sizes, gaps, and a take that is made of them."""
+
+import cv2
+import numpy as np
+import pytest
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.readers.video import Video, VideoSet
+
+
+def draw(folder, numbers, ending=".png", size=(48, 32)):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in numbers:
+        picture = np.full((size[1], size[0], 3), 0, np.uint8)
+        picture[..., 2] = 5 * i  # red, as OpenCV orders channels
+        assert cv2.imwrite(str(folder / f"img{i}{ending}"), picture)
+    return folder
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".jpeg"])
+def test_images_are_frames_by_their_number(tmp_path, ending):
+    (draw(tmp_path / "cam01", range(8, 21), ending) / "notes.txt").write_text("no image")
+    with Video(tmp_path / "cam01", rate=25.0) as video:
+        assert (len(video), video.size, video.rate) == (13, (48, 32), 25.0)
+        np.testing.assert_allclose(video.times, np.arange(13) / 25.0)
+        for i in (12, 0, 5):
+            red, green, _ = video.read(i)[16, 24]
+            assert abs(int(red) - 5 * (8 + i)) <= 3 and green <= 3
+        assert len(list(video.frames(2, 5))) == 3
+
+
+def test_a_pattern_names_the_images_of_one_camera(tmp_path):
+    draw(tmp_path, range(4))
+    for i in range(4):
+        (tmp_path / f"img{i}.png").rename(tmp_path / f"left_{i}.png")
+    draw(tmp_path, range(6))
+    assert len(Video(tmp_path / "left_*.png", rate=10.0)) == 4
+    with pytest.raises(ObservationError, match=r"two images of one number.*pattern"):
+        Video(tmp_path, rate=10.0)
+
+
+def test_what_is_wrong_with_images_is_told(tmp_path):
+    folder = draw(tmp_path / "cam", [0, 1, 2, 3])
+    with pytest.raises(ObservationError, match=r"states no frame rate.*rate = .*\[take\]"):
+        Video(folder)
+    (folder / "img2.png").unlink()
+    with pytest.raises(ObservationError, match="missing between img1.png and img3.png"):
+        Video(folder, rate=30.0)
+    draw(folder, [2], size=(20, 20))
+    with Video(folder, rate=30.0) as video, pytest.raises(FileError, match=r"20x20 px, but the first image has 48x32"):
+        video.read(2)
+    (folder / "img2.png").write_bytes(b"\x89PNG")
+    with Video(folder, rate=30.0) as video, pytest.raises(FileError, match="cannot be decoded"):
+        video.read(2)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileError, match="no images here"):
+        Video(tmp_path / "empty", rate=30.0)
+
+
+def test_folders_go_in_step(tmp_path):
+    paths = {name: draw(tmp_path / name, range(6)) for name in ("a", "b")}
+    with VideoSet(paths, {"b": 0.1}, rate=20.0, frames=(2, 6)) as videos:
+        at = videos.read(0)
+        assert (at["a"][0, 0, 0], at["b"][0, 0, 0]) == (10, 0)
+
+
+def test_a_take_of_folders_has_the_rate_of_the_take(tmp_path):
+    names = ("cam01", "cam02")
+    for name in names:
+        draw(tmp_path / name, range(5))
+    cameras = "".join(f'[[camera]]\nname = "{name}"\nvideo = "{name}"\n' for name in names)
+    calibration = "".join(
+        f'[{name}]\nname = "{name}"\nsize = [48, 32]\nmatrix = [[50, 0, 24], [0, 50, 16], [0, 0, 1]]\n'
+        f"distortions = [0, 0, 0, 0]\nrotation = [0, 0, {i}]\ntranslation = [{i}, 0, 3]\n"
+        for i, name in enumerate(names)
+    )
+    (tmp_path / "calibration.toml").write_text(calibration)
+    take = tmp_path / "take.toml"
+    take.write_text('[take]\nrate = 12.5\n[calibration]\nfile = "calibration.toml"\n' + cameras)
+    seen = load_observations(read_take(take))
+    assert (seen.rate, seen.frames) == (12.5, (0, 5))
+    take.write_text('[calibration]\nfile = "calibration.toml"\n' + cameras)
+    with pytest.raises(ObservationError, match="states no frame rate"):
+        load_observations(read_take(take))

@@ -1,0 +1,120 @@
+"""TOML and numpy archives of any content: an answer within bounds, with the place and what would work."""
+
+import io
+import time
+import zipfile
+
+import numpy as np
+import pytest
+
+from kinefit._files import npy_header, parse_toml, read_npy, read_npz
+from kinefit.errors import BodyError, FileError
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('[a]\nfile = "C:\\Users\\me\\x.toml"', r"line 2.*single quotes. Write 'C:\\Users\\me\\x.toml'"),
+        ('file = "C:\\data\\x.toml"', "forward slashes"),
+        ("size = True", "Write true"),
+        ("rate = 29,97", "a point, not a comma"),
+        ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
+        ("a = " + "9" * 5000, "number too long"),
+        ("\n" + "a." * 20_000 + "a = 1", "line 2.*more than 50 parts"),
+        ("'a'. \"b\" ." * 100 + "a = 1", "more than 50 parts"),
+        ("#" * 5_000_000, "5 MB"),
+    ],
+)
+def test_what_is_no_toml_is_told_at_once(text, told):
+    began = time.monotonic()
+    with pytest.raises(FileError, match=f"(?s)x.toml.*{told}") as error:
+        parse_toml(text, "x.toml")
+    assert time.monotonic() - began < 2.0 and len(str(error.value)) < 600
+
+
+def test_the_error_is_of_the_kind_asked_for():
+    with pytest.raises(BodyError):
+        parse_toml("a = = 1", "x.toml", BodyError)
+
+
+def test_dots_in_texts_and_numbers_are_no_keys():
+    text = "a = '" + "x." * 40 + "'\nb = [" + "1.5, " * 500 + "]\nc.d.e = 1"
+    assert parse_toml(text, "x.toml")["c"] == {"d": {"e": 1}}
+
+
+def archive(path, **members):
+    """A zip archive of raw bytes and arrays."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as out:
+        for name, content in members.items():
+            if isinstance(content, np.ndarray):
+                stream = io.BytesIO()
+                np.save(stream, content)
+                content = stream.getvalue()
+            out.writestr(f"{name}.npy", content)
+    return path
+
+
+def header(text):
+    """The begin of a numpy array that says what it likes."""
+    data = text.encode()
+    data += b" " * (-(len(data) + 11) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(data).to_bytes(2, "little") + data
+
+
+def test_arrays_come_back_as_numpy_reads_them(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.arange(6).reshape(2, 3)), "c": np.array("é"),
+              "d": np.zeros((0, 3), np.float32), "e": np.array(["x", "yz"]), "f": np.array(True)}  # fmt: skip
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    found = read_npz(tmp_path / "a.npz", remedy="")
+    with np.load(tmp_path / "a.npz") as known:
+        for name in arrays:
+            np.testing.assert_array_equal(found[name], known[name])
+            assert found[name].dtype == known[name].dtype and found[name].flags.writeable
+    assert set(read_npz(tmp_path / "a.npz", "a", "none", remedy="")) == {"a"}
+    np.save(tmp_path / "b.npy", arrays["b"])
+    np.testing.assert_array_equal(read_npy(tmp_path / "b.npy", remedy=""), arrays["b"])
+    assert npy_header(tmp_path / "b.npy") == ((2, 3), np.dtype(int))
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (header("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}"), "but there are 128 bytes"),
+        (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"), "but there are"),
+        (header("{'descr': '<U0', 'fortran_order': False, 'shape': (9999999999,)}"), "but there are"),
+        (header("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "not of numbers or texts"),
+        (header("{'descr': '<U1', 'fortran_order': False, 'shape': (1,)}") + b"\xff" * 4, "characters that there"),
+        (header("(" * 5000), "damaged"), (b"no array", "damaged"), (b"", "damaged"),
+    ],
+)  # fmt: skip
+def test_a_member_that_is_no_array_is_told(tmp_path, content, told):
+    with pytest.raises(BodyError, match=f"(?s)a.npz.*{told}.*Copy it"):
+        read_npz(archive(tmp_path / "a.npz", a=content), remedy="Copy it.", error=BodyError)
+    (tmp_path / "a.npy").write_bytes(content)
+    with pytest.raises(FileError, match=r"a\.npy.*Copy it"):
+        read_npy(tmp_path / "a.npy", remedy="Copy it.")
+
+
+def test_an_archive_that_unpacks_to_very_much_is_not_unpacked(tmp_path):
+    path = archive(tmp_path / "a.npz", a=np.zeros(40_000_000))
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(FileError, match="320 MB, which the file is far too small for"):
+        read_npz(path, remedy="")
+    assert read_npz(archive(tmp_path / "b.npz", a=np.zeros(4_000_000)), remedy="")["a"].shape == (4_000_000,)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_an_archive_that_is_cut_is_told(tmp_path, share):
+    path = archive(tmp_path / "a.npz", a=np.random.default_rng(0).random(1000))
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(FileError, match="damaged"):
+        read_npz(path, remedy="")
+
+
+def test_flipped_bytes_of_packed_data_are_told(tmp_path):
+    path = archive(tmp_path / "a.npz", a=np.random.default_rng(0).random(1000))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(bytes(data))
+    with pytest.raises(FileError, match="damaged"):
+        read_npz(path, remedy="")
