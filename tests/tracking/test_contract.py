@@ -209,5 +209,7 @@ def test_sensors_that_contradict_each_other_are_told():
 
 @pytest.mark.parametrize("mix", ["keypoints", "markers alone", "everything"])
 def test_a_smoothed_motion_is_surer_than_a_filtered_one(mix):
-    smoothed, filtered = (np.median(tracked(mix, smooth).dof_std) for smooth in (True, False))
-    assert smoothed < filtered
+    """Most of its coordinates: what lasts of a depth camera's errors is known to smoothing alone, and adds to some."""
+    smoothed, filtered = (np.median(tracked(mix, smooth).dof_std, axis=0) for smooth in (True, False))
+    assert np.median(smoothed / filtered) < 1.0
+    assert np.median(smoothed[:3] / filtered[:3]) < 1.1

@@ -80,8 +80,8 @@ def of_all(recording: Recording, body: Body, *, size: bool, lengths: bool, surfa
     ----------
     body : as sized as it is already
     size : whether anything of the body is sought
-    lengths : whether neither points nor a few depth images have told them: nearest points of a surface of simple shapes,
-        frame after frame, are surer of lengths than they are right
+    lengths : whether neither points nor a few depth images have told them: nearest points of a surface of simple
+        shapes, frame after frame, are surer of lengths than they are right
     surfaces : whether any sensor sees them
     """
     found: list[tuple[Parameters, NDArray]] = []
