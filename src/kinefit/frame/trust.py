@@ -22,7 +22,7 @@ _MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and
 
 def observed(tree: KinematicTree, information: NDArray) -> NDArray:
     """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`."""
-    prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])
+    prior = np.concatenate([np.full(6, ANYWHERE), tree.posture_std])
     return np.asarray(np.sqrt(np.maximum(variances(information), 0.0)) <= BLIND * prior)
 
 
@@ -56,7 +56,7 @@ def holding(tree: KinematicTree, segments: NDArray) -> NDArray:
 
 def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
     """A covariance (n, n) that knows of some degrees of freedom (n,) bool no more than the prior does."""
-    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.spread, _MOST)])
+    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.posture_std, _MOST)])
     out = np.where(gone[:, None] | gone[None, :], 0.0, covariance)
     out[gone, gone] = prior[gone] ** 2
     return out

@@ -25,7 +25,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
-from kinefit.solvers.equations import inverse, product
+from kinefit.solvers.equations import block_diagonal, inverse, product
 from kinefit.solvers.shape import ShapeParameters, shape_parameters
 from kinefit.subject.keypoints import Subject
 
@@ -127,7 +127,7 @@ def lasting(
     Jq = J[:, :, :n].reshape(-1, n)
     each = np.repeat(weight, 2)
     H = product((Jq * each[:, None]).T, J.reshape(len(each), J.shape[2]))
-    prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
+    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
     alone[free, free] = inverse((H[:, :n] + other_information + prior)[free, free])

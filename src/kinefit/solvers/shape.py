@@ -16,6 +16,7 @@ from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss, geman_mcclure
 from kinefit.solvers import _kernels, _kernels_linear, _kernels_shape
+from kinefit.solvers.equations import dense_pattern
 
 _MIDDLE = 0.002  # [m] spread of a point in the middle to either side
 PROPORTIONS = 0.05
@@ -262,7 +263,8 @@ def fit_shape(
     model = shape_parameters(body, frames.points, np.asarray(scales, float), scale_sigma, shift_sigma, whole=whole)
     if lengths is not None:
         model = model.with_lengths(*lengths)
-    posture = _POSTURE * np.square(1.0 / tree.spread)
+    posture = _POSTURE * tree.posture_precision
+    chain, depth = dense_pattern(n) if tree.coupled else (tree.chain, tree.depth)
     p, groups = len(model.mean), len(body.scale_groups)
     owner, cameras = frames.points.segments, rig.packed
 
@@ -272,7 +274,7 @@ def fit_shape(
         total = float(bent @ model.prior @ bent)
         for f, state in enumerate(states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += float(posture @ np.square(state.angles - tree.usual)) + _kernels_shape.frame_cost(
+            total += tree.posture_cost(state.angles, _POSTURE) + _kernels_shape.frame_cost(
                 owner, rest, cameras, frames.camera, frames.column, frames.uv[f], frames.weight[f],
                 frames.shares, placed, loss.kind, loss.scale,
             )  # fmt: skip
@@ -283,8 +285,8 @@ def fit_shape(
             theta, state, rig, frames.camera, frames.column, frames.uv[f], frames.weight[f], loss=loss,
             share=frames.shares,
         )
-        H[range(6, n), range(6, n)] += posture
-        g[6:n] -= posture * (state.angles - tree.usual)
+        H[6:n, 6:n] += posture
+        g[6:n] -= posture @ (state.angles - tree.usual)
         if not tree.root_free:
             H[:6], H[:, :6], g[:6] = 0.0, 0.0, 0.0
             H[range(6), range(6)] = 1.0
@@ -296,7 +298,7 @@ def fit_shape(
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-            if not _kernels_linear.eliminate(H, g, n, damping, tree.chain, tree.depth, S, b, kept[f]):
+            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, kept[f]):
                 kept[f] = 0.0
         S = np.tril(S) + np.tril(S, -1).T
         S += damping * np.diag(np.diag(S))
@@ -324,7 +326,7 @@ def fit_shape(
     for f, state in enumerate(states):
         H, g = system(theta, state, f)
         information += H[n:, n:]
-        _kernels_linear.eliminate(H, g, n, 1e-9, tree.chain, tree.depth, information, np.zeros(p), np.empty((p + 1, n)))
+        _kernels_linear.eliminate(H, g, n, 1e-9, chain, depth, information, np.zeros(p), np.empty((p + 1, n)))
     information += np.tril(information, -1).T - np.triu(information, 1)
     return Shape(
         theta[:groups].copy(), model.geometry(theta)[2], tuple(states), cost, model, theta, information,
