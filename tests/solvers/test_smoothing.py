@@ -271,3 +271,22 @@ def test_equations_that_are_not_finite_are_refused():
     roots, angles = np.tile(np.eye(4), (5, 1, 1)), np.tile(TREE.usual, (5, 1))
     with pytest.raises(ObservationError, match="cannot be smoothed"):
         smooth(BODY, roots, angles, seen.equations(BODY), prior())
+
+
+def test_angles_that_nothing_observes_have_the_posture_priors_covariance():
+    """Coupled ones too: in the middle of a long take their joint covariance is the inverse of the prior's precision."""
+    p = MotionPrior(
+        np.where(np.arange(N) < 6, 3.0, 40.0), (0.2, 0.5), 1 / 10, TREE.usual, TREE.spread, couplings=TREE.couplings
+    )
+    T = 80
+    roots, angles = np.tile(np.eye(4), (T, 1, 1)), np.tile(TREE.usual, (T, 1))
+    weight = np.zeros((T, N))
+    weight[:, :6] = 1.0
+    V = posterior(BODY, smooth(BODY, roots, angles, held(weight), p)).frames[T // 2, 6:, 6:]
+    expected = np.linalg.inv(TREE.posture_precision)
+    own = [TREE.coordinate(name) for name in ("lumbar_extension", "thorax_extension", "hip_flexion_r", "knee_angle_l")]
+    deviation = TREE.posture_std[own]
+    np.testing.assert_allclose(
+        V[np.ix_(own, own)] / deviation / deviation[:, None],
+        expected[np.ix_(own, own)] / deviation / deviation[:, None], atol=0.03,
+    )  # fmt: skip

@@ -68,7 +68,8 @@ class KinematicTree:
         for name in ("offsets", "axes", "lower", "upper", "usual", "spread"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         object.__setattr__(self, "axes", _frozen(self.axes.reshape(-1, 3)))
-        object.__setattr__(self, "couplings", _frozen(np.reshape(self.couplings, (-1, len(self.coordinates)))))
+        lines = (len(self.couplings), len(self.coordinates))
+        object.__setattr__(self, "couplings", _frozen(np.reshape(self.couplings, lines)))
         if np.any(np.diff(self.owners) < 0) or np.any(self.parents[1:] >= np.arange(1, len(self.parents))):
             raise BodyError("segments of a tree are not in order", remedy="Put parents before their children.")
         middle = [d.start + 1 for d in self.ball_joints]
