@@ -112,6 +112,7 @@ def test_a_joint_that_hardly_moves_a_point_is_not_seen_by_it():
 def test_information_observes_what_it_makes_narrower_than_the_prior():
     spread = np.concatenate([np.full(6, 1.0), TREE.spread])
     information = np.diag(1.0 / np.square(spread))
+    information[6:, 6:] += TREE.couplings.T @ TREE.couplings
     knee = 6 + TREE.coordinate("knee_angle_r")
     information[knee, knee] *= 1.2
     assert np.flatnonzero(observed(TREE, information)).tolist() == [knee]
@@ -127,7 +128,7 @@ def test_degrees_of_freedom_of_a_lost_segment():
     gone = holding(TREE, lost)
     covariance = forgotten(TREE, np.full((TREE.n_dofs,) * 2, 0.01), gone)
     assert not covariance[np.ix_(gone, ~gone)].any() and (covariance[np.ix_(~gone, ~gone)] == 0.01).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.spread[gone[6:]])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.posture_std[gone[6:]])
 
 
 def test_rows_of_segments_that_are_left_out_weigh_nothing():

@@ -21,9 +21,13 @@ _MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and
 
 
 def observed(tree: KinematicTree, information: NDArray) -> NDArray:
-    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`."""
-    prior = np.concatenate([np.full(6, ANYWHERE), tree.posture_std])
-    return np.asarray(np.sqrt(np.maximum(variances(information), 0.0)) <= BLIND * prior)
+    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`.
+
+    By itself, not through what the prior couples with them.
+    """
+    prior, alone = np.concatenate([np.full(6, ANYWHERE), tree.spread]), np.array(information)
+    alone[6:, 6:] -= tree.couplings.T @ tree.couplings
+    return np.asarray(np.sqrt(np.maximum(variances(alone), 0.0)) <= BLIND * prior)
 
 
 def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:

@@ -21,7 +21,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise, known_sigma
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.process_noise import INLIER
-from kinefit.solvers.equations import block_diagonal, inverse, normal_equations
+from kinefit.solvers.equations import inverse, normal_equations
 
 
 class Follows(Protocol):
@@ -109,11 +109,11 @@ class FrameCosts:
         pixels = [m for m in frame.points if isinstance(m, KeypointMatched)]
         others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
         told = np.zeros(len(tree.coordinates), bool)
-        H = block_diagonal(np.eye(6), tree.posture_precision)
+        H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         for several, far in ((others, False), (pixels, True)):
             if several:
                 H = H + normal_equations(self.body, scene.state, self._rows(several, scene, frame.points)).matrix
-                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.posture_std
+                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
                 told |= seen & self._far(pixels, scene) if far else seen
         return told
 

@@ -23,7 +23,7 @@ from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.equations import block_diagonal, inverse
+from kinefit.solvers.equations import inverse
 
 _PARTS = 3  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
@@ -147,7 +147,7 @@ def _take(
 def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
     """Coordinates (F, D) that each frame observes: by all sensors, by all but keypoints; rows of the latter (F,)."""
     tree, (T, D) = take.body.tree, take.angles.shape
-    prior = block_diagonal(np.eye(6), tree.posture_precision)
+    prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
     more, rows = np.zeros_like(prior), np.zeros(T)
     out = [np.zeros((T, D), bool), np.zeros((T, D), bool)]
     for f in range(T):
@@ -163,7 +163,7 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
         for which, H in enumerate((pixels + more, more)):
             if which == 0 or others is not None:
                 std = np.sqrt(np.maximum(np.diag(inverse(H + prior)), 0.0))[6:]
-                out[which][f] = std <= BLIND * tree.posture_std
+                out[which][f] = std <= BLIND * tree.spread
     return out, rows
 
 
