@@ -103,17 +103,20 @@ def run() -> None:
     for marked, group in ((False, "motions"), (True, "markers")):
         there = any(t.marked == marked for t in known.values())
         for what in ANGLES:
-            old, new = ((over_people(r, known, marked, what) if there else (np.nan,) * 3) for r in (before, after))
+            was, now = ((over_people(r, known, marked, what) if there else (np.nan,) * 3) for r in (before, after))
             tag = f"posture_{what.replace(' ', '_')}_{group}"
-            print(f"# {group}, {what}: error {old[0]:.1f} deg, now {new[0]:.1f}; standard deviation {old[1]:.1f}, "
-                  f"now {new[1]:.1f}; coverage {old[2]:.0f} %, now {new[2]:.0f} %", flush=True)  # fmt: skip
+            print(f"# {group}, {what}: error {was[0]:.1f} deg, now {now[0]:.1f}; standard deviation {was[1]:.1f}, "
+                  f"now {now[1]:.1f}; coverage {was[2]:.0f} %, now {now[2]:.0f} %", flush=True)  # fmt: skip
             if what == "knee angle":
                 continue
-            figure(f"{tag}_error", new[0] / old[0], "of before", "<= 0.5", absent)
+            figure(f"{tag}_error", now[0] / was[0], "of before", "<= 0.5", absent)
             if what == "hip flexion":
-                figure(f"{tag}_sigma", new[1], "deg", "<= 8", absent)
-                figure(f"{tag}_coverage_lowest", new[2], "%", ">= 90", absent)
-                figure(f"{tag}_coverage_highest", new[2], "%", "<= 98", absent)
-        tilts = [np.mean([np.abs(r[n].tilt).mean() for n, t in known.items() if t.marked == marked] or [np.nan])
-                 for r in (before, after)]  # fmt: skip
-        print(f"# {group}, pelvic tilt: mean error {tilts[0]:.1f} deg, now {tilts[1]:.1f} deg", flush=True)
+                figure(f"{tag}_sigma", now[1], "deg", "<= 8", absent)
+                figure(f"{tag}_coverage_lowest", now[2], "%", ">= 90", absent)
+                figure(f"{tag}_coverage_highest", now[2], "%", "<= 98", absent)
+        for told_as, of in (("", np.zeros_like), (" less a constant of the take", lambda e: np.full_like(e, e.mean()))):
+            tilts = [[np.abs(t.tilt - of(t.tilt)).mean() for n, t in r.items() if known[n].marked == marked]
+                     for r in (before, after)]  # fmt: skip
+            if there:
+                old, new = (float(np.mean(t)) for t in tilts)
+                print(f"# {group}, error of pelvic tilt{told_as}: {old:.1f} deg, now {new:.1f} deg", flush=True)
