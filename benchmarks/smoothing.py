@@ -27,8 +27,9 @@ from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.losses import geman_mcclure
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.solvers.motion_prior import MotionPrior
 from kinefit.solvers.seen_points import SeenPoints
-from kinefit.solvers.smoothing import MotionPrior, smooth
+from kinefit.solvers.smoothing import smooth
 
 JOINTS = {"Hip": "thigh", "Knee": "shank", "Ankle": "foot", "Shoulder": "upperarm", "Elbow": "forearm", "Wrist": "hand"}
 RIVAL = "rival_results/pose2sim_0.10.49_openpose_refined.trc"
@@ -116,7 +117,7 @@ def speed(frames: int = amount(500, 100)) -> None:
     camera = np.repeat(np.arange(times), len(points))
     seen = SeenPoints(rig, every, camera, uv, np.full(uv.shape[:2], 1.0 / 9.0), geman_mcclure())
     acceleration = np.where(np.arange(tree.n_dofs) < 3, 5.0, 30.0)
-    prior = MotionPrior(acceleration, (0.2, 1.0), 1.0 / truth.rate, tree.usual, tree.spread)
+    prior = MotionPrior(acceleration, (0.2, 1.0), 1.0 / truth.rate, tree.usual, tree.spread, couplings=tree.couplings)
     start = np.clip(truth.angles + 0.03 * random.normal(size=truth.angles.shape), tree.lower, tree.upper)
     spent = []
     for _ in range(amount(30, 3)):

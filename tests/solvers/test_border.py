@@ -120,7 +120,7 @@ def test_rows_of_every_kind_have_their_columns():
     J, r = columns(joint, pose), residuals(joint)
     assert np.allclose(J.T @ J, np.einsum("ai,ab,bj->ij", np.eye(n)[joint.index], W, np.eye(n)[joint.index]))
     assert np.allclose(J.T @ r, np.eye(n)[joint.index].T @ W @ joint.residual)
-    prior = prior_rows(HUMANOID, state)
+    prior = prior_rows(HUMANOID, state, sigma=HUMANOID.tree.spread)
     assert np.allclose(columns(prior, pose).sum(0)[prior.index], np.sqrt(prior.weight))
     hands = HUMANOID.landmarks.select(("r_wrist", "l_wrist"))
     step = 1e-6 * random.normal(size=n)

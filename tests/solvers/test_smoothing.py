@@ -12,9 +12,10 @@ from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers import _kernels_band
-from kinefit.solvers.equations import dense_pattern
+from kinefit.solvers.equations import block_diagonal, dense_pattern
+from kinefit.solvers.motion_prior import MotionPrior
 from kinefit.solvers.seen_points import SeenPoints
-from kinefit.solvers.smoothing import MotionPrior, Smoothed, _system, _workspace, blocks, posterior, smooth
+from kinefit.solvers.smoothing import Smoothed, _system, _workspace, blocks, posterior, smooth
 
 BODY = load_body("humanoid")
 TREE, N = BODY.tree, BODY.tree.n_dofs
@@ -130,14 +131,14 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T, pattern
     expected = np.linalg.solve(H + 0.3 * np.eye(T * N), b.ravel()).reshape(T, N)
     np.testing.assert_allclose(x[:, :N], expected, atol=1e-11)
 
-    share = np.tile(np.concatenate([np.zeros(6), p.posture_share - 1.0 / TREE.spread**2]), T)
-    V = np.linalg.inv(H + np.diag(share)).reshape(T, N, T, N)
+    share = np.kron(np.eye(T), block_diagonal(np.zeros((6, 6)), p.posture_share - p.precision))
+    V = np.linalg.inv(H + share).reshape(T, N, T, N)
     found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, pattern))
     for t in range(T):
         np.testing.assert_allclose(found.frames[t], V[t, :, t], atol=1e-9)
         if t + 1 < T:
             np.testing.assert_allclose(found.following[t], V[t + 1, :, t], atol=1e-9)
-    assert np.isclose(found.log_determinant, np.linalg.slogdet(H + np.diag(share))[1])
+    assert np.isclose(found.log_determinant, np.linalg.slogdet(H + share)[1])
     past, _ = p.rows(max(T - 1, 0))
     for s in range(T - 1):
         c = np.zeros(T)
@@ -270,3 +271,22 @@ def test_equations_that_are_not_finite_are_refused():
     roots, angles = np.tile(np.eye(4), (5, 1, 1)), np.tile(TREE.usual, (5, 1))
     with pytest.raises(ObservationError, match="cannot be smoothed"):
         smooth(BODY, roots, angles, seen.equations(BODY), prior())
+
+
+def test_angles_that_nothing_observes_have_the_posture_priors_covariance():
+    """Coupled ones too: in the middle of a long take their joint covariance is the inverse of the prior's precision."""
+    p = MotionPrior(
+        np.where(np.arange(N) < 6, 3.0, 40.0), (0.2, 0.5), 1 / 10, TREE.usual, TREE.spread, couplings=TREE.couplings
+    )
+    T = 80
+    roots, angles = np.tile(np.eye(4), (T, 1, 1)), np.tile(TREE.usual, (T, 1))
+    weight = np.zeros((T, N))
+    weight[:, :6] = 1.0
+    V = posterior(BODY, smooth(BODY, roots, angles, held(weight), p)).frames[T // 2, 6:, 6:]
+    expected = np.linalg.inv(TREE.posture_precision)
+    own = [TREE.coordinate(name) for name in ("lumbar_extension", "thorax_extension", "hip_flexion_r", "knee_angle_l")]
+    deviation = TREE.posture_std[own]
+    np.testing.assert_allclose(
+        V[np.ix_(own, own)] / deviation / deviation[:, None],
+        expected[np.ix_(own, own)] / deviation / deviation[:, None], atol=0.03,
+    )  # fmt: skip

@@ -12,6 +12,7 @@ import numpy as np
 
 from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.couplings import coupled
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
 from kinefit.bodies.serial import saved_body
@@ -81,7 +82,8 @@ def parse_body(text: str, source: str = "body") -> Body:
         points |= {n: p for n, p in mirrored.items() if n not in points}
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
-    landmarks, tree = _points(points, index, source), _tree(segments, index, source)
+    landmarks = _points(points, index, source)
+    tree = coupled(_tree(segments, index, source), record.coupling, source)
     return Body(
         name=record.body.name,
         tree=tree,

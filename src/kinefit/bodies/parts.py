@@ -220,6 +220,7 @@ def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> Kin
         upper=np.append(tree.upper, high),
         usual=np.append(tree.usual, usual),
         spread=np.append(tree.spread, columns["spread"]),
+        couplings=np.pad(tree.couplings, ((0, 0), (0, k))),
     )
 
 
@@ -239,6 +240,7 @@ def _shrunk(tree: KinematicTree, gone: int) -> KinematicTree:
         upper=tree.upper[own],
         usual=tree.usual[own],
         spread=tree.spread[own],
+        couplings=tree.couplings[(tree.couplings[:, ~own] == 0.0).all(axis=1)][:, own],
     )
 
 

@@ -39,6 +39,14 @@ class SegmentRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     names: dict[str, str] = {}
 
 
+class CouplingRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One `[[coupling]]`."""
+
+    name: str
+    of: dict[str, float]
+    spread: float
+
+
 class PointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A named point on a segment."""
 
@@ -67,6 +75,7 @@ class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     body: HeadRecord
     segment: list[SegmentRecord] = []
+    coupling: list[CouplingRecord] = []
     morph: list[MorphRecord] = []
     skin: SkinRecord | None = None
     landmarks: dict[str, PointRecord] = {}
@@ -78,6 +87,7 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
     """`base` with what `own` says: segments and entries of the same name are replaced, all others added."""
     mine = {s.name: s for s in own.segment}
     segments = [mine.pop(s.name, s) for s in base.segment]
+    couplings = {c.name: c for c in base.coupling + own.coupling}
     head = msgspec.structs.replace(
         own.body,
         base=None,
@@ -87,6 +97,7 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
     return FileRecord(
         body=head,
         segment=segments + list(mine.values()),
+        coupling=list(couplings.values()),
         morph=base.morph + own.morph,
         skin=own.skin or base.skin,
         landmarks=base.landmarks | own.landmarks,

@@ -9,6 +9,7 @@ radians:
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
     prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
     usual, spread (D,)                                 common posture and usual departure from it [rad] or [m]
+    couplings (C, D)                                   departures that go together [1/rad] or [1/m]; may be missing
     scale_groups (G,)  segment_scale (S,)
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
@@ -64,7 +65,7 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
     }
     out |= _surfaces_to_arrays(body.surfaces)
     out |= morphs_to_arrays(body.morphs, _surfaces_to_arrays) | skin_to_arrays(body.skin)
-    out |= {name: np.array(getattr(tree, name)) for name in _TREE}
+    out |= {name: np.array(getattr(tree, name)) for name in (*_TREE, "couplings")}
     out |= _points_to_arrays("landmarks", body.landmarks)
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
         for name, points in sets.items():
@@ -89,6 +90,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
         segments=_texts(arrays, "segments"),
         coordinates=_texts(arrays, "coordinates"),
         root_free=bool(_array(arrays, "root_free", ())),
+        couplings=_array(arrays, "couplings", (None, n_coordinates)) if "couplings" in arrays else np.empty((0, 0)),
         **{name: _array(arrays, name, shapes.get(name, (n_coordinates,))) for name in _TREE},  # type: ignore[arg-type]
     )
     _check_indices(tree.owners, n_segments, "owners")

@@ -7,7 +7,7 @@ The degrees of freedom of a body are the root's twist (v, ω) in the world about
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,6 +42,9 @@ class KinematicTree:
     usual, spread : (D,) [rad] or [m]
         A common posture and one standard deviation of departures from it: where a fit starts, and what decides where
         measurements leave something open; spread inf for no prior.
+    couplings : (C, D) [1/rad] or [1/m]
+        Departures from the usual posture that go together: each line's sum c · (angles − usual) has a standard
+        deviation of one. Not of the middle axis of a ball joint, which turns the other way in the joint's other chart.
     root_free : bool, False for a body whose root stays where it is put.
     """
 
@@ -57,6 +60,7 @@ class KinematicTree:
     usual: NDArray
     spread: NDArray
     root_free: bool = True
+    couplings: NDArray = field(default_factory=lambda: np.empty((0, 0)))
 
     def __post_init__(self) -> None:
         for name, dtype in (("parents", np.int64), ("owners", np.int64), ("prismatic", bool)):
@@ -64,13 +68,43 @@ class KinematicTree:
         for name in ("offsets", "axes", "lower", "upper", "usual", "spread"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         object.__setattr__(self, "axes", _frozen(self.axes.reshape(-1, 3)))
+        lines = (len(self.couplings), len(self.coordinates))
+        object.__setattr__(self, "couplings", _frozen(np.reshape(self.couplings, lines)))
         if np.any(np.diff(self.owners) < 0) or np.any(self.parents[1:] >= np.arange(1, len(self.parents))):
             raise BodyError("segments of a tree are not in order", remedy="Put parents before their children.")
+        middle = [d.start + 1 for d in self.ball_joints]
+        for d in np.flatnonzero((self.couplings != 0.0).any(axis=0)):
+            if d in middle or not np.isfinite(self.spread[d]):
+                why = "the middle axis of a ball joint" if d in middle else "without a spread of its own"
+                problem = f"a coupling of {self.coordinates[d]}, {why}"
+                raise BodyError(problem, remedy="Couple other coordinates, with a finite spread.")
 
     @property
     def n_dofs(self) -> int:
         """Degrees of freedom: six of the root and one for each coordinate."""
         return 6 + len(self.coordinates)
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the posture prior couples coordinates."""
+        return len(self.couplings) > 0
+
+    @cached_property
+    def posture_precision(self) -> NDArray:
+        """(D, D) inverse covariance of the posture prior, a Gaussian about `usual`; zero where there is no prior."""
+        return _frozen(np.diag(np.square(1.0 / self.spread)) + self.couplings.T @ self.couplings)
+
+    def posture_cost(self, angles: NDArray, share: float = 1.0) -> float:
+        """A share of the posture prior's cost of angles (D,)."""
+        away = angles - self.usual
+        return share * float(away @ self.posture_precision @ away)
+
+    @cached_property
+    def posture_std(self) -> NDArray:
+        """(D,) [rad] or [m] standard deviation of each coordinate by the posture prior; inf where there is none."""
+        out, held = np.array(self.spread), np.flatnonzero((self.couplings != 0.0).any(axis=0))
+        out[held] = np.sqrt(np.diag(np.linalg.inv(self.posture_precision[np.ix_(held, held)])))
+        return _frozen(out)
 
     @cached_property
     def dof_start(self) -> NDArray:

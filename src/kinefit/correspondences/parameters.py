@@ -28,20 +28,21 @@ def limit_rows(body: Body, state: BodyState, *, sigma: float = 0.02) -> Paramete
 def prior_rows(
     body: Body, state: BodyState, *, mean: ArrayLike | None = None, sigma: ArrayLike | None = None
 ) -> ParameterRows:
-    """One row for each coordinate, towards a mean posture.
+    """One row for each coordinate, towards a mean posture; weighed together where the body's prior couples them.
 
     Parameters
     ----------
     mean : scalar or (D,) [rad or m]
         Default: the body's usual posture.
     sigma : scalar or (D,) [rad or m]
-        Spread of the posture, inf for a coordinate without prior; default: the body's.
+        Spread of the posture, inf for a coordinate without prior; default: the body's posture prior, couplings and all.
     """
-    count = len(body.tree.coordinates)
-    w = targets.weights(body.tree.spread if sigma is None else sigma, np.ones(count, bool), "priors")
+    tree, count = body.tree, len(body.tree.coordinates)
+    w = targets.weights(tree.spread if sigma is None else sigma, np.ones(count, bool), "priors")
     held = np.flatnonzero(w > 0.0)
-    gap = np.broadcast_to(np.asarray(body.tree.usual if mean is None else mean, float), count) - state.angles
-    return ParameterRows(6 + held, gap[held], w[held])
+    gap = np.broadcast_to(np.asarray(tree.usual if mean is None else mean, float), count) - state.angles
+    joint = sigma is None and tree.coupled
+    return ParameterRows(6 + held, gap[held], tree.posture_precision[np.ix_(held, held)] if joint else w[held])
 
 
 def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma: NDArray) -> ParameterRows:

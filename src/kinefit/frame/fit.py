@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.prediction import belief
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged
 from kinefit.frame.skin import skin_of
 from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
-from kinefit.rows import AnyRows, ParameterRows, Rows
+from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.keypoints import KeypointMatched
@@ -75,8 +76,6 @@ class FrameFit:
     def __init__(self, body: Body, settings: TrackSettings) -> None:
         self.body, self.settings = body, settings
         self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
-        self._prior = 6 + np.flatnonzero(np.isfinite(body.tree.spread))
-        self._prior_weight = 1.0 / np.square(body.tree.spread[self._prior - 6])
 
     def run(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None
@@ -173,8 +172,7 @@ class FrameFit:
         parts = rows_of(scene, matched, self.settings, without=without)
         if held is not None:
             parts.append(belief(scene.state, *held))
-        usual = self.body.tree.usual
-        parts.append(ParameterRows(self._prior, (usual - scene.state.angles)[self._prior - 6], self._prior_weight))
+        parts.append(prior_rows(self.body, scene.state))
         return [*parts, *self.apart(scene)] if apart else parts
 
     def apart(self, scene: Scene) -> list[AnyRows]:
@@ -204,7 +202,7 @@ class FrameFit:
         known = seen[6:] if known is None else seen[6:] | known
         known = known | ~np.isfinite(tree.spread)
         alone = np.array(H)
-        alone[self._prior, self._prior] -= self._prior_weight * (1.0 - _TRACE)
+        alone[6:, 6:] -= (1.0 - _TRACE) * tree.posture_precision
         posterior = inverse(H)
         stated = posterior + self._of_surfaces(scene, found.matched, now, without)
         if lost is not None:

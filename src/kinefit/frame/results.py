@@ -77,7 +77,7 @@ def deviations(
         Coordinates that the data observe at all; others are unknown however small their variance is.
     """
     tree = body.tree
-    prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])
+    prior = np.concatenate([np.full(6, ANYWHERE), tree.posture_std])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     blind = std > BLIND * prior
     if observed is not None:

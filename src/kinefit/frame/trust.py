@@ -22,9 +22,13 @@ _MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and
 
 
 def observed(tree: KinematicTree, information: NDArray) -> NDArray:
-    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`."""
-    prior = np.concatenate([np.full(6, ANYWHERE), tree.spread])
-    return np.asarray(np.sqrt(np.maximum(variances(information), 0.0)) <= BLIND * prior)
+    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`.
+
+    By itself, not through what the prior couples with them.
+    """
+    prior, alone = np.concatenate([np.full(6, ANYWHERE), tree.spread]), np.array(information)
+    alone[6:, 6:] -= tree.couplings.T @ tree.couplings
+    return np.asarray(np.sqrt(np.maximum(variances(alone), 0.0)) <= BLIND * prior)
 
 
 def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
@@ -86,7 +90,7 @@ def holding(tree: KinematicTree, segments: NDArray) -> NDArray:
 
 def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
     """A covariance (n, n) that knows of some degrees of freedom (n,) bool no more than the prior does."""
-    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.spread, _MOST)])
+    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.posture_std, _MOST)])
     out = np.where(gone[:, None] | gone[None, :], 0.0, covariance)
     out[gone, gone] = prior[gone] ** 2
     return out

@@ -24,8 +24,10 @@ from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers import _kernels_smoothing
+from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.marginal import Entering, leave
-from kinefit.solvers.smoothing import Equations, MotionPrior, Smoothed, blocks, posterior, smooth
+from kinefit.solvers.motion_prior import MotionPrior
+from kinefit.solvers.smoothing import Equations, Smoothed, blocks, posterior, smooth
 
 _BEFORE = 0.3  # [s] of frames before the lag that are still linearised anew
 _TRIED = 3  # steps of a window: it begins where the last one ended
@@ -64,7 +66,9 @@ class FixedLag:
         self._memory = round(settings.smooth_memory * rate)
         memory = settings.acceleration_memory, settings.smooth_memory
         tree = self.body.tree
-        self._prior = MotionPrior(self.noise.acceleration, memory, 1.0 / rate, tree.usual, tree.spread)
+        self._prior = MotionPrior(
+            self.noise.acceleration, memory, 1.0 / rate, tree.usual, tree.spread, couplings=tree.couplings
+        )
         self._share = self._prior.posture_share
         self._costs = FrameCosts(tracker, self.noise)
         self._begin()
@@ -192,13 +196,13 @@ class FixedLag:
         roots, angles = self._states(4)
         lower, upper, usual = boxes(self.body.tree, angles)
         H, g, _ = self._costs.quadratic(self._frames, 0)
-        weight = 1.0 / np.square(self.body.tree.spread)
-        H[np.arange(6, len(H)), np.arange(6, len(H))] += weight
-        g[6:] += weight * (usual[0] - angles[0])
+        weight = self.body.tree.posture_precision
+        H[6:, 6:] += weight
+        g[6:] += weight @ (usual[0] - angles[0])
         at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
         held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
         past, strength = replace(self._prior, liveliness=self._livelier).rows(3)
-        share = np.concatenate([np.zeros(6), self._share - weight])
+        share = block_diagonal(np.zeros((6, 6)), self._share - weight)
         self._entering = leave(
             self.body, roots, angles, H, g, share, held, past, strength, blocks(self.body), self._entering
         )

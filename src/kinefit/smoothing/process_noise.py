@@ -15,8 +15,9 @@ from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.unwrap import boxes
+from kinefit.solvers.motion_prior import MotionPrior
 from kinefit.solvers.seen_points import SeenPoints
-from kinefit.solvers.smoothing import MotionPrior, Posterior, Smoothed, posterior, smooth
+from kinefit.solvers.smoothing import Posterior, Smoothed, posterior, smooth
 
 INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual is noise
 _RAYLEIGH = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ²
@@ -119,7 +120,10 @@ class SmoothTake:
         lower, upper, usual = boxes(self.body.tree, self.angles)
         never = ~self.told.any(axis=0)  # stays at the prior mean
         lower[:, never] = upper[:, never] = usual[:, never]
-        prior = MotionPrior(strength.acceleration, self.memory, self.dt, usual, self.body.tree.spread, self.live)
+        tree = self.body.tree
+        prior = MotionPrior(
+            strength.acceleration, self.memory, self.dt, usual, tree.spread, self.live, tree.couplings
+        )  # fmt: skip
         make = self.seen(strength.sigma).equations(self.body)
         dense = self.linear is not None
         if self.linear is not None:

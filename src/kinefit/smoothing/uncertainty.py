@@ -26,7 +26,7 @@ from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
-from kinefit.solvers.equations import inverse, joint_moves, product
+from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
 from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.matched_frames import point_moves
 from kinefit.subject.point_moves import PointMoves
@@ -135,7 +135,7 @@ def lasting(
     if moves is not None:
         told = moves.columns(layout.places, rows, tree, frames)
         by_shape, stretch = by_shape if told is None else told, moves.joints(tree, frames)
-    prior = np.diag(np.concatenate([np.full(6, ANYWHERE**-2), np.square(1.0 / tree.spread)]))
+    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
     alone[free, free] = inverse((product(by_pose.T, by_pose) + other_information + prior)[free, free])

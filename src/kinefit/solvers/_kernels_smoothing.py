@@ -14,7 +14,7 @@ from kinefit._jit import jit
 from kinefit.bodies._kernels import difference, forward, retract
 from kinefit.correspondences._kernels import pixel_rows, place, point_rows
 from kinefit.geometry._kernels_camera import project_jacobian
-from kinefit.solvers._kernels import add_parameters, assemble
+from kinefit.solvers._kernels import assemble
 
 
 @jit
@@ -44,14 +44,6 @@ def pixel_equations(
             data, segment, group, count, kind, scale, roots[t, :3, 3], parents, dof_start, chain, depth, screws,
             factor, blocks, C[t], g[t],
         )  # fmt: skip
-
-
-@jit
-def add_posture(angles, usual, weight, depth, C, g, cost):
-    """Pull angles (F, D) towards usual (F, D), weight (F, D)."""
-    index = np.arange(6, 6 + angles.shape[1])
-    for t in range(angles.shape[0]):
-        cost[t] += add_parameters(index, usual[t] - angles[t], weight[t], depth, C[t], g[t])
 
 
 @jit

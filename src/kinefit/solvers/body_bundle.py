@@ -24,6 +24,7 @@ from kinefit.solvers.cameras import (
     residuals,
     robust_cost,
 )
+from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.shape import PixelFrames, ShapeParameters
 
 
@@ -80,7 +81,8 @@ def fit_body_and_cameras(
     loss = loss or geman_mcclure()
     tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
     groups, size = len(model.body.scale_groups), len(rig) * COLUMNS
-    posture = POSTURE * np.square(1.0 / tree.spread)
+    posture = POSTURE * tree.posture_precision
+    chain, depth = dense_pattern(n) if tree.coupled else (tree.chain, tree.depth)
     shape_prior = model.prior
     precision, freedom = prior.precision, prior.freedom
     owner = frames.points.segments
@@ -101,7 +103,7 @@ def fit_body_and_cameras(
         total += robust_cost(residuals(rig, offsets, static, x), static.weight, loss)[0]
         for f, state in enumerate(states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += float(posture @ np.square(state.angles - tree.usual)) + _kernels_shape.frame_cost(
+            total += tree.posture_cost(state.angles, POSTURE) + _kernels_shape.frame_cost(
                 owner, rest, rig.packed, frames.camera, frames.column, target(offsets, f), frames.weight[f],
                 frames.shares, placed, loss.kind, loss.scale,
             )  # fmt: skip
@@ -116,8 +118,8 @@ def fit_body_and_cameras(
                 theta, state, rig, frames.camera, frames.column, target(offsets, f), frames.weight[f], loss=loss,
                 share=frames.shares, freedom=freedom, velocity=velocity[f],
             )
-            H[range(6, n), range(6, n)] += posture
-            g[6:n] -= posture * (state.angles - tree.usual)
+            H[6:n, 6:n] += posture
+            g[6:n] -= posture @ (state.angles - tree.usual)
             if not tree.root_free:
                 H[:6], H[:, :6], g[:6] = 0.0, 0.0, 0.0
                 H[range(6), range(6)] = 1.0
@@ -135,7 +137,7 @@ def fit_body_and_cameras(
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-            if not _kernels_linear.eliminate(H, g, n, damping, tree.chain, tree.depth, S, b, kept[f]):
+            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, kept[f]):
                 kept[f] = 0.0
         return np.tril(S) + np.tril(S, -1).T, b, kept, points
 

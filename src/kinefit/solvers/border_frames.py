@@ -109,8 +109,8 @@ def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, wei
     body = problem.body(theta)
     tree, n = body.tree, body.tree.n_dofs
     parts, pose = problem.parts(theta, frame, state), Pose.of(body, state)
-    pull = weighing.most * weighing.posture / np.square(tree.spread)
-    away, factors, cost = state.angles - tree.usual, [np.empty(0)], 0.0
+    posture, factors, cost = weighing.most * weighing.posture, [np.empty(0)], 0.0
+    pull = posture * tree.posture_precision
     for sensor, rows in parts:
         share = weighing.shares.get(sensor, 1.0)
         soft, own = softening(rows, weighing.loss)
@@ -120,11 +120,11 @@ def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, wei
     J = factor[:, None] * np.concatenate([*(columns(r, pose) for _, r in parts), np.empty((0, n))])
     left = factor * _stacked(parts)
     H, g, held = gram(J, J), left @ J, lock(body, None)
-    H[range(6, n), range(6, n)] += pull
-    g[6:] -= pull * away
+    H[6:, 6:] += pull
+    g[6:] -= pull @ (state.angles - tree.usual)
     held[6:] |= (state.angles <= tree.lower) & (g[6:] < 0.0)
     held[6:] |= (state.angles >= tree.upper) & (g[6:] > 0.0)
-    return Frame(parts, factor, J, left, H, g, held, cost + float(pull @ np.square(away)))
+    return Frame(parts, factor, J, left, H, g, held, cost + tree.posture_cost(state.angles, posture))
 
 
 def settle(

@@ -138,6 +138,14 @@ def dense_pattern(n: int) -> tuple[NDArray, NDArray]:
     return chain, depth
 
 
+def block_diagonal(first: NDArray, second: NDArray) -> NDArray:
+    """Two square matrices as the blocks of a larger one, zeros elsewhere."""
+    n = len(first)
+    out = np.zeros((n + len(second),) * 2)
+    out[:n, :n], out[n:, n:] = first, second
+    return out
+
+
 def inverse(matrix: NDArray) -> NDArray:
     """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
     out = np.empty_like(matrix)

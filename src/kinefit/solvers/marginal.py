@@ -71,7 +71,7 @@ def leave(
     ----------
     roots, angles : (4, 4, 4), (4, D)
     H, g : (n, n), (n,) of all that the first frame measured, posture prior included
-    posture : (n,) what the posture prior's weight in a covariance is more than in the fit
+    posture : (n, n) what the posture prior's weight in a covariance is more than in the fit
     held : (n,) bool, degrees of freedom of the first frame that stand at a limit
     past, weight : (3, 2), (3, n) of the three steps between them, see `MotionPrior.rows`
     blocks : of the prior's blocks, see `solvers.smoothing.blocks`
@@ -95,7 +95,7 @@ def leave(
     A_covariance = np.array(A)
     if entering is not None:
         A_covariance[:3, :, :3] += (entering.H_covariance - entering.H).reshape(3, n, 3, n)
-    A_covariance[0, np.arange(n), 0, np.arange(n)] += posture
+    A_covariance[0, :, 0] += posture
     A[0, held], b[0, held] = 0.0, 0.0
     A[:, :, 0, held] = 0.0
     A[0, held, 0, held] = 1.0

@@ -21,85 +21,12 @@ from kinefit.solvers import _kernels_band, _kernels_smoothing
 from kinefit.solvers._kernels_linear import adapt
 from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.marginal import Entering, start_of
+from kinefit.solvers.motion_prior import MotionPrior
 
 _NEVER = 1e12  # of damping, beyond which no step is small enough
 
 Equations = tuple[NDArray, NDArray, NDArray]
 MakeEquations = Callable[[NDArray, NDArray], Equations]
-
-
-@dataclass(frozen=True, eq=False)
-class MotionPrior:
-    """How a body moves when nobody looks.
-
-    Parameters
-    ----------
-    acceleration : (n,) [m/s², rad/s²] one standard deviation, of every degree of freedom.
-    memory : (float, float) [s] in which an acceleration and a velocity forget themselves by 1/e.
-    dt : float [s] between frames.
-    usual : (T, D) or (D,) [rad or m] posture, in the chart of the angles.
-    spread : (D,) [rad or m]
-        Standard deviation of an angle that nothing observes, about the usual one.
-    liveliness : (T, n), optional
-        How much more than `acceleration` it is at times: a factor for every r_s, the last one for none.
-    """
-
-    acceleration: NDArray
-    memory: tuple[float, float]
-    dt: float
-    usual: NDArray
-    spread: NDArray
-    liveliness: NDArray | None = None
-
-    @property
-    def keep(self) -> tuple[float, float]:
-        """λ and κ, shares of an acceleration and of a velocity that are left one frame later."""
-        fast, slow = np.exp(-self.dt / np.array(self.memory))
-        return float(fast), float(slow)
-
-    @property
-    def weight(self) -> NDArray:
-        """(n,) inverse variance of r, 1/(a² Δt⁴ (1 − λ²))."""
-        return 1.0 / (np.square(self.acceleration * self.dt**2) * (1.0 - self.keep[0] ** 2))
-
-    def rows(self, count: int) -> tuple[NDArray, NDArray]:
-        """What r_s takes from v_{s−1} and v_{s−2}, (count, 2), and weights (count, n).
-
-        The first two steps have no past; they are as likely as any two of a motion that goes on for ever.
-        """
-        fast, slow = self.keep
-        past = np.tile([fast + slow, -fast * slow], (count, 1))
-        weight = np.tile(self.weight, (count, 1))
-        if self.liveliness is not None:
-            weight /= np.square(self.liveliness[:count])
-        past[:1], past[1:2] = 0.0, [(fast + slow) / (1 + fast * slow), 0.0]
-        weight[:1] *= (1 - fast * slow) * ((1 + fast * slow) ** 2 - (fast + slow) ** 2) / (1 + fast * slow)
-        weight[1:2] *= 1 - (fast * slow) ** 2
-        return past, weight
-
-    @property
-    def posture_share(self) -> NDArray:
-        """(D,) weight that the usual posture has in each frame of a covariance.
-
-        In the fit it weighs 1/spread² in every frame, as much against the pixels as in the fit of a single frame: both
-        err the same way in frame after frame. But a posture is not drawn anew in every frame. Here its weight is such
-        that an angle that nothing observes has the variance spread² in the middle of a long take,
-        spread² = ∫₀^π dθ/π / (w + weight |(1 − z)(1 − κ z)(1 − λ z)|²) with z = e^{iθ}.
-        """
-        lowest = 1e-6
-        theta = np.geomspace(lowest, np.pi, 2000)
-        z = np.exp(1j * theta)
-        prior = self.weight[6:, None] * np.abs((1 - z) * (1 - self.keep[0] * z) * (1 - self.keep[1] * z)) ** 2
-        low, high = np.full(len(self.spread), -40.0), np.full(len(self.spread), 40.0)  # of log w
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            w = np.exp(middle)
-            density = 1.0 / (w[:, None] + prior)
-            whole = 0.5 * (density[:, 1:] + density[:, :-1]) @ np.diff(theta)  # trapezoidal rule
-            variance = (whole + lowest * density[:, 0]) / np.pi
-            wide = variance > self.spread**2
-            low, high = np.where(wide, middle, low), np.where(wide, high, middle)
-        return np.where(np.isfinite(self.spread), np.exp(0.5 * (low + high)), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +116,7 @@ def smooth(
     bounds : (T, D) lower and upper ends of every angle.
     dense : bool
         The equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower triangle
-        is read.
+        is read. So it is, made dense here, where the prior's posture is coupled.
     entering : Entering
         What frames before these tell of the first three, of three or more; the first two steps then have their past.
     tolerance : stop when the predicted fall of the cost is below this share of it.
@@ -200,6 +127,8 @@ def smooth(
         The equations are not finite.
     """
     tree, first, width = body.tree, *blocks(body)
+    if prior.coupled and not dense:
+        equations, dense = _made_dense(body, equations), True
     chain, depth = pattern = dense_pattern(tree.n_dofs) if dense else (tree.chain, tree.depth)
     lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
     roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
@@ -241,6 +170,16 @@ def smooth(
     return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
 
 
+def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
+    def dense(roots: NDArray, angles: NDArray) -> Equations:
+        packed, g, cost = equations(roots, angles)
+        C = np.zeros((*g.shape, g.shape[1]))
+        _kernels_smoothing.add_packed(packed, body.tree.chain, body.tree.depth, C)
+        return C, g, cost
+
+    return dense
+
+
 def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
     p = 4 * -(-n // 4)
     return np.empty((T, p, p)), np.empty((T, 3 * p, p)), np.zeros((T, p))
@@ -257,9 +196,11 @@ def _system(
 ) -> _System:
     T, n = len(roots), body.tree.n_dofs
     C, g, cost = equations(roots, angles)
-    usual = np.ascontiguousarray(np.broadcast_to(prior.usual, angles.shape))
-    weight = np.ascontiguousarray(np.broadcast_to(1.0 / np.square(prior.spread), angles.shape))
-    _kernels_smoothing.add_posture(angles, usual, weight, depth, C, g, cost)
+    precision, away = prior.precision, prior.usual - angles
+    pull = away @ precision
+    _add_posture(C, precision, depth)
+    g[:, 6:] += pull
+    cost = cost + np.sum(pull * away, axis=1)
     steps, band = np.empty((max(T - 1, 0), n)), np.zeros((4, T, n, 3))
     _kernels_smoothing.velocities(roots, angles, steps)
     past, weight = prior.rows(len(steps))
@@ -277,13 +218,13 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
     """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
 
     Limits are left out, as they are of a frame's covariance. Frames before `since` are left out: they stand as NaN.
-    `share` (D,) is the prior's `posture_share`, where it is known already.
+    `share` (D, D) is the prior's `posture_share`, where it is known already.
     """
     s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
     T, n = s.g.shape
     C = s.C.copy()
     share = prior.posture_share if share is None else share
-    C[:, np.arange(6, n), depth[6:]] += share - 1.0 / np.square(prior.spread)
+    _add_posture(C, share - prior.precision, depth)
     W, below, nothing = _workspace(T, n)
     p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), depth].mean())
     start = start_of(s.entering, n, p, covariance=True)
@@ -310,6 +251,15 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
             if change < T - 1:
                 variance[change] = _variance_of(past[change], min(change, 2), alone)
     return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
+
+
+def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
+    """Add a weight (D, D) of angles to every block of C, as far as the pattern goes: dense where it is coupled."""
+    n = len(depth)
+    if C.shape[2] == n:
+        C[:, 6:, 6:] += weight
+    else:
+        C[:, np.arange(6, n), depth[6:]] += np.diag(weight)
 
 
 def _variance_of(past: NDArray, back: int, alone: NDArray) -> NDArray:

@@ -15,7 +15,14 @@ from kinefit.errors import ExportError
 from kinefit.exporters.report.angles import _band, _root_turns, curves, thinned
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
-from kinefit.exporters.report.moments import doubtful_moments, frame_residuals, listed, never_observed, stretches
+from kinefit.exporters.report.moments import (
+    doubtful_moments,
+    frame_residuals,
+    listed,
+    never_observed,
+    shared_by_prior,
+    stretches,
+)
 from kinefit.exporters.report.pictures import close_up, report_frames
 from kinefit.exporters.report.report import trust_sentence, write_report
 from kinefit.geometry import se3
@@ -159,6 +166,21 @@ def test_coordinates_without_any_measurement_are_named():
     std[:, 6 + motion.body.tree.coordinate("wrist_dev_l")] = np.inf
     std[:10, 6 + motion.body.tree.coordinate("knee_angle_l")] = np.inf
     assert never_observed(replace(motion, dof_std=std)) == ("wrist_dev_l",)
+
+
+def test_angles_that_share_a_bend_by_the_prior_are_named_and_why(tmp_path):
+    motion = good_motion()
+    std, tree = np.array(motion.dof_std), motion.body.tree
+    shared = ("lumbar_extension", "thorax_extension", "hip_flexion_r", "hip_flexion_l")
+    std[:, [6 + tree.coordinate(name) for name in shared]] = np.radians(8.0)
+    std[:10, 6 + tree.coordinate("thorax_extension")] = np.inf
+    unsure = replace(motion, dof_std=std)
+    assert {name: round(v, 6) for name, v in shared_by_prior(unsure).items()} == dict.fromkeys(shared, 8.0)
+    page = write_report(unsure, tmp_path / "report.html", date="2026-01-01").read_text(encoding="utf-8")
+    assert "Shared by the prior posture" in page and "hip_flexion_r (±8°)" in page
+    std[:, 6 + tree.coordinate("hip_flexion_l")] = np.radians(1.0)  # markers on the pelvis tell how the hips turn
+    assert shared_by_prior(replace(motion, dof_std=std)) == {}
+    assert "Shared by the prior" not in write_report(motion, tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 def test_stretches_and_lists():
@@ -326,7 +348,7 @@ def test_a_motion_without_frames_is_refused_and_nothing_is_left(tmp_path):
     with pytest.raises(ExportError, match="without frames"):
         write_report(empty, tmp_path / "report.html")
     assert not list(tmp_path.iterdir())
-    assert report_frames(empty) == {} and never_observed(empty) == ()
+    assert report_frames(empty) == {} and never_observed(empty) == () and shared_by_prior(empty) == {}
 
 
 @pytest.mark.slow

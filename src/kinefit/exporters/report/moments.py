@@ -101,6 +101,22 @@ def never_observed(motion: Motion) -> tuple[str, ...]:
     return tuple(name for name, is_blind in zip(motion.body.dof_names, blind) if is_blind)
 
 
+def shared_by_prior(motion: Motion) -> dict[str, float]:
+    """Coupled coordinates whose share of a bend the posture prior tells, with their median standard deviation [deg].
+
+    Those of a coupling are told where none of them is known to 5 degrees, beyond which errors may mislead a clinician
+    (McGinley et al. 2009, Gait & Posture 29:360).
+    """
+    tree, out = motion.body.tree, dict[str, float]()
+    for line in tree.couplings:
+        own = np.flatnonzero(line)
+        std = [s[np.isfinite(s)] for s in np.degrees(motion.dof_std[:, 6 + own]).T]
+        middle = [float(np.median(s)) if len(s) else 0.0 for s in std]
+        if min(middle) > 5.0:
+            out |= {tree.coordinates[d]: m for d, m in zip(own, middle)}
+    return out
+
+
 def plain(segment: str) -> str:
     """A segment's name in words: hand_l becomes "left hand"."""
     side = {"_l": "left ", "_r": "right "}.get(segment[-2:], "")

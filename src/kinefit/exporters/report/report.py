@@ -25,7 +25,15 @@ from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged
 from kinefit.exporters.report.methods import lengths_table, methods
-from kinefit.exporters.report.moments import DOUBTFUL, Moment, doubt_sentence, doubtful_moments, listed, never_observed
+from kinefit.exporters.report.moments import (
+    DOUBTFUL,
+    Moment,
+    doubt_sentence,
+    doubtful_moments,
+    listed,
+    never_observed,
+    shared_by_prior,
+)
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.pictures import report_frames
 from kinefit.exporters.report.ranges import ranges_table
@@ -154,6 +162,16 @@ def _summary(
         text = "No measurement observes them: what is shown follows from the prior posture and is no result."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         parts.append(p.callout("bad" if most else "note", f"Not observed: {listed(blind, 8)}.", text))
+    shared = shared_by_prior(motion)
+    if shared:
+        title = f"Shared by the prior posture: {listed([f'{n} (±{std:.0f}°)' for n, std in shared.items()], 8)}."
+        text = (
+            "Measured is how far they bend together, hardly how each takes part: points at a joint's centre do not "
+            "tell how the segments turn about it. How people usually share a bend decides; the standard deviation says "
+            "how far one person departs from it. Changes within a take are surer than the values. Whatever shows how "
+            "the segment between them turns would tell, such as markers on the front and the back of a pelvis."
+        )
+        parts.append(p.callout("note", title, text))
     body = motion.body
     session, facts = motion.provenance.get("session"), {}
     if isinstance(session, Mapping):

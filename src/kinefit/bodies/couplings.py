@@ -1,0 +1,42 @@
+"""Departures from the usual posture that go together, as a body file states them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kinefit.bodies.records import CouplingRecord
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError, choices
+
+
+def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
+    """The tree with the couplings of a file, whose weights have no unit and whose spreads are in degrees.
+
+    Raises
+    ------
+    BodyError
+        A coordinate that is not there or slides, nothing or no number as weights, a spread that is not positive, or a
+        coordinate that cannot be coupled, see `KinematicTree`.
+    """
+    lines = np.zeros((len(couplings), len(tree.coordinates)))
+    for line, c in zip(lines, couplings):
+        place = f"coupling {c.name}"
+        for name, weight in c.of.items():
+            if name not in tree.coordinates:
+                raise BodyError(
+                    choices("coordinate", name, tree.coordinates), file=source, place=place, remedy="Use one of these."
+                )
+            line[tree.coordinate(name)] = weight
+        if not (np.isfinite(line).all() and line.any() and 0.0 < c.spread < np.inf):
+            problem = f"spread {c.spread}, weights {list(c.of.values())}"
+            raise BodyError(problem, file=source, place=place, remedy="Give a positive spread, and weights besides 0.")
+        if tree.prismatic[line != 0.0].any():
+            raise BodyError("it couples a coordinate that slides", file=source, place=place, remedy="Couple angles.")
+        line /= np.radians(c.spread)
+    try:
+        return replace(tree, couplings=lines)
+    except BodyError as error:
+        raise BodyError(error.problem, file=source, place="coupling", remedy=error.remedy) from error
