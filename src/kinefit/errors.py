@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import shlex
 import subprocess
@@ -42,6 +43,7 @@ class KinefitError(Exception):
         super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
 
 
+_LISTED = 240  # characters of a list of names
 _LONGEST, _ALL = 300, 570  # characters of a problem, and of all parts: what a file gives them may be of any length
 
 
@@ -84,8 +86,12 @@ class AssetError(KinefitError):
 
 
 def choices(kind: str, name: str, valid: object) -> str:
-    """Sentence that names an unknown thing and lists what exists: for messages."""
-    listed = ", ".join(str(v) for v in valid) or "none"  # type: ignore[attr-defined]
+    """Sentence that names an unknown thing and lists what exists, of many the nearest: for messages."""
+    names = [str(v) for v in valid]  # type: ignore[attr-defined]
+    listed = ", ".join(names) or "none"
+    if len(listed) > _LISTED:
+        near = difflib.get_close_matches(str(name), names, 5, 0.3) or names[:5]
+        listed = f"{', '.join(near)} and {len(names) - len(near)} more"
     return f"no {kind} '{name}'; there are: {listed}"
 
 

@@ -77,9 +77,12 @@ def people(scales, noise, count=20, shifts=None, unseen=()):
     return make_channels(BODY, rig, records, [np.zeros(count, int)] * 4, [max(noise, 0.5)] * 4), x
 
 
-@pytest.mark.parametrize(("shifted", "within"), [(False, 0.02), (True, 0.06)])
+@pytest.mark.parametrize(("shifted", "within"), [(False, 0.04), (True, 0.06)])
 def test_a_known_person_comes_back(shifted, within):
-    """Where the detector's points sit 1 cm beside the joints to every side, lengths less surely: both look alike."""
+    """Where the detector's points sit 1 cm beside the joints to every side, lengths less surely: both look alike.
+
+    Noise of 2 px and random postures, which no prior posture has, leave 1 to 2.5 % of a length.
+    """
     random = np.random.default_rng(0)
     scales = 1.03 * random.uniform(0.9, 1.12, len(SCALES))
     lead, sign = mirror_points(BODY.keypoints("BODY_25B"), BODY.tree.segments)
