@@ -177,7 +177,7 @@ def test_angles_that_share_a_bend_by_the_prior_are_named_and_why(tmp_path):
     unsure = replace(motion, dof_std=std)
     assert {name: round(v, 6) for name, v in shared_by_prior(unsure).items()} == dict.fromkeys(shared, 8.0)
     page = write_report(unsure, tmp_path / "report.html", date="2026-01-01").read_text(encoding="utf-8")
-    assert "Shared by the prior posture" in page and "hip_flexion_r (±8°)" in page
+    assert "Shared by the prior posture" in page and "right hip flexion (±8°)" in page
     std[:, 6 + tree.coordinate("hip_flexion_l")] = np.radians(1.0)  # markers on the pelvis tell how the hips turn
     assert shared_by_prior(replace(motion, dof_std=std)) == {}
     assert "Shared by the prior" not in write_report(motion, tmp_path / "r.html").read_text(encoding="utf-8")
@@ -323,7 +323,7 @@ def a_still_arm(motion):
     ("change", "told"),
     [
         (lambda m: cut(m, 0, 1), "1 frames at 60 Hz"), (lambda m: cut(m, 0, 2), "2 frames"),
-        (lambda m: replace(m, residuals={}), "comes without measurements"), (everything_inf, "Not observed: root_tx"),
+        (lambda m: replace(m, residuals={}), "comes without measurements"), (everything_inf, "Not observed: root tx"),
         (nothing_seen, "nothing seen"), (a_still_arm, "comes without measurements"),
     ],
 )  # fmt: skip

@@ -36,6 +36,13 @@ NAMES = {
 """Clinical names of OpenSim's coordinates, in the direction that counts as positive."""
 
 
+def spoken(coordinate: str) -> str:
+    """Clinical name of a coordinate, with its side in words: hip_flexion_l becomes "left hip flexion"."""
+    side = {"_l": "left ", "_r": "right "}.get(coordinate[-2:], "")
+    stem = coordinate[:-2] if side else coordinate
+    return side + NAMES.get(stem, stem.replace("_", " ")).lower()
+
+
 @dataclass(frozen=True)
 class Extremes:
     """How far one coordinate moved, each with two standard deviations [deg, deg/s].
@@ -86,7 +93,7 @@ def ranges_table(motion: Motion) -> p.Html:
     for rows in by_joint(curves(motion)).values():
         for stem, found in rows.items():
             of = {c.side: extremes(c, motion.rate, tracked) for c in found if c.unit == "deg"}
-            name = NAMES.get(stem, stem.replace("_", " "))
+            name = spoken(stem).capitalize()
             if "" in of:
                 single.append((name, *_cells(of[""])))
             elif of:

@@ -36,7 +36,7 @@ from kinefit.exporters.report.moments import (
 )
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.pictures import report_frames
-from kinefit.exporters.report.ranges import ranges_table
+from kinefit.exporters.report.ranges import ranges_table, spoken
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
@@ -161,10 +161,12 @@ def _summary(
     if blind:
         text = "No measurement observes them: what is shown follows from the prior posture and is no result."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
-        parts.append(p.callout("bad" if most else "note", f"Not observed: {listed(blind, 8)}.", text))
+        title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
+        parts.append(p.callout("bad" if most else "note", title, text))
     shared = shared_by_prior(motion)
     if shared:
-        title = f"Shared by the prior posture: {listed([f'{n} (±{std:.0f}°)' for n, std in shared.items()], 8)}."
+        told = [f"{spoken(name)} (±{std:.0f}°)" for name, std in shared.items()]
+        title = f"Shared by the prior posture: {listed(told, 8)}."
         text = (
             "Measured is how far they bend together, hardly how each takes part: points at a joint's centre do not "
             "tell how the segments turn about it. How people usually share a bend decides; the standard deviation says "
