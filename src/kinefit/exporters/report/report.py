@@ -165,8 +165,8 @@ def _summary(
         parts.append(p.callout("bad" if most else "note", title, text))
     shared = shared_by_prior(motion)
     if shared:
-        told = [f"{spoken(name)} (±{std:.0f}°)" for name, std in shared.items()]
-        title = f"Shared by the prior posture: {listed(told, 8)}."
+        each = [f"{spoken(name)} (±{std:.0f}°)" for name, std in shared.items()]
+        title = f"Shared by the prior posture: {listed(each, 8)}."
         text = (
             "Measured is how far they bend together, hardly how each takes part: points at a joint's centre do not "
             "tell how the segments turn about it. How people usually share a bend decides; the standard deviation says "
