@@ -5,6 +5,7 @@ from __future__ import annotations
 from benchmarks.figures import run_parts
 
 PARTS = {
+    "start": "how long a user waits: first and later starts, the whole track of the demo's recording",
     "fuzz": "every reader on damaged files: a typed error or a valid result, soon and in little memory",
 }
 

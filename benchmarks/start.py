@@ -1,0 +1,69 @@
+"""How long a user waits: the demo's first fitted frame on the first start and on later ones, its whole track.
+
+Each start is a process of its own, told from before Python begins; the recording is there already, and the first start
+has no kernels. Wall-clock times, so other programs on the machine count.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.figures import amount, data, figure
+
+_TAKE = """
+import sys
+from pathlib import Path
+from kinefit import assets
+assets.sample_recording = lambda progress=None: Path(sys.argv[1])
+assets.write_sample_take(Path(sys.argv[2]))
+"""
+
+_FIRST = """
+import os, sys, time
+def told(what, done, total):
+    if what == "frames" and done:
+        print(time.time(), flush=True)
+        os._exit(0)
+from kinefit import track_take
+track_take(sys.argv[1], progress=told)
+"""
+
+
+def run() -> None:
+    """Print the times, and the memory of the whole track."""
+    folder = data("video_balancing_4cam")
+    names = {"start_first": "<= 25", "start_later": "<= 1.5", "track_trial": "<= 12"}
+    if folder is None:
+        for name, goal in names.items():
+            figure(name, None, "s", goal, "no recording video_balancing_4cam")
+        return
+    with tempfile.TemporaryDirectory() as work:
+        take = Path(work) / "take"
+        subprocess.run([sys.executable, "-c", _TAKE, str(folder), str(take)], check=True)
+        kernels = os.environ | {"KINEFIT_CACHE": str(Path(work) / "kernels")}
+        figure("start_first", _first(take, kernels), "s", names["start_first"])
+        figure("start_later", min(_first(take, kernels) for _ in range(amount(3, 1))), "s", names["start_later"])
+        command = [sys.executable, "-m", "kinefit", "track", str(take), "--out", str(Path(work) / "out")]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=kernels)
+        seconds = []
+        for _ in range(amount(2, 1)):
+            began = time.perf_counter()
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=kernels)
+            seconds.append(time.perf_counter() - began)
+        figure("track_trial", min(seconds), "s", names["track_trial"])
+        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        figure("track_trial_memory", most / (1e6 if sys.platform == "darwin" else 1e3), "MB", "<= 700")
+
+
+def _first(take: Path, environment: dict[str, str]) -> float:
+    """[s] from before Python begins to the first fitted frame."""
+    began = time.time()
+    command = [sys.executable, "-c", _FIRST, str(take / "take.toml")]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+    return float(done.stdout.split()[-1]) - began
