@@ -12,12 +12,12 @@ import numpy as np
 
 from benchmarks.figures import amount, data, figure, quick
 from kinefit.assets import CAMERAS
-from kinefit.cli import _detecting
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.triangulation import triangulate
 from kinefit.multiview.association import choose_people
 from kinefit.observations import MEDIAPIPE_33, Detections
+from kinefit.preparing import detecting
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import read_detections
 
@@ -37,7 +37,7 @@ def run() -> None:
     """Print every figure of the built-in detector."""
     trial, seated = data("video_balancing_4cam"), data("mv4_upperbody_caliscope")
     try:
-        _detecting._networks(None)
+        detecting._networks(None, print)
         missing = "" if trial else "no recording"
     except (AssetError, ObservationError) as error:
         missing = error.problem
@@ -52,8 +52,8 @@ def run() -> None:
 
 
 def _detect(videos: dict[str, Path], folder: Path) -> dict[str, Detections]:
-    jobs = [_detecting.Job(name, video, folder / f"{name}.npz") for name, video in videos.items()]
-    _detecting.detect(jobs, force=True)
+    jobs = [detecting.Job(name, video, folder / f"{name}.npz") for name, video in videos.items()]
+    detecting.detect(jobs, force=True, tell=print)
     return {job.camera: read_detections(job.file) for job in jobs}
 
 
@@ -66,7 +66,7 @@ def _trial(trial: Path, folder: Path) -> None:
         walls.append(time.perf_counter() - wall)
         processor.append(time.process_time() - cpu)
     frames = len(found[CAMERAS[0]])
-    cores = min(_detecting._cores(), len(CAMERAS))
+    cores = min(detecting._cores(), len(CAMERAS))
     print(f"  {frames} frames of {len(CAMERAS)} cameras in {min(walls):.2f} s on {cores} cores, everything included")
     _figure("detect_speed", frames / min(walls))
     _figure("detect_processor_time", 1000 * min(processor) / (frames * len(CAMERAS)))  # 12 frames/s on two cores

@@ -34,13 +34,13 @@ def test_damaged_files_are_answered(name, tmp_path):
     seed.read()
     whole = [file.read_bytes() for file in seed.files]
     for i in range(COPIES):
-        which, began = i % len(whole), time.monotonic()
+        which, began = i % len(whole), time.process_time()
         seed.files[which].write_bytes(mutated(whole[which], [zlib.crc32(name.encode()), i]))
         try:
             seed.read()
         except KinefitError as error:
             assert len(str(error).replace(str(tmp_path), "")) <= LONGEST
-        assert time.monotonic() - began < SLOW
+        assert time.process_time() - began < SLOW
         seed.files[which].write_bytes(whole[which])
 
 

@@ -183,7 +183,7 @@ def _monotonic_limit(k: NDArray, model: str) -> float:
 
 def _first_root(polynomial: Polynomial) -> float:
     """Smallest positive root, infinite if there is none."""
-    roots = polynomial.trim().roots()
+    roots = polynomial.trim(1e-100).roots()  # less is nothing in any image
     real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
     return min((float(r) for r in real if r > 0), default=np.inf)
 

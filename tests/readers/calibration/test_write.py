@@ -7,7 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from kinefit.errors import CalibrationError, ExportError, FileError
@@ -360,6 +360,7 @@ finite = st.floats(-3, 3)
     w=st.tuples(finite, finite, finite), t=st.tuples(finite, finite, finite), k=st.tuples(*[finite] * 5),
     focal=st.floats(100, 5000), unit=st.sampled_from(["m", "cm", "mm"]),
 )
+@example(w=(0, 0, 0), t=(0, 0, 0), k=(0.0, 0.0, 0.0, 0.0, 5e-323), focal=100.0, unit="m")
 def test_any_numbers_survive(tmp_path_factory, w, t, k, focal, unit):
     folder = tmp_path_factory.mktemp("any")
     (folder / "a.json").write_text(json_text(rig_of()).replace('"cm"', f'"{unit}"'))
