@@ -79,9 +79,10 @@ def track_source(path: Path, name: str) -> DepthSource:
             if codec is None:
                 raise FileError("a codec that FFmpeg does not know", file=path, remedy="Copy the recording again.")
             size, raw = (codec.width, codec.height), codec.codec_tag.lower() == "b16g"
-            if not raw and codec.pix_fmt not in _GREY:
+            pixels = None if codec.format is None else codec.format.name  # `codec.pix_fmt`, which old PyAV fails to tell
+            if not raw and pixels not in _GREY:
                 raise ObservationError(
-                    f"its video is {codec.name} {codec.pix_fmt}, which is no depth", file=path,
+                    f"its video is {codec.name} {pixels}, which is no depth", file=path,
                     remedy="Depth is 16-bit grey (FFV1 gray16le) or the depth track of an Azure Kinect recording.",
                 )  # fmt: skip
             rate = float(stream.average_rate or 0) or None
