@@ -79,7 +79,7 @@ def track_source(path: Path, name: str) -> DepthSource:
             if codec is None:
                 raise FileError("a codec that FFmpeg does not know", file=path, remedy="Copy the recording again.")
             size, raw = (codec.width, codec.height), codec.codec_tag.lower() == "b16g"
-            pixels = None if codec.format is None else codec.format.name  # `codec.pix_fmt`, which old PyAV fails to tell
+            pixels = None if codec.format is None else codec.format.name  # old PyAV has no `pix_fmt` then
             if not raw and pixels not in _GREY:
                 raise ObservationError(
                     f"its video is {codec.name} {pixels}, which is no depth", file=path,
