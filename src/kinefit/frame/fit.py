@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.prediction import belief
-from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged
+from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
 from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
 from kinefit.rows import AnyRows, Rows
@@ -32,8 +32,8 @@ _ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wid
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it, without the posture prior."""
 
-Without = NDArray | Sequence[NDArray | None] | None
-"""Segments (S,) bool whose rows weigh nothing, of all matches or of each its own."""
+Without = Sequence[NDArray | None] | None
+"""Of each match the segments (S,) bool whose rows weigh nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +94,12 @@ class FrameFit:
         every = len(points) == len(measurements)
         found = self._fitted(scene, held, measurements)
         told = evidence_of(found.scene, found.matched)
-        of_points = told if every else evidence_of(
-            found.scene, [a for a, m in zip(found.matched, measurements) if m.settled]
-        )  # fmt: skip
-        if points and of_points.lost.any():
+        if points and together(scene, [e for e, m in zip(told, measurements) if m.settled]).lost.any():
             other = self._settled(scene, held, points, self._uncertain(held))
             other = other if every else self._renewed(other.scene, held, measurements)
             also = evidence_of(other.scene, other.matched)
-            if other.cost < found.cost if every else also.balance > told.balance:
+            gain = found.cost - other.cost if every else sum(e.balance for e in also) - sum(e.balance for e in told)
+            if gain > 0.0:
                 found, told = other, also
         return self._judged(found, held, told, known)
 
@@ -183,11 +181,11 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _judged(self, found: _Found, held: Held | None, told: Evidence, known: NDArray | None) -> Fitted:
+    def _judged(self, found: _Found, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Where measurements contradict a segment, none makes it more certain, nor does a surface that hides it."""
-        scene, tree, H = found.scene, self.body.tree, found.H
+        scene, tree, H, told = found.scene, self.body.tree, found.H, together(found.scene, each)
         lost = told.lost if told.lost.any() else None
-        off = [unseen(m, scene) for m in found.matched]
+        off = [unseen(m, one) for m, one in zip(found.matched, each)]
         if lost is not None:
             off = [lost if one is None else lost | one for one in off]
         without = off if any(one is not None and one.any() for one in off) else None
@@ -241,7 +239,7 @@ class FrameFit:
         if short.any():
             others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
             if others:
-                off = without if without is None or isinstance(without, np.ndarray) else [without[k] for k in others]
+                off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)
                 H = normal_equations(self.body, scene.state, rows).matrix + _TRACE * np.eye(len(now))
                 short &= ~observed(self.body.tree, H)[6:]
@@ -263,7 +261,7 @@ def rows_of(
     ----------
     scale : {sensor: factor} on standard deviations
     points : rows of points that are not among the matches
-    without : (S,) bool, segments whose rows weigh nothing; of all matches, or of each its own
+    without : of each match the segments (S,) bool whose rows weigh nothing
     """
     parts, surface, points = _kinds(scene, matched, scale, points, without)
     if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
@@ -277,8 +275,7 @@ def _kinds(
     """Rows of all but surfaces, rows of surfaces, and how many of points there are."""
     parts: list[AnyRows] = []
     surface: list[Rows] = []
-    each = [without] * len(matched) if without is None or isinstance(without, np.ndarray) else without
-    for m, off in zip(matched, each):
+    for m, off in zip(matched, without or [None] * len(matched)):
         for rows in rows_at(m, scene):
             rows = weaker(rows, (scale or {}).get(m.sensor, 1.0))
             rows = rows if off is None else left_out(rows, off)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,12 +95,14 @@ def deviations(
     return np.where(blind, np.inf, std), joints
 
 
-def evidence_of(scene: Scene, matched: Sequence[Matched]) -> Evidence:
-    """What matches say of each segment at a scene's state."""
-    told = Evidence.none(len(scene.body.tree.segments))
-    for m in matched:
-        told = told + m.evidence(scene.at_time(m.time))
-    return told
+def evidence_of(scene: Scene, matched: Sequence[Matched]) -> list[Evidence]:
+    """What each match says of each segment at a scene's state."""
+    return [m.evidence(scene.at_time(m.time)) for m in matched]
+
+
+def together(scene: Scene, told: Iterable[Evidence]) -> Evidence:
+    """What several say, all in all."""
+    return sum(told, Evidence.none(len(scene.body.tree.segments)))
 
 
 def judged(
@@ -115,7 +117,7 @@ def judged(
     covariance, observed : see `deviations`
     told : what the matches say at the fitted state, where that is known already
     """
-    told = evidence_of(scene, matched) if told is None else told
+    told = together(scene, evidence_of(scene, matched)) if told is None else told
     total = float(told.agreeing.sum() + told.contrary.sum())
     support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)

@@ -12,7 +12,7 @@ from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.evidence import AGREES
+from kinefit.sensors.evidence import AGREES, Evidence
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.scene import Scene
@@ -68,16 +68,13 @@ def adrift(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> ND
     return np.asarray(unknown & unknown[:, parents] & near(contradicted, half))
 
 
-def unseen(matched: Matched, scene: Scene) -> NDArray | None:
-    """(S,) bool: segments that a surface does not show, or speaks against; None where its rows are of points.
+def unseen(matched: Matched, told: Evidence) -> NDArray | None:
+    """(S,) bool: segments that a surface, as its evidence says, does not show, or speaks against; None for points.
 
     What it has near one of these is another segment's, or no segment's: it may pull that one along, and tells nothing
     of where it is. No more does it that parts of the body keep apart.
     """
-    if not matched.shows_surface:
-        return None
-    told = matched.evidence(scene.at_time(matched.time))
-    return np.asarray(told.hidden | told.lost)
+    return np.asarray(told.hidden | told.lost) if matched.shows_surface else None
 
 
 def holding(tree: KinematicTree, segments: NDArray) -> NDArray:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.fit import rows_of
+from kinefit.frame.results import evidence_of
 from kinefit.frame.trust import unseen
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
@@ -131,8 +132,10 @@ class OtherSensors:
             if parts:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
-            without = [unseen(m, scene) for m in matched] if judge else []
-            if unsure is not None and any(w is not None and w.any() for w in without):
+            if unsure is None or not any(m.shows_surface for m in matched):
+                continue
+            without = [unseen(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
+            if any(w is not None and w.any() for w in without):
                 sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
                 unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix
         span = slice(chosen.start, chosen.stop)

@@ -49,6 +49,16 @@ def test_where_the_head_is_not_known_nothing_is_sharp(why):
     assert out.shape == image.shape and out.std() < 0.25 * image.std()
 
 
+@pytest.mark.parametrize("away", [0.0, 3.0])
+def test_a_head_about_the_camera_leaves_nothing_sharp_and_one_behind_it_all(away):
+    motion, camera, image = scene()
+    head = motion.body.positions(motion.state(1), motion.body.landmarks)[motion.body.landmarks.index("nose_tip")]
+    T = np.array(camera.T_camera_world)
+    T[:3, 3] = -T[:3, :3] @ head - np.array([0.0, 0.0, away])  # the nose at the camera, or so far behind it
+    out = without_face(image, motion, 1, replace(camera, T_camera_world=T))
+    assert (out == image).all() if away else out.std() < 0.25 * image.std()
+
+
 def test_a_body_without_a_head_is_refused():
     motion, camera, image = scene()
     arm = replace(motion, body=load_body("arm"))

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from benchmarks import fuzz_seeds
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -9,41 +10,7 @@ from kinefit.readers.skeletons.amc import read_amc
 from kinefit.readers.skeletons.asf import read_asf
 from kinefit.readers.skeletons.bvh import read_bvh
 
-ASF = """# comment
-:version 1.10
-:units
-  mass 1.0
-  length 0.5
-  angle deg
-:root
-   order TX TY TZ RX RY RZ
-   axis XYZ
-   position 0 1 0
-   orientation 0 0 0
-:bonedata
-  begin
-     id 1
-     name arm
-     direction 2 0 0
-     length 3
-     axis 0 0 90 XYZ
-    dof rx rz
-    limits (-90 90)
-           (0 inf)
-  end
-  begin
-     id 2
-     name hand
-     direction 0 1 0
-     length 1
-     axis 0 0 0 XYZ
-  end
-:hierarchy
-  begin
-    root arm
-    arm hand
-  end
-"""
+ASF = f"# comment\n{fuzz_seeds.ASF}"
 AMC = """#!OML:ASF
 :FULLY-SPECIFIED
 :DEGREES

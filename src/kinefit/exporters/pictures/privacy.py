@@ -43,8 +43,9 @@ def without_face(
     image_frame = image_frame or ImageFrame.identity()
     around = middle + reach * np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
     uv = image_frame.from_calibration(camera.project(around))
-    if not np.isfinite(uv).all():  # behind the camera, or beside its lens
-        return np.array(image)
+    if not np.isfinite(uv).all():  # partly or all behind the camera, or beside its lens
+        ahead = around @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+        return _coarse(image, max(image.shape[:2]) / 12) if ahead.max() > 0.0 else np.array(image)
     centre = uv[-1]
     radius = float(np.linalg.norm(uv[:-1] - centre, axis=1).max())
     box = np.clip(np.stack([centre - radius, centre + radius + 1]), 0, image.shape[1::-1]).astype(int)
