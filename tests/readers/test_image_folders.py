@@ -52,7 +52,7 @@ def test_what_is_wrong_with_images_is_told(tmp_path):
     with Video(folder, rate=30.0) as video, pytest.raises(FileError, match=r"20x20 px, but the first image has 48x32"):
         video.read(2)
     (folder / "img2.png").write_bytes(b"\x89PNG")
-    with Video(folder, rate=30.0) as video, pytest.raises(FileError, match="cannot be decoded"):
+    with Video(folder, rate=30.0) as video, pytest.raises(FileError, match="no image"):
         video.read(2)
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileError, match="no images here"):

@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.depth.images import listed
 
@@ -42,7 +42,7 @@ class ImageFolder:
             raise ObservationError(problem, file=path, remedy="Write rate = ... (frames per second) into [take].")
         _check_numbers(files)
         self._files, self.rate = files, float(rate)
-        self._picture: tuple[int, NDArray[np.uint8]] = (0, _decoded(files[0]))
+        self._picture: tuple[int, NDArray[np.uint8]] = (0, read_picture(files[0]))
         self.size: tuple[int, int] = self._picture[1].shape[1::-1]
 
     def __len__(self) -> int:
@@ -59,7 +59,7 @@ class ImageFolder:
     def image(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB."""
         if self._picture[0] != i:
-            picture = _decoded(self._files[i])
+            picture = read_picture(self._files[i])
             if picture.shape[1::-1] != self.size:
                 sizes = [f"{width}x{height}" for width, height in (picture.shape[1::-1], self.size)]
                 problem = f"{sizes[0]} px, but the first image has {sizes[1]}"
@@ -90,14 +90,3 @@ def _check_numbers(files: list[Path]) -> None:
             f"images are missing between {files[i].name} and {files[i + 1].name}", file=files[0].parent,
             remedy="Copy them again; or leave out what comes after, and number the rest without a gap.",
         )  # fmt: skip
-
-
-def _decoded(file: Path) -> NDArray[np.uint8]:
-    try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    except (OSError, cv2.error) as error:
-        raise FileError("cannot be read, or is no image", file=file, remedy="Copy it again.") from error
-    if picture is None:
-        raise FileError("an image that cannot be decoded", file=file, remedy="It is cut or damaged: copy it again.")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)

@@ -405,7 +405,7 @@ def test_wrong_board_broken_and_mixed_pictures(tmp_path):
     with pytest.raises(CalibrationError, match=r"2\.png: has 1280x300 px"):
         find_boards(camera_sources([tmp_path / "mixed"]), CHARUCO)
     (tmp_path / "mixed" / "2.png").write_bytes(b"no picture")
-    with pytest.raises(FileError, match=r"2\.png: not an image"):
+    with pytest.raises(FileError, match=r"2\.png: no image"):
         find_boards(camera_sources([tmp_path / "mixed"]), CHARUCO)
 
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._pictures import read_picture
 from kinefit.calibration.board.detection import (
     Board,
     CameraViews,
@@ -45,10 +45,7 @@ class Pictures:
 
     def read(self, frame: int) -> NDArray[np.uint8]:
         """One frame, (H, W, 3) RGB."""
-        data = np.fromfile(self.files[frame], np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None
-        if image is None:
-            raise FileError("not an image that can be read", file=self.files[frame], remedy="Remove or replace it.")
+        image = read_picture(self.files[frame])
         size = (image.shape[1], image.shape[0])
         if getattr(self, "size", size) != size:
             raise CalibrationError(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_npz
+from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import Camera
 
@@ -90,13 +91,7 @@ def _page(file: Path, i: int) -> NDArray:
 
 
 def _picture(file: Path) -> NDArray:
-    try:
-        data = np.frombuffer(file.read_bytes(), np.uint8)
-    except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=file, remedy="Check the path.") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    if picture is None:
-        raise FileError("a picture that cannot be decoded", file=file, remedy="It is cut or damaged: copy it again.")
+    picture = read_picture(file, cv2.IMREAD_UNCHANGED)
     if picture.ndim != 2 or picture.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if picture.ndim == 2 else picture.shape[2]
         raise ObservationError(

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 
 from kinefit._files import npy_header
-from kinefit.errors import CalibrationError, KinefitError
+from kinefit._pictures import read_picture
+from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.names import natural
@@ -174,8 +175,11 @@ def _is_film(group: list[Path]) -> bool:
     alike = {re.sub(r"\d+", "#", path.name) for path in images}
     if len(images) < _MANY or len(alike) > 1:
         return False
-    picture = cv2.imread(str(images[0]), cv2.IMREAD_UNCHANGED)
-    return picture is not None and picture.dtype == np.uint8 and picture.ndim == 3
+    try:
+        picture = read_picture(images[0], cv2.IMREAD_UNCHANGED)
+    except FileError:
+        return False
+    return picture.dtype == np.uint8 and picture.ndim == 3
 
 
 def find_markers(files: list[Path]) -> list[Path]:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._pictures import read_picture
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
@@ -153,13 +154,11 @@ class _BeforeBackground:
     @cached_property
     def plate(self) -> BackgroundPlate:
         if self._file is not None:
-            picture = cv2.imread(str(self._file), cv2.IMREAD_COLOR)
-            if picture is None:
-                raise FileError("not an image, or damaged", file=self._file, remedy="Give a PNG or JPEG.")
+            picture = read_picture(self._file)
             if picture.shape[1::-1] != self.video.size:
                 problem = f"the background has {picture.shape[1::-1]} px, the video {self.video.size}"
                 raise ObservationError(problem, file=self._file, remedy="Take it with the same camera and settings.")
-            return BackgroundPlate(self._smaller(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)))
+            return BackgroundPlate(self._smaller(picture))
         chosen = np.unique(np.linspace(0, len(self.video) - 1, _LEARNT).astype(int))
         return BackgroundPlate.of(self._smaller(self.video.read(int(i))) for i in chosen)
 
@@ -190,9 +189,7 @@ def _picture_size(file: Path, size: tuple[int, int], frame: ImageFrame | None) -
 
 
 def _mask(file: Path) -> NDArray:
-    mask = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if mask is None:
-        raise FileError("not an image, or damaged", file=file, remedy="Write it again, as an 8-bit PNG.")
+    mask = read_picture(file, cv2.IMREAD_UNCHANGED)
     if mask.ndim == 3:
         mask = mask[..., 3] if mask.shape[2] == 4 else mask[..., :3].max(axis=2)
     if mask.dtype != np.uint8:
