@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
+from kinefit.bodies.closures import FIXED, Closure, Dimension
 from kinefit.bodies.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
@@ -99,6 +100,8 @@ class Body:
     morphs : what changes with its angles; `Morphing` lets them act.
     skin : SkinnedMesh, a surface over all segments; depth and drawings go by `surfaces`.
     family : Family, bodies of other shapes of which this is one; files do not keep it.
+    closures : what closes chains of the tree, see `closures`.
+    dimensions : lengths and angles of gear that closures need.
     """
 
     name: str
@@ -115,6 +118,8 @@ class Body:
     morphs: tuple[Operator, ...] = ()
     skin: SkinnedMesh | None = None
     family: Family | None = None
+    closures: tuple[Closure, ...] = ()
+    dimensions: tuple[Dimension, ...] = ()
 
     @property
     def dof_names(self) -> tuple[str, ...]:
@@ -163,14 +168,15 @@ class Body:
         return se3.apply(Ts[:, points.segments], points.points)
 
     def scaled(self, scales: NDArray) -> Body:
-        """The body with every scale group stretched: (G,) factors; joint centres and all points move along."""
+        """The body with every scale group stretched: (G,) factors; joint centres and all points move along, gear does not.
+        """
         factors = np.asarray(scales, float)
         if factors.shape != (len(self.scale_groups),) or not np.all(np.isfinite(factors)) or np.any(factors <= 0):
             raise BodyError(
                 f"scales must be {len(self.scale_groups)} positive numbers, got {factors}",
                 remedy=f"One for each of: {', '.join(self.scale_groups)}.",
             )
-        per_segment = factors[self.segment_scale]
+        per_segment = np.where(self.gear_scale, 1.0, factors)[self.segment_scale]
         old, parents = self.tree, np.maximum(self.tree.parents, 0)
         tree = old.with_offsets(old.offsets * per_segment[parents][:, None])
         stretched = replace(
@@ -184,6 +190,11 @@ class Body:
             skin=self.skin and self.skin.stretched(old.rest, tree.rest, per_segment),
         )
         return replace(stretched, stature=self.stature * stretched._extent() / max(self._extent(), 1e-9))
+
+    @property
+    def gear_scale(self) -> NDArray:
+        """(G,) bool, the scale group of gear, which no person's size stretches."""
+        return np.array([name == FIXED for name in self.scale_groups], bool)
 
     def _extent(self) -> float:
         """[m] from the lowest to the highest landmark or joint at rest."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.closure_files import closed, with_closure_images
 from kinefit.bodies.couplings import coupled
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
@@ -84,7 +85,7 @@ def parse_body(text: str, source: str = "body") -> Body:
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
     tree = coupled(_tree(segments, index, source), record.coupling, source)
-    return Body(
+    body = Body(
         name=record.body.name,
         tree=tree,
         joints=tuple(s.joint.name for s in segments),
@@ -102,6 +103,10 @@ def parse_body(text: str, source: str = "body") -> Body:
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(with_images(record.morph, _left) if mirror else record.morph, tree, source),
     )
+    if not (record.closure or record.dimension):
+        return body
+    closures = with_closure_images(record.closure, _left) if mirror else record.closure
+    return closed(body, closures, record.dimension, source)
 
 
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:

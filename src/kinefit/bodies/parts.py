@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.closures import without_landmarks
 from kinefit.bodies.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, Surface
@@ -118,18 +119,21 @@ def without_part(body: Body, name: str) -> Body:
         raise BodyError(f"{', '.join(children)} hang on it", place=f"part {name}", remedy=remedy)
     stay = np.arange(len(tree.segments)) != gone
     used = sorted(set(body.segment_scale[stay].tolist()))
+    landmarks = _left(body.landmarks, gone)
     return replace(
         body,
         tree=_shrunk(tree, gone),
         joints=tuple(j for j, keep in zip(body.joints, stay) if keep),
         scale_groups=tuple(body.scale_groups[g] for g in used),
         segment_scale=np.searchsorted(used, body.segment_scale[stay]),
-        landmarks=_left(body.landmarks, gone),
+        landmarks=landmarks,
         keypoint_sets={n: _left(p, gone) for n, p in body.keypoint_sets.items()},
         marker_sets={n: _left(p, gone) for n, p in body.marker_sets.items()},
         surfaces=tuple(replace(s, segment=s.segment - (s.segment > gone)) for s in body.surfaces if s.segment != gone),
         aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
         morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == gone)),
+        closures=without_landmarks(body.closures, landmarks.names),
+        dimensions=tuple(d for d in body.dimensions if name not in d.moves),
     )
 
 

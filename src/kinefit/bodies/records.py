@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from kinefit.bodies.closure_files import ClosureRecord, DimensionRecord
 from kinefit.bodies.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
 from kinefit.bodies.surfaces.skin_files import SkinRecord
@@ -76,6 +77,8 @@ class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True)
     body: HeadRecord
     segment: list[SegmentRecord] = []
     coupling: list[CouplingRecord] = []
+    closure: list[ClosureRecord] = []
+    dimension: list[DimensionRecord] = []
     morph: list[MorphRecord] = []
     skin: SkinRecord | None = None
     landmarks: dict[str, PointRecord] = {}
@@ -88,6 +91,8 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
     mine = {s.name: s for s in own.segment}
     segments = [mine.pop(s.name, s) for s in base.segment]
     couplings = {c.name: c for c in base.coupling + own.coupling}
+    closures = {c.name: c for c in base.closure + own.closure}
+    dimensions = {d.name: d for d in base.dimension + own.dimension}
     head = msgspec.structs.replace(
         own.body,
         base=None,
@@ -98,6 +103,8 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
         body=head,
         segment=segments + list(mine.values()),
         coupling=list(couplings.values()),
+        closure=list(closures.values()),
+        dimension=list(dimensions.values()),
         morph=base.morph + own.morph,
         skin=own.skin or base.skin,
         landmarks=base.landmarks | own.landmarks,

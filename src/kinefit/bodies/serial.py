@@ -20,6 +20,7 @@ radians:
     surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
     aliases/CONVENTION (N, 2)                          pairs: segment, name there
     morphs/..., skin/...                               see `serial_morphs`
+    closures, dimensions                               each as JSON, fields as of `closures`; may be missing
 
 Names that are part of a key are percent-encoded.
 """
@@ -30,13 +31,16 @@ import tempfile
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from typing import TypeVar
 from urllib.parse import quote, unquote
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.serial_morphs import (
     morphs_from_arrays,
     morphs_to_arrays,
@@ -47,6 +51,7 @@ from kinefit.bodies.surfaces import MeshSurface, Surface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
+_Kind = TypeVar("_Kind")
 _TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread")
 
 
@@ -70,6 +75,9 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
         for name, points in sets.items():
             out |= _points_to_arrays(f"{kind}/{quote(name, safe='')}", points)
+    for one in ("closures", "dimensions"):
+        if getattr(body, one):
+            out[one] = text_array([msgspec.json.encode(each).decode() for each in getattr(body, one)])
     for convention, names in body.aliases.items():
         pairs = [text_array(names), text_array(names.values())]
         out[f"aliases/{quote(convention, safe='')}"] = np.stack(pairs, axis=1)
@@ -99,7 +107,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
     _check_indices(tree.parents[1:], n_segments, "parents")
     groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
     _check_indices(segment_scale, len(groups), "segment_scale")
-    return Body(
+    body = Body(
         name=str(_array(arrays, "name", ())),
         tree=tree,
         joints=_texts(arrays, "joints", n_segments),
@@ -117,7 +125,10 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
         stature=float(_array(arrays, "stature", ())),
         morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
         skin=skin_from_arrays(arrays, n_segments),
+        closures=_decoded(arrays, "closures", Closure),
+        dimensions=_decoded(arrays, "dimensions", Dimension),
     )
+    return _check_closures(body)
 
 
 def save_body(body: Body, path: str | PathLike[str]) -> None:
@@ -214,6 +225,24 @@ def _points_from_arrays(arrays: Mapping[str, NDArray], key: str, n_segments: int
 def _sets(arrays: Mapping[str, NDArray], kind: str, n_segments: int) -> dict[str, PointSet]:
     keys = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/"))
     return {unquote(key): _points_from_arrays(arrays, f"{kind}/{key}", n_segments) for key in keys}
+
+
+def _decoded(arrays: Mapping[str, NDArray], key: str, kind: type[_Kind]) -> tuple[_Kind, ...]:
+    """Closures or dimensions; none in older files."""
+    if key not in arrays:
+        return ()
+    try:
+        return tuple(msgspec.json.decode(str(text), type=kind) for text in _array(arrays, key, (None,)))
+    except msgspec.MsgspecError as error:
+        raise BodyError(f"{key} that cannot be read ({error})") from error
+
+
+def _check_closures(body: Body) -> Body:
+    for c in body.closures:
+        points = (c.point, *([c.to] if c.to else []))
+        if c.kind not in KINDS or any(p not in body.landmarks.names for p in points):
+            raise BodyError(f"closure '{c.name}' is of a kind or of landmarks that are not there")
+    return body
 
 
 def _array(arrays: Mapping[str, NDArray], key: str, shape: tuple[int | None, ...]) -> NDArray:

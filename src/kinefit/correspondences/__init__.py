@@ -2,6 +2,7 @@
 
 from kinefit.correspondences.anchored import anchored_rows, target_rows
 from kinefit.correspondences.bands import Bands, band_rows, joint_bands
+from kinefit.correspondences.closures import closure_rows
 from kinefit.correspondences.coincidence import coincidence_rows
 from kinefit.correspondences.collisions import collision_rows
 from kinefit.correspondences.depth_image import depth_image_rows
@@ -20,6 +21,7 @@ __all__ = [
     "Bands",
     "anchored_rows",
     "band_rows",
+    "closure_rows",
     "coincidence_rows",
     "collision_rows",
     "depth_image_rows",

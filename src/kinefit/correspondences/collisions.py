@@ -76,7 +76,7 @@ def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None
 
     Parameters
     ----------
-    between : pairs of segments' names, by default all that are not parent and child.
+    between : pairs of segments' names, by default all that are not parent and child; gear may touch anything.
 
     Raises
     ------
@@ -87,7 +87,8 @@ def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None
     parents = body.tree.parents
     index = np.array(np.triu_indices(len(segment), 1)).T.reshape(-1, 2)
     one, other = segment[index].T
-    keep = (one != other) & (parents[one] != other) & (parents[other] != one)
+    gear = body.gear_scale[body.segment_scale]  # which is held, sat and stood on
+    keep = (one != other) & (parents[one] != other) & (parents[other] != one) & ~gear[one] & ~gear[other]
     if between is not None:
         wanted = {frozenset((body.tree.segment(i), body.tree.segment(j))) for i, j in between}
         bare = sorted(body.tree.segments[s] for s in frozenset().union(*wanted) - set(segment.tolist()))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_rows
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.prediction import belief
@@ -21,12 +22,14 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.closed import closed_fit, closed_step, on_null_space
 from kinefit.solvers.equations import Equations, inverse, joint_moves, normal_equations
-from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.solvers.least_squares import Fit, gauss_newton, levenberg_marquardt
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
+_OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
 _ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wide: the next one begins there
 
 Held = tuple[BodyState, NDArray]
@@ -76,6 +79,7 @@ class FrameFit:
     def __init__(self, body: Body, settings: TrackSettings) -> None:
         self.body, self.settings = body, settings
         self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
+        self._hard = hard_equations(body)
 
     def run(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None
@@ -113,7 +117,11 @@ class FrameFit:
         while iterations < s.iterations:
             iterations += 1
             matched = _match(scene, measurements, reach)
-            step = gauss_newton(self.body, scene.state, self.rows(scene, held, matched, apart=True))
+            rows = self.rows(scene, held, matched, apart=True)
+            if self._hard is None:
+                step = gauss_newton(self.body, scene.state, rows)
+            else:
+                step = closed_step(self.body, scene.state, rows, self._hard)
             scene = scene.at(step.state)
             gain = float(step.delta @ step.equations.gradient)  # twice the fall of the cost: squared deviations
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
@@ -145,11 +153,26 @@ class FrameFit:
     def _minimum(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
     ) -> tuple[Scene, Equations, int]:
-        fit = levenberg_marquardt(
-            self.body, scene.state, lambda state: self.rows(scene.at(state), held, matched),
-            max_iterations=most, tolerance=tolerance, damping=None if held is None else _LIGHT,
-        )  # fmt: skip
-        return scene.at(fit.state), fit.equations, fit.iterations
+        def rows(state: BodyState) -> list[AnyRows]:
+            return self.rows(scene.at(state), held, matched)
+
+        damping, tried = None if held is None else _LIGHT, 0
+        if self._hard is None:
+            fit = levenberg_marquardt(
+                self.body, scene.state, rows, max_iterations=most, tolerance=tolerance, damping=damping
+            )
+        else:
+            start = scene.state
+            if np.abs(self._hard(start)[0]).max() > _OPEN:  # the nearest closed pose may be far from what is seen
+                near = levenberg_marquardt(
+                    self.body, start, lambda state: [*rows(state), closed_at(self.body, state).rows(_OPEN)],
+                    max_iterations=_ROUGH[0], tolerance=_ROUGH[1], damping=damping,
+                )  # fmt: skip
+                start, tried = near.state, near.iterations
+            fit = closed_fit(
+                self.body, start, rows, self._hard, max_iterations=most, tolerance=tolerance, damping=damping
+            )
+        return scene.at(fit.state), fit.equations, fit.iterations + tried
 
     def _uncertain(self, held: Held | None) -> float:
         """[m] how far some joint centre may be from where it is expected, one standard deviation; `far` at least."""
@@ -163,7 +186,7 @@ class FrameFit:
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], *, apart: bool = False,
         without: Without = None,
     ) -> list[AnyRows]:  # fmt: skip
-        """Rows of all matches, of what was held, of the posture prior; `apart` keeps parts of the body apart.
+        """Rows of all matches, of what was held, of the posture prior, of soft closures; `apart` keeps parts apart.
 
         Measurements of the segments `without` weigh nothing.
         """
@@ -171,6 +194,7 @@ class FrameFit:
         if held is not None:
             parts.append(belief(scene.state, *held))
         parts.append(prior_rows(self.body, scene.state))
+        parts += soft_rows(self.body, scene.state)
         return [*parts, *self.apart(scene)] if apart else parts
 
     def apart(self, scene: Scene) -> list[AnyRows]:
@@ -183,7 +207,10 @@ class FrameFit:
 
     def _judged(self, found: _Found, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Where measurements contradict a segment, none makes it more certain, nor does a surface that hides it."""
-        scene, tree, H, told = found.scene, self.body.tree, found.H, together(found.scene, each)
+        scene, tree, told = found.scene, self.body.tree, together(found.scene, each)
+        A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
+        exact = A.T @ A / STIFF**2
+        H = found.H + exact
         lost = told.lost if told.lost.any() else None
         off = [unseen(m, one) for m, one in zip(found.matched, each)]
         if lost is not None:
@@ -191,7 +218,7 @@ class FrameFit:
         without = off if any(one is not None and one.any() for one in off) else None
         if without is not None:
             rows = self.rows(scene, held, found.matched, without=without)
-            H = normal_equations(self.body, scene.state, rows).matrix
+            H = normal_equations(self.body, scene.state, rows).matrix + exact
         if held is None:
             H = now = H + _TRACE * np.eye(len(H))  # where nothing measures the root, nothing holds it
         else:
@@ -201,7 +228,7 @@ class FrameFit:
         known = known | ~np.isfinite(tree.spread)
         alone = np.array(H)
         alone[6:, 6:] -= (1.0 - _TRACE) * tree.posture_precision
-        posterior = inverse(H)
+        posterior = on_null_space(inverse(H), A)
         stated = posterior + self._of_surfaces(scene, found.matched, now, without)
         if lost is not None:
             elsewhere = np.zeros(len(lost), bool) if told.elsewhere is None else lost & told.elsewhere
@@ -235,7 +262,7 @@ class FrameFit:
         pixels = [m for m in matched if isinstance(m, KeypointMatched)]
         if not pixels:
             return seen
-        short = seen[6:] & ~levered(scene, pixels)
+        short = seen[6:] & ~levered(scene, pixels) & ~looped(self.body)
         if short.any():
             others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
             if others:

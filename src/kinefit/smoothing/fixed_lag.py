@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import hard_equations
 from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult, judged
 from kinefit.observations.arrays import is_number
@@ -24,6 +25,7 @@ from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers import _kernels_smoothing
+from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.marginal import Entering, leave
 from kinefit.solvers.motion_prior import MotionPrior
@@ -71,6 +73,7 @@ class FixedLag:
         )
         self._share = self._prior.posture_share
         self._costs = FrameCosts(tracker, self.noise)
+        self._hard = hard_equations(self.body)
         self._begin()
 
     def _begin(self) -> None:
@@ -222,15 +225,22 @@ class FixedLag:
             frame = self._frames[f]
             self._waiting -= 1
             if frame.real:
+                if self._hard is not None:
+                    frame.state = onto(self.body, frame.state, self._hard, limits=False)[0]
                 number = self._count - len(self._frames) + f + 1
                 observed = self._told >= number - self._memory
                 matched = (*frame.points, *frame.surfaces)
                 out.append(
                     judged(
-                        self._costs.scene(self._frames, f), found[f], matched, self._last.iterations, observed=observed
+                        self._costs.scene(self._frames, f), self._exact(frame.state, found[f]), matched, self._last.iterations, observed=observed
                     )
                 )
         return out
+
+
+    def _exact(self, state: BodyState, covariance: NDArray) -> NDArray:
+        """A covariance (n, n) of a state that is closed exactly."""
+        return covariance if self._hard is None else on_null_space(covariance, self._hard(state)[1])
 
 
 def lag_frames(lag: float, rate: float) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import all_rows, looped
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.rows import AnyRows
@@ -110,11 +111,14 @@ class FrameCosts:
         others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
         told = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
+        closed = all_rows(self.body, scene.state)
+        if closed:
+            H = H + normal_equations(self.body, scene.state, closed).matrix
         for several, far in ((others, False), (pixels, True)):
             if several:
                 H = H + normal_equations(self.body, scene.state, self._rows(several, scene, frame.points)).matrix
                 seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
-                told |= seen & self._far(pixels, scene) if far else seen
+                told |= seen & (self._far(pixels, scene) | looped(self.body)) if far else seen
         return told
 
     def _far(self, pixels: Sequence[KeypointMatched], scene: Scene) -> NDArray:
@@ -165,10 +169,11 @@ class FrameCosts:
         """Cost c − 2 gᵀδ + δᵀHδ of a frame's measurements about where it is now: H, g, c."""
         frame, body, n = frames[f], self.body, self.body.tree.n_dofs
         H, g, cost = np.zeros((n, n)), np.zeros(n), 0.0
-        if frame.points or (frame.surfaces and frame.H is None):
+        if frame.points or body.closures or (frame.surfaces and frame.H is None):
             scene = self.scene(frames, f)
-        if frame.points:
-            points = normal_equations(body, scene.state, self._rows(frame.points, scene))
+        if frame.points or body.closures:
+            rows = [*self._rows(frame.points, scene), *all_rows(body, scene.state)]
+            points = normal_equations(body, scene.state, rows)
             H, g, cost = points.matrix, points.gradient, points.cost
         if frame.surfaces:
             if frame.H is None:

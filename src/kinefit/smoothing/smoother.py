@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.frame.trust import adrift
 from kinefit.sensors.base import Matched
@@ -24,6 +25,7 @@ from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.unwrap import unwrap
+from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import inverse
 
 _PARTS = 3  # of a long take, from which its process noise is estimated
@@ -87,6 +89,8 @@ def smooth_results(
         found = find_contacts(body, take.roots, take.angles, rate, up)
         take, _, others_matched = _solve(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
+    hard = hard_equations(body)
+    take = take if hard is None else _closed(take, hard)
     fitted = take.fitted(take.roots, take.angles)
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
     took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
@@ -101,6 +105,8 @@ def smooth_results(
         )  # fmt: skip
         more = () if others_matched is None else others_matched[f]
         covariance[packed] = covariance.T[packed] = covariances[f]
+        if hard is not None:
+            covariance = on_null_space(covariance, hard(state)[1])
         scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
         surfaces |= any(m.shows_surface for m in more)
@@ -108,6 +114,15 @@ def smooth_results(
     if surfaces:
         smoothed = _without_adrift(body, smoothed, round(_ADRIFT * rate))
     return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
+
+
+def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
+    """With closures that hold exactly: the solution has them as rows of a tenth of a millimetre."""
+    roots, angles = np.array(take.roots), np.array(take.angles)
+    for f in range(len(roots)):
+        state, _ = onto(take.body, BodyState(roots[f], angles[f]), hard, limits=False)
+        roots[f], angles[f] = state.T_world_root, state.angles
+    return replace(take, roots=roots, angles=angles)
 
 
 def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> list[FrameResult]:
@@ -155,7 +170,8 @@ def _take(
     take = pixels_of_track(body, channels, results, rate, settings)
     inliers = take.factors(channels.sigma, take.fitted(take.roots, take.angles)) > INLIER
     alone, rows = _observed(take, channels, others)
-    told = alone[0] & (levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST) | alone[1]
+    far = levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST
+    told = alone[0] & (far | looped(body)) | alone[1]
     lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
     roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)
     told = near(told, round(settings.smooth_memory * rate))

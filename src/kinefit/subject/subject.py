@@ -114,6 +114,7 @@ class Subject:
             share = np.sqrt(np.diag(self.covariance)[: len(self.scales)])
         if share is None:
             return {}
+        share = np.where(self.body.gear_scale, 0.0, share)
         tree = self.body.tree
         lengths = np.linalg.norm(tree.offsets, axis=1)
         return {

@@ -84,7 +84,7 @@ def motion_of(
     provenance: dict[str, Any] = dict(told or {})
     others = None
     names = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0)
-    if names:
+    if names or body.closures:
         points = 2 * np.count_nonzero(channels.weight, axis=1)
         others = OtherSensors(
             frames.times, frames.measurements, frames.scene_of, frames.apart, settings, names, points

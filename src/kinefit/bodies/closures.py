@@ -1,0 +1,206 @@
+"""Closed chains: points of a body that stay on other points, on lines, on planes, or segments that stay together (P3 3.2).
+
+A body is an open tree; what closes it (a boot in its binding, a hand on a bar, a pedal's axis on the bike) is told by
+closures between its landmarks, or between a landmark and the world. What of the gear is not known, such as how far the
+bindings are apart, is a dimension that a subject fit estimates (P3 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import BodyError, choices
+from kinefit.geometry import se3
+
+if TYPE_CHECKING:
+    from kinefit.bodies.body import Body, PointSet
+
+KINDS = {"point": 3, "line": 2, "plane": 1, "rigid": 6}
+"""Kinds of closures, and how many freedoms each takes away."""
+
+FIXED = "fixed"
+"""The scale group of gear: no person's size stretches it."""
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A landmark that stays where another landmark, or a place in the world, says.
+
+    The other's frame is that of its segment, or the world's.
+
+    Parameters
+    ----------
+    name : str
+    kind : "point": it stays on the other point; "line", "plane": on a line through it, a plane through it, of direction
+        or normal `axis`; "rigid": its segment stays fixed to the other's.
+    point : name of the landmark.
+    to : name of the other landmark; "" for a place in the world.
+    place : (3,) [m] in the world, where `to` is "".
+    axis : (3,) unit, in the other's frame.
+    turn : (3,) [rad] rotation vector of the landmark's segment in the other's frame, of a rigid closure.
+    sigma, turn_sigma : [m], [rad] standard deviation of a soft closure.
+    hard : whether it holds exactly.
+    place_std, turn_std : [m], [rad] prior standard deviations of a place in the world that is estimated; 0 for a known
+        one.
+    """
+
+    name: str
+    kind: str
+    point: str
+    to: str = ""
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sigma: float = 0.005
+    turn_sigma: float = np.radians(2.0)
+    hard: bool = False
+    place_std: float = 0.0
+    turn_std: float = 0.0
+
+    @property
+    def rows(self) -> int:
+        """How many freedoms it takes away."""
+        return KINDS[self.kind]
+
+    @property
+    def directions(self) -> NDArray:
+        """(k, 3) unit directions, in the other's frame, along which the point may not leave."""
+        axis = np.array(self.axis)
+        if self.kind == "plane":
+            return axis[None]
+        if self.kind == "line":
+            first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+            first /= np.linalg.norm(first)
+            return np.stack([first, np.cross(axis, first)])
+        return np.eye(3)
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Of its rows, for messages."""
+        if self.kind == "line":
+            return ("across the line", "across the line, the other way")
+        shifts = ("off the plane",) if self.kind == "plane" else tuple(f"along {a}" for a in AXES)
+        return shifts + (tuple(f"about {a}" for a in AXES) if self.kind == "rigid" else ())
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """A length or an angle of gear by which landmarks, joints and closures lie.
+
+    Parameters
+    ----------
+    name : str
+    value : float [m] or [rad], at which the body stands.
+    along : (3,) by which whatever it moves shifts, for each metre, in the frame that it is given in.
+    about : (3,) unit axis about which the `turn` of rigid closures turns with it; zeros for a length.
+    moves : names of landmarks, of segments (their joint shifts in the parent's frame), of closures.
+    std : [m] or [rad] prior standard deviation of a value that is estimated; 0 for a known one.
+    """
+
+    name: str
+    value: float
+    along: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    about: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    moves: tuple[str, ...] = ()
+    std: float = 0.0
+
+    @property
+    def turns(self) -> bool:
+        """Whether it is an angle."""
+        return any(self.about)
+
+
+def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
+    """The body with gear of other dimensions [m] or [rad]; lengths that a person's size stretches are added to as they are.
+
+    Raises
+    ------
+    BodyError
+        A dimension that the body does not have.
+    """
+    known = {d.name: d for d in body.dimensions}
+    for name in values:
+        if name not in known:
+            raise BodyError(choices(f"dimension of body '{body.name}' named", name, known), remedy="Use one of these.")
+    offsets, points = np.array(body.tree.offsets), np.array(body.landmarks.points)
+    closures = {c.name: c for c in body.closures}
+    moved = False
+    for name, value in values.items():
+        d, change = known[name], float(value) - known[name].value
+        if change == 0.0:
+            continue
+        shift, moved = change * np.array(d.along), True
+        for what in d.moves:
+            if what in closures:
+                closures[what] = _shifted(closures[what], shift, change * np.array(d.about))
+            elif what in body.landmarks.names:
+                points[body.landmarks.names.index(what)] += shift
+            else:
+                offsets[body.tree.segment(what)] += shift
+        known[name] = replace(d, value=float(value))
+    if not moved:
+        return body
+    landmarks = replace(body.landmarks, points=points)
+    sets = {name: _following(one, body.landmarks, landmarks) for name, one in body.keypoint_sets.items()}
+    return replace(
+        body, tree=body.tree.with_offsets(offsets), landmarks=landmarks, keypoint_sets=sets,
+        closures=tuple(closures.values()), dimensions=tuple(known.values()),
+    )  # fmt: skip
+
+
+def _following(points: PointSet, old: PointSet, new: PointSet) -> PointSet:
+    """A set of points of which those that lie on a landmark that moved go along."""
+    at = {(int(s), tuple(x)): k for k, (s, x) in enumerate(zip(old.segments, old.points))}
+    out = np.array(points.points)
+    for i, (s, x) in enumerate(zip(points.segments, points.points)):
+        k = at.get((int(s), tuple(x)))
+        if k is not None:
+            out[i] = new.points[k]
+    return replace(points, points=out)
+
+
+def _shifted(closure: Closure, shift: NDArray, turn: NDArray) -> Closure:
+    """A closure whose place in the world lies elsewhere, or whose segment is turned on."""
+    out = closure
+    if shift.any():
+        out = replace(out, place=tuple((np.array(out.place) + shift).tolist()))
+    if turn.any():
+        R = se3.exp_so3(turn) @ se3.exp_so3(np.array(out.turn))
+        out = replace(out, turn=tuple(se3.log_so3(R).tolist()))
+    return out
+
+
+def with_places(body: Body, places: Mapping[str, tuple[NDArray, NDArray]]) -> Body:
+    """The body with other places (3,) [m] and turns (3,) [rad] of some closures to the world."""
+    out = []
+    for c in body.closures:
+        if c.name in places:
+            at, turn = places[c.name]
+            c = replace(c, place=tuple(np.asarray(at, float).tolist()), turn=tuple(np.asarray(turn, float).tolist()))
+        out.append(c)
+    return replace(body, closures=tuple(out))
+
+
+def known_gear(body: Body) -> Body:
+    """The body whose dimensions and places in the world are taken for known as they are."""
+    return replace(
+        body, closures=tuple(replace(c, place_std=0.0, turn_std=0.0) for c in body.closures),
+        dimensions=tuple(replace(d, std=0.0) for d in body.dimensions),
+    )  # fmt: skip
+
+
+def has_unknown_gear(body: Body) -> bool:
+    """Whether a dimension or a place in the world is to be estimated."""
+    return any(c.place_std > 0.0 for c in body.closures) or any(d.std > 0.0 for d in body.dimensions)
+
+
+def without_landmarks(closures: tuple[Closure, ...], there: tuple[str, ...]) -> tuple[Closure, ...]:
+    """The closures whose landmarks are still there."""
+    return tuple(c for c in closures if c.point in there and (not c.to or c.to in there))

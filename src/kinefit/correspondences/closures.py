@@ -1,0 +1,208 @@
+"""What closes chains of a body, as rows (P3 3.2, eqs. 15-19).
+
+A point x_a of one segment stays at x_b of another (or of the world) along the directions n of b's frame:
+
+    r = n·(x_b − x_a),    δr = −(n, x_a × n)·(δξ_a − δξ_b)
+
+Both twists act at x_a, since n turns with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
+δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows of their standard deviation, as in the paper; hard ones
+are equations for `solvers.closed`, or rows of `STIFF` where a quadratic cost is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.closures import with_dimensions
+from kinefit.correspondences import _kernels_closures
+from kinefit.geometry import se3
+from kinefit.rows import DofRows
+
+STIFF = 1e-4
+"""[m, rad] standard deviation of a hard closure where it enters a quadratic cost; what is solved is then made exact."""
+
+_WORLD = np.array([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])  # frame of segment -1
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """Closures of a body at a state: m equations c = 0.
+
+    Parameters
+    ----------
+    value : (m,) [m, rad] c, how far each is off.
+    jacobian : (m, n) of c by the degrees of freedom.
+    sigma : (m,) [m, rad] standard deviation, what is not known of gear included; 0 where it holds exactly.
+    """
+
+    value: NDArray
+    jacobian: NDArray
+    sigma: NDArray
+
+    @property
+    def hard(self) -> NDArray:
+        """(m,) bool, equations that hold exactly."""
+        return self.sigma == 0.0
+
+    def chosen(self, some: NDArray) -> Closed:
+        """Some of the equations."""
+        return Closed(self.value[some], self.jacobian[some], self.sigma[some])
+
+    def rows(self, stiff: float = STIFF) -> DofRows:
+        """All of them as rows, hard ones with a standard deviation."""
+        weight = 1.0 / np.square(np.where(self.hard, stiff, self.sigma))
+        return DofRows(self.jacobian, -self.value, weight, np.full(len(weight), -1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """Closures of a body as arrays: K closures, m equations, numbered `first` .. of each."""
+
+    segments: NDArray  # (K, 2) int, -1 for the world
+    rest: NDArray  # (K, 2, 3) [m] points in the root frame at rest, or in the world
+    directions: NDArray  # (m, 3) in the other's frame, zeros for a turn
+    owner: NDArray  # (m,) int
+    rigid: tuple[tuple[int, int], ...]  # closure, first of its turn equations
+    turns: NDArray  # (K, 3, 3)
+    sigma: NDArray  # (m,)
+
+
+@lru_cache(maxsize=256)
+def _table(body: Body) -> _Table:
+    names, marks, rest = list(body.landmarks.names), body.landmarks, body.points_rest(body.landmarks)
+    segments, points, directions, owner, sigma, rigid = [], [], [], [], [], []
+    for k, c in enumerate(body.closures):
+        a = names.index(c.point)
+        b = names.index(c.to) if c.to else -1
+        segments.append((marks.segments[a], marks.segments[b] if c.to else -1))
+        points.append((rest[a], rest[b] if c.to else np.array(c.place)))
+        E = c.directions
+        directions.append(E)
+        place = c.place_std if c.place_std > 0.0 else 0.0
+        sigma += [0.0 if c.hard and not place else float(np.hypot(0.0 if c.hard else c.sigma, place))] * len(E)
+        if c.kind == "rigid":
+            rigid.append((k, sum(map(len, directions))))
+            directions.append(np.zeros((3, 3)))
+            turn = 0.0 if c.hard else c.turn_sigma
+            sigma += [float(np.hypot(turn, c.turn_std))] * 3
+        owner += [k] * c.rows
+    turns = se3.exp_so3(np.array([c.turn for c in body.closures]).reshape(-1, 3))
+    return _Table(
+        np.array(segments, np.int64).reshape(-1, 2), np.array(points, float).reshape(-1, 2, 3),
+        np.concatenate([*directions, np.zeros((0, 3))]), np.array(owner, np.int64), tuple(rigid), turns,
+        np.array(sigma, float),
+    )  # fmt: skip
+
+
+def owners(body: Body) -> NDArray:
+    """(m,) int, the closure of each equation."""
+    return _table(body).owner
+
+
+@lru_cache(maxsize=64)
+def _loose(body: Body) -> NDArray:
+    """(m,) standard deviation of each equation by what is not known of the gear's dimensions, in the usual posture."""
+    variance = np.zeros(len(_table(body).owner))
+    for d in body.dimensions:
+        if d.std > 0.0:
+            step = 0.1 * d.std
+            ends = [closure_values(with_dimensions(body, {d.name: d.value + s * step}), body.usual_state()) for s in (1, -1)]
+            variance += np.square((ends[0] - ends[1]) / (2.0 * step) * d.std)
+    out = np.sqrt(variance)
+    out[out < 1e-9] = 0.0
+    return out
+
+
+def closure_values(body: Body, state: BodyState) -> NDArray:
+    """(m,) [m, rad] how far every equation of a body's closures is off."""
+    return _placed(body, state, body.tree.forward(state.T_world_root, state.angles)[0])[0]
+
+
+def _placed(body: Body, state: BodyState, frames: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Values (m,), points x_a (K, 3), directions of all equations (m, 3) in the world, frames of the turns (K, 3, 3)."""
+    t = _table(body)
+    f = np.concatenate([frames, _WORLD])[t.segments]
+    R = f[..., :9].reshape(-1, 2, 3, 3)
+    x = (R @ t.rest[..., None])[..., 0] + f[..., 9:]
+    n = (R[t.owner, 1] @ t.directions[:, :, None])[..., 0]
+    value = np.einsum("mi,mi->m", n, (x[:, 0] - x[:, 1])[t.owner])
+    M = R[:, 1] @ t.turns
+    for k, first in t.rigid:
+        value[first : first + 3] = se3.log_so3(M[k].T @ R[k, 0])
+    return value, x[:, 0], n, M
+
+
+def closed_at(body: Body, state: BodyState) -> Closed:
+    """The closures of a body at a state."""
+    t, tree = _table(body), body.tree
+    frames, screws = tree.forward(state.T_world_root, state.angles)
+    value, x, n, M = _placed(body, state, frames)
+    data = np.zeros((2, len(t.owner), 6))  # what of the twists of both segments each equation takes
+    data[:, :, :3] = n
+    data[:, :, 3:] = np.cross(x[t.owner] - state.T_world_root[:3, 3], n)
+    for k, first in t.rigid:
+        e = value[first : first + 3]
+        data[:, first : first + 3, 3:] = np.linalg.solve(se3.left_jacobian_so3(e), M[k].T)
+    data[1] *= -1.0
+    J, segments = np.zeros((len(t.owner), tree.n_dofs)), np.ascontiguousarray(t.segments[t.owner].T)
+    _kernels_closures.twists(data, segments, screws, tree.dof_parent, tree.last_dof, J)
+    return Closed(value, J, np.hypot(t.sigma, _loose(body)))
+
+
+def closure_rows(body: Body, state: BodyState) -> DofRows:
+    """Rows of all closures of a body, r = −c: soft ones by their standard deviation, hard ones by `STIFF`."""
+    return closed_at(body, state).rows()
+
+
+def soft_rows(body: Body, state: BodyState) -> list[DofRows]:
+    """Rows of the closures that do not hold exactly, where there are any."""
+    if not body.closures:
+        return []
+    closed = closed_at(body, state)
+    soft = ~closed.hard
+    return [closed.chosen(soft).rows()] if soft.any() else []
+
+
+def all_rows(body: Body, state: BodyState) -> list[DofRows]:
+    """Rows of all closures, where there are any: for quadratic costs."""
+    return [closure_rows(body, state)] if body.closures else []
+
+
+def hard_equations(body: Body) -> Callable[[BodyState], tuple[NDArray, NDArray]] | None:
+    """State -> values and Jacobian of what holds exactly; None where nothing does."""
+    hard = np.hypot(_table(body).sigma, _loose(body)) == 0.0 if body.closures else np.zeros(0, bool)
+    if not hard.any():
+        return None
+
+    def equations(state: BodyState) -> tuple[NDArray, NDArray]:
+        closed = closed_at(body, state)
+        return closed.value[hard], closed.jacobian[hard]
+
+    return equations
+
+
+@lru_cache(maxsize=64)
+def looped(body: Body) -> NDArray:
+    """(D,) bool, coordinates within a closed chain: what they are follows from those of the others in it."""
+    out = np.zeros(body.tree.n_dofs, bool)
+    for a, b in _table(body).segments:
+        paths = []
+        for s in (a, b):
+            path = np.zeros(len(out), bool)
+            if s >= 0:
+                last = int(body.tree.last_dof[s])
+                path[body.tree.chain[last, : body.tree.depth[last] + 1]] = True
+            paths.append(path)
+        out |= paths[0] ^ paths[1]
+    return out[6:]
+
+
+def with_closures(body: Body, closures: Sequence[str]) -> Body:
+    """The body with some of its closures alone, by name."""
+    return replace(body, closures=tuple(c for c in body.closures if c.name in closures))

@@ -1,0 +1,186 @@
+"""Fits under equations that hold exactly: hard closures of a body (P3 3.2, as an equality-constrained step).
+
+With H the normal matrix, g the gradient, A the Jacobian of the equations c = 0, and Z what A leaves free, a step is
+
+    δ = −A⁺ c + Z (Zᵀ (H + λ) Z)⁻¹ Zᵀ (g + (H + λ) A⁺ c)
+
+which solves the Karush-Kuhn-Tucker system without its multipliers, whatever equations follow from others. Every trial
+state is brought back onto c = 0 before its cost is compared, so that a fit never trades one for the other. Covariances
+are those on the null space of A.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.losses import SQUARED, Loss
+from kinefit.rows import AnyRows
+from kinefit.solvers import _kernels_linear
+from kinefit.solvers.equations import lock, normal_equations
+from kinefit.solvers.least_squares import Fit, MakeRows, Step, bounds_of
+
+CLOSED = 1e-9
+"""[m, rad] by which an equation may be off and still hold."""
+
+_RANK = 1e-7  # of the largest singular value of A, below which an equation follows from the others
+_BACK = 30  # Newton steps back onto the equations
+_ACTIVE = 6  # rounds of holding coordinates at the limits that a step would leave
+
+Constraint = Callable[[BodyState], tuple[NDArray, NDArray]]
+"""State -> c (m,) and its Jacobian A (m, n)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Null:
+    """What equations leave free of some degrees of freedom.
+
+    Parameters
+    ----------
+    free : (n, n − r) Z, orthonormal directions that the equations do not see; zero for what is held.
+    back : (n,) −A⁺ c, the shortest step onto them.
+    """
+
+    free: NDArray
+    back: NDArray
+
+
+def null_space(A: NDArray, c: NDArray, held: NDArray) -> Null:
+    """Of equations with Jacobian A (m, n) and values c (m,), where some degrees of freedom (n,) bool stay."""
+    open_to = np.flatnonzero(~held)
+    U, s, Vt = np.linalg.svd(A[:, open_to])
+    rank = int(np.sum(s > _RANK * max(float(s.max(initial=0.0)), 1e-12)))
+    free, back = np.zeros((A.shape[1], len(open_to) - rank)), np.zeros(A.shape[1])
+    free[open_to] = Vt[rank:].T
+    back[open_to] = -Vt[:rank].T @ ((U[:, :rank].T @ c) / s[:rank])
+    return Null(free, back)
+
+
+def onto(
+    body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, locked: NDArray | None = None,
+    steps: int = _BACK,
+) -> tuple[BodyState, float]:  # fmt: skip
+    """The state nearest to one at which the equations hold, and by how much the worst of them is off still."""
+    bounds, fixed = bounds_of(body, limits), lock(body, locked)
+    c, A = constraint(state)
+    worst, best = float(np.abs(c).max(initial=0.0)), float(c @ c)
+    for _ in range(steps):
+        if worst <= CLOSED:
+            break
+        held, share = fixed.copy(), 1.0
+        for _ in range(_ACTIVE):
+            delta = null_space(A, c, held).back
+            out = _beyond(state, delta, bounds) & ~held
+            if not out.any():
+                break
+            held |= out
+        moved = None
+        while share > 1e-3:  # a step that leads away from the equations was too long
+            trial = state.retract(share * delta, bounds)
+            new_c, new_A = constraint(trial)
+            if float(new_c @ new_c) < best:
+                moved = trial
+                break
+            share *= 0.3
+        if moved is None:
+            break
+        state, c, A, best = moved, new_c, new_A, float(new_c @ new_c)
+        worst = float(np.abs(c).max(initial=0.0))
+    return state, worst
+
+
+def _beyond(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -> NDArray:
+    """(n,) bool, coordinates that a step takes beyond their limits."""
+    angles = state.angles + delta[6:]
+    out = np.zeros(len(delta), bool)
+    out[6:] = (angles < bounds[0] - 1e-12) | (angles > bounds[1] + 1e-12)
+    return out
+
+
+def _step(
+    H: NDArray, g: NDArray, damping: float, A: NDArray, c: NDArray, state: BodyState,
+    bounds: tuple[NDArray, NDArray], locked: NDArray,
+) -> tuple[NDArray, float]:  # fmt: skip
+    """δ (n,) of the constrained step and the fall of the cost that it predicts, from a state that is on the equations."""
+    damped = H + damping * np.eye(len(H))
+    at_limit = np.zeros(len(g), bool)
+    at_limit[6:] = ((state.angles <= bounds[0]) & (g[6:] < 0.0)) | ((state.angles >= bounds[1]) & (g[6:] > 0.0))
+    held = locked | at_limit
+    delta = np.zeros(len(g))
+    for _ in range(_ACTIVE):
+        null = null_space(A, c, held)
+        Z = null.free
+        push = Z.T @ (g - damped @ null.back)
+        delta = null.back + Z @ np.linalg.solve(Z.T @ damped @ Z, push)
+        out = _beyond(state, delta, bounds) & ~held
+        if not out.any():
+            break
+        held |= out
+    return delta, float(delta @ g) + damping * float(delta @ delta)
+
+
+def closed_fit(
+    body: Body, state: BodyState, make_rows: MakeRows, constraint: Constraint, *, loss: Loss = SQUARED,
+    limits: bool = True, locked: NDArray | None = None, damping: float | None = None, max_iterations: int = 50,
+    tolerance: float = 1e-9,
+) -> Fit:  # fmt: skip
+    """Minimise Σ ρ(w r²) under equations, by Levenberg-Marquardt; arguments as of `levenberg_marquardt`.
+
+    Where the equations cannot be met from the start, the fit ends at once, at the state that comes nearest.
+    """
+    bounds, held = bounds_of(body, limits), lock(body, locked)
+    state = state.retract(np.zeros(body.tree.n_dofs), bounds)
+    state, off = onto(body, state, constraint, limits=limits, locked=locked)
+    eq = normal_equations(body, state, make_rows(state), loss=loss)
+    if off > CLOSED:
+        return Fit(state, eq, 1, False, damping or 0.0)
+    mean = float(eq.diagonal.mean()) + 1e-300
+    damping, growth = (0.1 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    nothing, H, g = 1e-16 * eq.cost, eq.matrix, eq.gradient
+    c, A = constraint(state)
+    for iteration in range(1, max_iterations + 1):
+        delta, predicted = _step(H, g, damping, A, c, state, bounds, held)
+        if predicted <= tolerance * eq.cost + nothing:
+            return Fit(state, eq, iteration, True, damping)
+        candidate, off = onto(body, state.retract(delta, bounds), constraint, limits=limits, locked=locked, steps=8)
+        fall, new = -1.0, None
+        if off <= CLOSED:
+            new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
+            fall = eq.cost - new.cost
+        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted)
+        if new is not None and fall > 0.0:
+            state, eq, H, g = candidate, new, new.matrix, new.gradient
+            c, A = constraint(state)
+        elif damping > 1e16 * mean:
+            return Fit(state, eq, iteration, True, damping)
+    return Fit(state, eq, max_iterations, False, damping)
+
+
+def closed_step(
+    body: Body, state: BodyState, rows: AnyRows | Iterable[AnyRows], constraint: Constraint, *, loss: Loss = SQUARED
+) -> Step:
+    """One constrained Gauss-Newton step for rows linearised at `state`; for loops that renew their rows (ICP)."""
+    bounds, held = bounds_of(body, True), lock(body, None)
+    eq = normal_equations(body, state, rows, loss=loss)
+    damping = 1e-12 * float(eq.diagonal.mean()) + 1e-300
+    c, A = constraint(state)
+    delta, _ = _step(eq.matrix, eq.gradient, damping, A, c, state, bounds, held)
+    moved, _ = onto(body, state.retract(delta, bounds), constraint)
+    return Step(moved, delta, float(np.linalg.norm(delta)), eq)
+
+
+def on_null_space(covariance: NDArray, A: NDArray) -> NDArray:
+    """Covariance (n, n) of what equations of Jacobian A (m, n) leave free: P − P Aᵀ (A P Aᵀ)⁺ A P."""
+    if not len(A):
+        return covariance
+    across = A @ covariance
+    S = across @ A.T
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+    inner = np.linalg.pinv(S * scale[:, None] * scale[None, :], rcond=1e-12, hermitian=True)
+    left = across * scale[:, None]
+    out = covariance - left.T @ inner @ left
+    return 0.5 * (out + out.T)

@@ -1,0 +1,226 @@
+"""How freely a body with closures moves: Gruebler's count beside the rank of what closes it (P3 eq. 9, 3).
+
+Gruebler: N moving links and g joints of fᵢ freedoms leave F = 6 (N − g) + Σ fᵢ; every joint of the tree is one, and every
+closure another. That count knows of no geometry. The rank of the closures' Jacobian at closed poses does: where equations
+follow from others, the body moves more freely than F says, and is over-constrained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import closed_at, owners
+from kinefit.correspondences.parameters import prior_rows
+from kinefit.errors import BodyError
+from kinefit.rows import DofRows
+from kinefit.solvers.closed import CLOSED, null_space, onto
+from kinefit.solvers.equations import lock
+from kinefit.solvers.least_squares import levenberg_marquardt
+
+_RANK = 1e-6  # of the largest singular value of the Jacobian: generic poses of the catalogue's have 1e-3 and more
+_MOVE = 0.02  # [m, rad] of a step along a direction that the Jacobian leaves free
+_MOVES = 0.5  # share of such a step that must be left once the equations hold again
+_POSES = 4  # closed poses that are looked at
+_TRIED = 12  # starts for them
+_SOFT = 0.01  # [m, rad] standard deviation of closures in the fit that leads to a closed pose
+_OFF = 3.0  # standard deviations by which a soft closure may be off in its best pose
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """What a body's closures leave of its freedoms.
+
+    Parameters
+    ----------
+    links : N, segments that move
+    joints : g, those of the tree and closures
+    open_dofs : degrees of freedom of the open tree, its root included
+    equations : how many the closures are
+    gruebler : F
+    rank : of the closures' Jacobian at closed poses
+    mobility : freedoms with which the closed body moves by finite steps
+    redundant : what follows from what else, where Gruebler's count is not the mobility
+    """
+
+    links: int
+    joints: int
+    open_dofs: int
+    equations: int
+    gruebler: int
+    rank: int
+    mobility: int
+    redundant: tuple[str, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether Gruebler's count is the mobility."""
+        return self.gruebler == self.mobility
+
+
+def mobility(body: Body, seed: int = 0) -> Mobility:
+    """Of a body, with or without closures.
+
+    Raises
+    ------
+    BodyError
+        Closures that contradict each other: no pose satisfies them.
+    """
+    fixed, tree = lock(body, None), body.tree
+    count = int(np.sum(~fixed))
+    links = len(tree.segments) - (0 if tree.root_free else 1)
+    joints = links + len(body.closures)
+    taken = len(owners(body)) if body.closures else 0
+    freedoms = count + sum(6 - c.rows for c in body.closures)
+    F = 6 * (links - joints) + freedoms
+    if not body.closures:
+        return Mobility(links, joints, count, 0, F, 0, count, ())
+    poses = closed_poses(body, seed)
+    ranks, moves = [], []
+    for state in poses:
+        A = closed_at(body, state).jacobian[:, ~fixed]
+        s = np.linalg.svd(A, compute_uv=False)
+        ranks.append(int(np.sum(s > _RANK * s[0])))
+        moves.append(_finite(body, state, fixed))
+    best = int(np.argmax(ranks))
+    return Mobility(
+        links, joints, count, taken, F, ranks[best], moves[best],
+        _redundant(body, closed_at(body, poses[best]).jacobian[:, ~fixed]),
+    )  # fmt: skip
+
+
+def closed_poses(body: Body, seed: int = 0, most: int = _POSES) -> list[BodyState]:
+    """Poses in which all closures hold exactly, soft ones too.
+
+    Raises
+    ------
+    BodyError
+        There are none.
+    """
+    random, out, least = np.random.default_rng(seed), list[BodyState](), (np.inf, body.usual_state())
+    for k in range(_TRIED):
+        state, off = _closed(body, _start(body, random, 0.0 if k == 0 else 1.0))
+        if off <= CLOSED:
+            out.append(state)
+            if len(out) == most:
+                break
+        elif off < least[0]:
+            least = off, state
+    if not out:
+        raise contradictory(body, least[1])
+    return out
+
+
+def contradictory(body: Body, state: BodyState) -> BodyError:
+    """That no pose satisfies all closures; a state that comes near tells which."""
+    closed, owner = closed_at(body, state), owners(body)
+    told = []
+    for k, c in enumerate(body.closures):
+        off = float(np.linalg.norm(closed.value[owner == k][:3]))
+        turn = float(np.linalg.norm(closed.value[owner == k][3:]))
+        if off > 1e-4 or turn > 1e-3:
+            told.append(f"'{c.name}' by {1e3 * off:.1f} mm" + (f" and {np.degrees(turn):.1f} deg" if turn > 0.0 else ""))
+    problem = f"closures of body '{body.name}' that contradict each other: in the best pose found they are off, "
+    remedy = "Correct the places of their landmarks and their joints' ranges, or make one of them soft."
+    return BodyError(problem + ", ".join(told), remedy=remedy)
+
+
+@lru_cache(maxsize=16)
+def check_closed(body: Body) -> None:
+    """That a body's closures can be met and leave it some freedom: once before it is tracked.
+
+    Raises
+    ------
+    BodyError
+        Hard closures that no pose satisfies, soft ones that none satisfies within three standard deviations; closures
+        that leave nothing to move.
+    """
+    if not body.closures:
+        return
+    random, least = np.random.default_rng(0), (np.inf, body.usual_state())
+    for k in range(_TRIED):
+        state, _ = _closed(body, _start(body, random, 0.0 if k == 0 else 1.0))
+        closed = closed_at(body, state)
+        worst = float(np.max(np.abs(closed.value) / np.where(closed.hard, 1e3 * CLOSED, _OFF * closed.sigma + 1e-12)))
+        if worst <= 1.0:
+            fixed = lock(body, None)
+            held = closed.chosen(closed.hard)
+            if held.jacobian.size and not null_space(held.jacobian, held.value, fixed).free.shape[1]:
+                problem = f"the closures of body '{body.name}' leave nothing to move: it is over-constrained"
+                raise BodyError(problem, remedy="`kinefit body check` tells which of them say the same.")
+            return
+        if worst < least[0]:
+            least = worst, state
+    raise contradictory(body, least[1])
+
+
+def _start(body: Body, random: np.random.Generator, share: float) -> BodyState:
+    """The usual pose, and departures from it within the limits and a radian."""
+    tree = body.tree
+    width = np.minimum(np.where(np.isfinite(tree.upper - tree.lower), 0.5 * (tree.upper - tree.lower), 1.0), 1.0)
+    delta = np.concatenate([np.zeros(6), share * width * random.uniform(-1.0, 1.0, len(width))])
+    return body.usual_state().retract(delta, (tree.lower, tree.upper))
+
+
+def _closed(body: Body, start: BodyState) -> tuple[BodyState, float]:
+    """A closed pose near a start: first by least squares, beside a weak posture prior, then exactly."""
+
+    def rows(state: BodyState) -> list[DofRows]:
+        closed = closed_at(body, state)
+        return [DofRows(closed.jacobian, -closed.value, np.full(len(closed.value), _SOFT**-2), np.full(len(closed.value), -1))]
+
+    near = levenberg_marquardt(
+        body, start, lambda state: [*rows(state), prior_rows(body, state)], max_iterations=60, tolerance=1e-6
+    )
+    near = levenberg_marquardt(body, near.state, rows, max_iterations=60, tolerance=1e-8)
+    return onto(body, near.state, _equations(body))
+
+
+def _equations(body: Body) -> Callable[[BodyState], tuple[NDArray, NDArray]]:
+    def equations(state: BodyState) -> tuple[NDArray, NDArray]:
+        closed = closed_at(body, state)
+        return closed.value, closed.jacobian
+
+    return equations
+
+
+def _finite(body: Body, state: BodyState, fixed: NDArray) -> int:
+    """In how many directions a closed pose moves by a finite step and is closed again."""
+    equations = _equations(body)
+    c, A = equations(state)
+    free = null_space(A, c, fixed).free
+    moved = np.zeros_like(free)
+    for k, z in enumerate(free.T):
+        again, off = onto(body, state.retract(_MOVE * z), equations, limits=False)
+        if off <= CLOSED:
+            moved[:, k] = state.difference(again) / _MOVE
+    s = np.linalg.svd(free.T @ moved, compute_uv=False) if free.shape[1] else np.zeros(0)
+    return int(np.sum(s > _MOVES))
+
+
+def _redundant(body: Body, A: NDArray) -> tuple[str, ...]:
+    """Which equations follow from the others, closure by closure."""
+    owner, out = owners(body), []
+    rank = _rank(A)
+    if rank == len(A):
+        return ()
+    U = np.linalg.svd(A)[0][:, rank:]  # combinations of equations that say nothing
+    for k, c in enumerate(body.closures):
+        adds = rank - _rank(A[owner != k])
+        if adds < c.rows:
+            said = [name for name, u in zip(c.row_names, np.abs(U[owner == k]).max(axis=1)) if u > 0.1]
+            told = f"closure '{c.name}' has {c.rows} equations, of which {adds} say what no other does"
+            out.append(told + (f" (in question: {', '.join(said)})" if said else ""))
+    return tuple(out)
+
+
+def _rank(A: NDArray) -> int:
+    if not len(A):
+        return 0
+    s = np.linalg.svd(A, compute_uv=False)
+    return int(np.sum(s > _RANK * s[0])) if s[0] > 0.0 else 0
