@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import all_rows
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.border_frames import Part, Weighing, differences, frame_at, gram
 from kinefit.solvers.equations import joint_moves, normal_equations
-from kinefit.subject.matched_frames import Worlds
+from kinefit.subject.matched_frames import CLOSURES, Worlds
 from kinefit.subject.parameters import PointOffsets, stacked
 from kinefit.subject.subject import SubjectFit
 from kinefit.subject.surfaces import CylinderShape, Girths
@@ -114,9 +115,10 @@ class _Frame:
         return self.worlds.at(self._all(values)).body
 
     def parts(self, values: NDArray, frame: int, state: BodyState) -> list[Part]:
-        """Rows of points."""
+        """Rows of points, and of what closes chains."""
         scene = self._scene(values)
-        return [(m.sensor, rows) for m in self.matched if m.of_points for rows in rows_at(m, scene)]
+        points = [(m.sensor, rows) for m in self.matched if m.of_points for rows in rows_at(m, scene)]
+        return [*points, *((CLOSURES, rows) for rows in all_rows(scene.body, scene.state))]
 
     def points(self, step: NDArray) -> NDArray:
         """(n, q) ∂g/∂θ of all points."""

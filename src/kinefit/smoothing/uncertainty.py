@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.correspondences import _kernels, targets
+from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.sensors.keypoints import Layout
@@ -28,7 +29,8 @@ from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
 from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
 from kinefit.solvers.whitened import Pose, columns
-from kinefit.subject.matched_frames import point_moves
+from kinefit.subject.closure_moves import ClosureMoves
+from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves
 from kinefit.subject.subject import Subject
 
@@ -76,9 +78,10 @@ def with_lasting_errors(
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
-    moves, Sigma = None, np.zeros((0, 0))
+    moves, closing, Sigma = None, None, np.zeros((0, 0))
     if subject.fit is not None and subject.covariance is not None:
         moves, Sigma = point_moves(subject.fit), subject.covariance
+        closing = closing_moves(subject.fit, body)
     layout = Layout(channels.with_points(body), body)
     half, n = round(_TIED * rate), body.tree.n_dofs
     weights = pooled(weight, half)
@@ -87,7 +90,7 @@ def with_lasting_errors(
     added, alone = [], []
     for f, result in enumerate(results):
         more = nothing if others is None else others.pooled(f, half)
-        one = lasting(moves, Sigma, layout, result.state, weights[f], noise, *more)
+        one = lasting(moves, Sigma, layout, result.state, weights[f], noise, *more, closing=closing)
         added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
         if f in sampled:
             alone.append(one.alone)
@@ -113,7 +116,8 @@ def pooled(values: NDArray, half: int) -> NDArray:
 
 def lasting(
     moves: PointMoves | None, Sigma_shape: NDArray, layout: Layout, state: BodyState, weight: NDArray,
-    noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
+    noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray, *,
+    closing: ClosureMoves | None = None,
 ) -> Lasting:  # fmt: skip
     """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
@@ -122,6 +126,7 @@ def lasting(
     moves : how points move with the shape, None for one that is exact; Sigma_shape (p, p) the shape's covariance.
     weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
     other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
+    closing : how the body's closures move with the shape; their own deviations last
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     n = tree.n_dofs
@@ -135,6 +140,12 @@ def lasting(
     if moves is not None:
         told = moves.columns(layout.places, rows, tree, frames)
         by_shape, stretch = by_shape if told is None else told, moves.joints(tree, frames)
+    if body.closures:
+        closed = closed_at(body, state)
+        w = closed.rows().weight
+        other_information = other_information + closed.jacobian.T @ (w[:, None] * closed.jacobian)
+        soft = (w * ~closed.hard)[:, None] * closed.jacobian
+        other_lasting = other_lasting + soft.T @ closed.jacobian
     prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
@@ -144,7 +155,10 @@ def lasting(
     sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shift))]
     push = np.concatenate([last[:, None] * pushed, *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
     meat = product(push.T, push) + other_lasting
-    answer = -product(alone, product(by_pose.T, by_shape))
+    pushed_by_shape = product(by_pose.T, by_shape)
+    if closing is not None:
+        pushed_by_shape = pushed_by_shape + closed.jacobian.T @ (w[:, None] * closing.at(state))
+    answer = -product(alone, pushed_by_shape)
     dofs = product(product(alone, meat), alone)
     moved = joint_moves(body, state)
     whole = product(moved, answer) + stretch

@@ -13,12 +13,17 @@ from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part, apart
+from kinefit.subject.closure_moves import ClosureMoves, closing_rows
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import PointMoves
 from kinefit.subject.subject import SubjectFit
 
+CLOSURES = "closures"
+"""Under which name what closes a body's chains stands among the sensors."""
+
 _KEPT = 64  # worlds that are remembered
+_CLOSING = ("tree", "landmarks", "closures")  # of a body, what its closures depend on
 _SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
 
 
@@ -76,6 +81,21 @@ class Worlds:
             pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
         return PointMoves(pairs, some, steps, self.touches)
 
+    def closing(self, theta: NDArray, steps: NDArray) -> ClosureMoves | None:
+        """How closures of the body move with the parameters; None for a body without."""
+        if not self._first.body.closures:
+            return None
+        pairs, body = [], self.at(theta).body
+        for k, step in enumerate(steps):
+            ends = []
+            for sign in (-1.0, 1.0):
+                change = np.zeros(len(theta))
+                change[k] = sign * step
+                ends.append(self.at(theta + change).body)
+            same = all(getattr(ends[0], part) is getattr(body, part) for part in _CLOSING)
+            pairs.append(None if same else (ends[0], ends[1]))
+        return ClosureMoves(body, pairs, steps)
+
     def scene(self, world: World, state: BodyState) -> Scene:
         """A scene of a world; those of one body share what was made for it."""
         key = id(world.body)
@@ -118,14 +138,14 @@ class MatchedFrames:
         for i, (measurement, matched) in enumerate(zip(self._steps[frame], self._matched[frame], strict=True)):
             rows = self._rows((frame, i), measurement.sensor, matched, scene, world)
             out += [(measurement.sensor, part) for part in rows]
-        return out
+        return [*out, *((CLOSURES, rows) for rows in closing_rows(world.body, state))]
 
     def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
         """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
         world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
         some = len(moving) and any(m.places is not None for several in self._matched for m in several)
         moves = self._worlds.moves(theta, steps, moving) if some else None
-        out = []
+        closing, out = self._worlds.closing(theta, steps), []
         for f, state in enumerate(states):
             scene, blocks = self._scene(world, f, state), [np.empty((0, len(theta)))]
             for i, matched in enumerate(self._matched[f]):
@@ -137,6 +157,8 @@ class MatchedFrames:
                     told = moves.columns(matched.places, rows, there.body.tree, there.frames)
                     if told is not None:
                         blocks[-1][:, moving] = told
+            if closing is not None:
+                blocks.append(closing.whitened(state))
             out.append(np.concatenate(blocks))
         return out
 
@@ -179,6 +201,17 @@ def point_moves(found: SubjectFit) -> PointMoves:
     """How points and joints move with the parameters of a fit, all of which move nothing else."""
     worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
     return worlds.moves(found.mean, step, np.arange(len(step)))
+
+
+def closing_moves(found: SubjectFit, body: Body) -> ClosureMoves | None:
+    """How closures of a body move with the parameters of a fit, which may have known less of the body's gear.
+
+    None for a body without closures.
+    """
+    if not body.closures:
+        return None
+    world = replace(found.prior_world, body=replace(found.prior_world.body, closures=body.closures))
+    return Worlds(world, found.parameters).closing(found.mean, stacked(found.parameters)[3])
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

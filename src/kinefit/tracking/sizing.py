@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.closures import has_unknown_gear
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.initialization.from_depth import sized_start
@@ -93,7 +94,7 @@ def fitted_to_person(
             problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
             raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
     person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
-    unknown = any(s.unknowns for s in recording.sensors)
+    unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
@@ -108,7 +109,7 @@ def fitted_to_person(
             person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
         if recording.depth:
             person = _by_depth(person, progress)
-    return _by_all(person, body, settings, progress, height=height, trial=trial) if others else person
+    return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
 
 
 def _others(recording: Recording) -> bool:
@@ -172,7 +173,8 @@ def _by_all(
         )  # fmt: skip
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
-    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and tracked.measurements[k]]
+    keypoints = bool(r.keypoints)
+    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and (tracked.measurements[k] or keypoints)]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
     surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
@@ -200,7 +202,7 @@ def _by_all(
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states
     lengths = points is None and person.subject.fit is None and not person.joint
-    left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
+    left = of_all(r, person.subject.body, states, size=size, lengths=lengths, surfaces=surfaces)
     if left is not None:
         found = fit(left, steps, states)
         person, states = _by_joint(person, found), found.states

@@ -28,6 +28,7 @@ from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject
 from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recovery import Recovery
@@ -93,6 +94,7 @@ class Tracker:
 
     def _wear(self, body: Body) -> None:
         s = self.settings
+        check_closed(body)
         self.body, self._seen = body, np.full(len(body.tree.coordinates), -np.inf)  # [s] when each was last observed
         self._fit = FrameFit(body, s)
         self._scene = Scene(

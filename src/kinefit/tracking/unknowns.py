@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.subject.gear import Gear
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import OwnUnknowns
 from kinefit.subject.subject import Subject
@@ -73,12 +74,15 @@ def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
     return np.asarray(values)[[whole.names.index(name) for name in part.names]]
 
 
-def of_all(recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool) -> Unknowns | None:
-    """What is left for all sensors together: the body's surface, and what sensors do not know of themselves.
+def of_all(
+    recording: Recording, body: Body, states: Sequence[BodyState], *, size: bool, lengths: bool, surfaces: bool
+) -> Unknowns | None:
+    """What is left for all sensors together: the body's surface, gear, and what sensors do not know of themselves.
 
     Parameters
     ----------
     body : as sized as it is already
+    states : some poses of it
     size : whether anything of the body is sought
     lengths : whether neither points nor a few depth images have told them: nearest points of a surface of simple
         shapes, frame after frame, are surer of lengths than they are right
@@ -89,6 +93,9 @@ def of_all(recording: Recording, body: Body, *, size: bool, lengths: bool, surfa
         found.append((SegmentScales(body), np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]
+    gear = Gear(body)
+    if gear.names:
+        found.append((gear, gear.start(states)))
     unknown = OwnUnknowns.of(recording.sensors)
     if unknown.names:
         found.append((unknown, unknown.mean))

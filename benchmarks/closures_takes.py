@@ -1,0 +1,226 @@
+"""Simulated takes of people with gear: motions in which every closure holds, and what cameras' detectors would see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import amount
+from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies.closures import Closure
+from kinefit.correspondences import prior_rows
+from kinefit.correspondences.closures import closed_at
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
+from kinefit.rows import AnyRows, DofRows, ParameterRows
+from kinefit.simulation import simulate_keypoints, studio_rig
+from kinefit.solvers.closed import CLOSED, closed_fit
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.tracking.recording import Recording
+
+LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")
+PLACED = "driven"
+RATE = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A simulated take.
+
+    Parameters
+    ----------
+    truth : Motion, of the person's own body
+    generic : Body to track with, of usual size and gear
+    recording : Recording of keypoints
+    hidden : (F,) bool, frames in which nothing of the left leg is seen
+    """
+
+    truth: Motion
+    generic: Body
+    recording: Recording
+    hidden: NDArray
+
+
+def cyclist(seed: int, *, seconds: float = 4.0, cameras: int = 4, leg: bool = False, noise: float = 3.0) -> Take:
+    """Somebody who pedals on a bike that stands, seen by cameras about it."""
+    random = np.random.default_rng(seed)
+    generic = load_body("cyclist")
+    person = _person(generic, random)
+    turn = random.uniform(-np.pi, np.pi)
+    T = se3.transform(se3.exp_so3(np.array([0.0, turn, 0.0])), np.array([*random.uniform(-0.3, 0.3, 1), 0.28, 0.1]))
+    person = _known_stand(person, T)
+    cadence, start = random.uniform(70.0, 95.0) / 60.0 * 2.0 * np.pi, random.uniform(0.0, 2.0 * np.pi)
+    names = person.tree.coordinates
+    wave = _waves(random, len(names))
+    usual = _posture(person, CYCLING)
+
+    def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
+        posture = usual + wave(t) * _give(person)
+        return person, _towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
+
+    return _take(generic, drive, seconds, cameras, seed, leg, noise)
+
+
+def snowboarder(seed: int, *, seconds: float = 4.0, cameras: int = 7, leg: bool = False, noise: float = 3.0) -> Take:
+    """Somebody who carves and jumps on a board."""
+    random = np.random.default_rng(seed)
+    generic = load_body("snowboarder")
+    person = _person(generic, random)
+    wave, usual = _waves(random, len(person.tree.coordinates)), _posture(person, RIDING)
+    phase, speed, jump = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.7, 1.1), random.uniform(1.2, 2.4)
+
+    def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
+        lean = 0.35 * np.sin(2.0 * np.pi * 0.5 * t + phase)
+        air = max(0.0, 1.0 - ((t - jump) / 0.3) ** 2) * 0.45
+        yaw = 0.5 * np.sin(2.0 * np.pi * 0.25 * t + phase) + 0.8 * np.clip((t - jump + 0.3) / 0.6, 0.0, 1.0)
+        R = se3.exp_so3(np.array([0.0, yaw, 0.0])) @ se3.exp_so3(np.array([0.0, 0.0, lean]))
+        place = np.array([0.5 * np.sin(phase + t), 0.1 + air, speed * (t - 0.5 * seconds)])
+        held = Closure(PLACED, "rigid", "right_binding", place=tuple(place), turn=tuple(se3.log_so3(R)), hard=True)
+        body = replace(person, closures=(*person.closures, held))
+        crouch = 0.35 * np.sin(2.0 * np.pi * 0.6 * t + phase) - 0.9 * air
+        posture = usual + wave(t) * _give(person)
+        names = person.tree.coordinates
+        for name, share in (("hip_flexion", 1.0), ("knee_angle", 1.2)):
+            for side in "lr":
+                posture[names.index(f"{name}_{side}")] += share * crouch
+        return body, _towards(person, posture), {}
+
+    return _take(generic, drive, seconds, cameras, seed, leg, noise, person)
+
+
+CYCLING = {
+    "lumbar_extension": -25, "thorax_extension": -12, "neck_extension": 25, "arm_flex_r": 70, "arm_flex_l": 70,
+    "arm_add_r": -8, "arm_add_l": -8, "elbow_flex_r": 20, "elbow_flex_l": 20, "hip_flexion_r": 70,
+    "hip_flexion_l": 70, "knee_angle_r": 70, "knee_angle_l": 70,
+}  # fmt: skip
+RIDING = {
+    "lumbar_extension": -15, "neck_rotation": 40, "arm_flex_r": 30, "arm_flex_l": 30, "arm_add_r": -50,
+    "arm_add_l": -50, "elbow_flex_r": 45, "elbow_flex_l": 45, "hip_flexion_r": 50, "hip_flexion_l": 50,
+    "knee_angle_r": 60, "knee_angle_l": 60, "ankle_angle_r": 10, "ankle_angle_l": 10, "hip_adduction_r": -15,
+    "hip_adduction_l": -15,
+}  # fmt: skip
+"""[deg] postures about which people move."""
+
+
+def _person(generic: Body, random: np.random.Generator) -> Body:
+    """Somebody of another size, each length by itself."""
+    size = random.normal(1.0, 0.04)
+    return generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
+
+
+def _known_stand(body: Body, T: NDArray) -> Body:
+    """The body whose bike stands where it does."""
+    at, turn = tuple(T[:3, 3].tolist()), tuple(se3.log_so3(T[:3, :3]).tolist())
+    closures = tuple(
+        replace(c, place=at, turn=turn, place_std=0.0, turn_std=0.0) if c.name == "stand" else c for c in body.closures
+    )
+    return replace(body, closures=closures)
+
+
+def _posture(body: Body, degrees: dict[str, float]) -> NDArray:
+    out = np.array(body.tree.usual)
+    for name, value in degrees.items():
+        out[body.tree.coordinate(name)] = np.radians(value)
+    return out
+
+
+def _give(body: Body) -> NDArray:
+    """(D,) [rad] how far each coordinate of the person wanders about its posture."""
+    named = [c.rsplit("_", 1)[0] for c in body.tree.coordinates]
+    return np.radians([{"neck_rotation": 15.0, "ankle_angle": 8.0, "arm_add": 6.0}.get(c, 3.0) for c in named])
+
+
+def _towards(body: Body, posture: NDArray) -> ParameterRows:
+    held = np.flatnonzero(np.isfinite(body.tree.spread))
+    return ParameterRows(6 + held, posture[held], np.full(len(held), np.radians(10.0) ** -2))
+
+
+def _waves(random: np.random.Generator, count: int):
+    """Smooth functions of time, of about unit size."""
+    speed, phase = random.uniform(0.2, 0.8, (3, count)), random.uniform(0.0, 2.0 * np.pi, (3, count))
+    return lambda t: np.sin(2.0 * np.pi * speed * t + phase).sum(axis=0) / np.sqrt(1.5)
+
+
+def _take(
+    generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool, noise: float, of: Body | None = None
+) -> Take:
+    frames = int(amount(seconds, min(seconds, 1.0)) * RATE)
+    states, body = list[BodyState](), generic
+    for f in range(frames):
+        body, towards, driven = drive(f / RATE)
+        states.append(_solved(body, towards, driven, states[-1] if states else None))
+    motion = _motion(body if of is None else of, states)
+    rig = studio_rig(motion, cameras=cameras, up="y")
+    seen = simulate_keypoints(motion, rig, noise_px=noise, outliers=0.03, missing=0.05, seed=seed)
+    hidden = np.zeros(frames, bool)
+    if leg:
+        hidden[frames // 4 : 3 * frames // 4] = True
+        seen = [_without(k, hidden) for k in seen]
+    recording = Recording.of_keypoints(rig, seen, accuracy=noise, up="y")
+    return Take(motion, generic, recording, hidden)
+
+
+def _without(k, hidden: NDArray):
+    """Keypoints of a camera that sees nothing of the left leg in some frames."""
+    points, confidence = np.array(k.points), np.array(k.confidence)
+    for name in LEG:
+        points[hidden, :, k.names.index(name)] = np.nan
+        confidence[hidden, :, k.names.index(name)] = 0.0
+    return replace(k, points=points, confidence=confidence)
+
+
+def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: BodyState | None) -> BodyState:
+    """The pose nearest to a posture in which every closure holds, soft ones exactly too, and driven coordinates are set."""
+    n, index = body.tree.n_dofs, np.array(list(driven), int)
+    wanted = np.array(list(driven.values()))
+
+    def constraint(state: BodyState) -> tuple[NDArray, NDArray]:
+        closed = closed_at(body, state)
+        more = state.angles[index - 6] - wanted if len(index) else np.zeros(0)
+        return np.concatenate([closed.value, more]), np.concatenate([closed.jacobian, np.eye(n)[index]])
+
+    def rows(state: BodyState) -> list[AnyRows]:
+        away = replace(towards, residual=towards.residual - state.angles[towards.index - 6])
+        return [away, prior_rows(body, state)]
+
+    def near(state: BodyState) -> list[AnyRows]:
+        c, A = constraint(state)
+        return [*rows(state), DofRows(A, -c, np.full(len(c), 1e4), np.full(len(c), -1))]
+
+    if last is None:
+        posture = np.array(body.usual_state().angles)
+        posture[towards.index - 6] = towards.residual
+        fits = []
+        for turn in np.arange(4) * 0.5 * np.pi:
+            for crank in np.arange(4) * 0.5 * np.pi:
+                start = np.array(posture)
+                for name in ("right_pedal_angle", "left_pedal_angle"):
+                    if name in body.tree.coordinates:
+                        start[body.tree.coordinate(name)] = crank * (1 if name[0] == "r" else -1)
+                if len(index):
+                    start[index - 6] = wanted
+                T = se3.transform(se3.exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 1.0, 0.0]))
+                first = BodyState(T, np.clip(start, body.tree.lower, body.tree.upper))
+                fits.append(levenberg_marquardt(body, first, near, max_iterations=60, tolerance=1e-4))
+        last = min(fits, key=lambda fit: fit.equations.cost).state
+    fit = closed_fit(body, last, rows, constraint, max_iterations=30, tolerance=1e-5)
+    assert np.abs(constraint(fit.state)[0]).max() <= CLOSED, "a pose that is not closed"
+    return fit.state
+
+
+def _motion(body: Body, states: list[BodyState]) -> Motion:
+    count = len(states)
+    return Motion(
+        body, RATE, np.arange(count) / RATE, np.stack([s.T_world_root for s in states]),
+        np.stack([s.angles for s in states]), np.zeros((count, body.tree.n_dofs)),
+        np.zeros((count, len(body.tree.segments), 3)), np.ones(count), np.ones((count, len(body.tree.segments))),
+        up="y",
+    )  # fmt: skip
+
+
+def rig_of(take: Take) -> Rig:
+    """The cameras of a take."""
+    return take.recording.rig

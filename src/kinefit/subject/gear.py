@@ -1,0 +1,105 @@
+"""What is not known of gear, as parameters of a subject fit: its dimensions, and where it stands in the world (P3 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.closures import Closure, Dimension, known_gear, with_dimensions, with_places
+from kinefit.geometry import se3
+from kinefit.subject.parameters import World
+
+_STEP = 1e-4  # [m, rad] from which derivatives are taken
+_WHERE = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class Gear:
+    """Dimensions of a body's gear and places of closures in the world that a body file says to estimate.
+
+    A place is a shift [m] and, of a rigid closure, a rotation vector [rad], both from the world's origin. Closures that
+    wait for these values are as soft as those are unsure; here they have their own deviation.
+
+    Parameters
+    ----------
+    body : Body, as its file has it
+    """
+
+    body: Body
+
+    @cached_property
+    def dimensions(self) -> tuple[Dimension, ...]:
+        """Those to estimate."""
+        return tuple(d for d in self.body.dimensions if d.std > 0.0)
+
+    @cached_property
+    def places(self) -> tuple[Closure, ...]:
+        """Closures whose place in the world is to be estimated."""
+        return tuple(c for c in self.body.closures if c.place_std > 0.0)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(p,)."""
+        out = [f"gear {d.name}" for d in self.dimensions]
+        return (*out, *(f"{c.name} {axis}" for c in self.places for axis in _WHERE[: _count(c)]))
+
+    @property
+    def mean(self) -> NDArray:
+        """(p,) [m] or [rad]."""
+        values = [d.value for d in self.dimensions]
+        return np.array(values + [v for c in self.places for v in (*c.place, *c.turn)[: _count(c)]])
+
+    @property
+    def information(self) -> NDArray:
+        """(p, p)."""
+        std = [d.std for d in self.dimensions]
+        std += [s for c in self.places for s in (*[c.place_std] * 3, *[c.turn_std] * 3)[: _count(c)]]
+        return np.diag(np.array(std) ** -2.0)
+
+    @property
+    def step(self) -> NDArray:
+        """(p,)."""
+        return np.full(len(self.names), _STEP)
+
+    def apply(self, world: World, values: NDArray) -> World:
+        """The world with gear of these values, which count as known."""
+        count = len(self.dimensions)
+        wanted = dict(zip((d.name for d in self.dimensions), np.asarray(values, float)[:count].tolist()))
+        body, rest = with_dimensions(world.body, wanted), np.asarray(values, float)[count:]
+        places = {}
+        for c in self.places:
+            own, rest = rest[: _count(c)], rest[_count(c) :]
+            places[c.name] = own[:3], own[3:] if c.kind == "rigid" else np.array(c.turn)
+        return replace(world, body=known_gear(with_places(body, places)))
+
+    def start(self, states: Sequence[BodyState]) -> NDArray:
+        """(p,) the prior means of dimensions, and places as some tracked poses have them: their median."""
+        out, at = self.mean, len(self.dimensions)
+        for c in self.places:
+            point = self.body.landmarks.select((c.point,))
+            segment = int(point.segments[0])
+            x = np.array([self.body.positions(s, point)[0] for s in states])
+            out[at : at + 3] = np.median(x, axis=0)
+            if c.kind == "rigid":
+                R = [
+                    self.body.tree.segment_poses(s.T_world_root[None], s.angles[None])[0, segment, :3, :3]
+                    for s in states
+                ]
+                out[at + 3 : at + 6] = se3.log_so3(_middle(np.array(R)))
+            at += _count(c)
+        return out
+
+
+def _count(c: Closure) -> int:
+    return 6 if c.kind == "rigid" else 3
+
+
+def _middle(R: NDArray) -> NDArray:
+    """(3, 3) of rotations (K, 3, 3): the one that is nearest to all others."""
+    angle = np.arccos(np.clip((np.einsum("aij,bij->ab", R, R) - 1.0) / 2.0, -1.0, 1.0))
+    return np.asarray(R[int(np.argmin(angle.sum(axis=1)))])
