@@ -173,7 +173,7 @@ def _without(k, hidden: NDArray):
 
 
 def _solved(body: Body, towards: ParameterRows, driven: dict[int, float], last: BodyState | None) -> BodyState:
-    """The pose nearest to a posture in which every closure holds, soft ones exactly too, and driven coordinates are set."""
+    """The pose nearest to a posture in which all closures hold exactly and driven coordinates are set."""
     n, index = body.tree.n_dofs, np.array(list(driven), int)
     wanted = np.array(list(driven.values()))
 

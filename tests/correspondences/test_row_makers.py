@@ -20,6 +20,7 @@ from tests.oracle import (
 
 import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
+from kinefit.bodies.closures import Closure
 from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
 from kinefit.bodies.steering import Steering
 from kinefit.bodies.surfaces import SkinnedMesh
@@ -27,6 +28,7 @@ from kinefit.correspondences import (
     Bands,
     anchored_rows,
     band_rows,
+    closure_rows,
     coincidence_rows,
     collision_rows,
     depth_image_rows,
@@ -106,8 +108,23 @@ class Scene:
         return uv[0, 0], by_translation @ R
 
 
+def closed_body(s):
+    """The scene's body with a closure of each kind between segments, and with the world."""
+    names, segments = list(s.body.landmarks.names), s.body.landmarks.segments
+    a = names[0]
+    b = next(n for n, segment in zip(names, segments) if segment != segments[0])
+    turn = tuple(s.random.normal(size=3))
+    kinds = [("point", ""), ("line", ""), ("plane", b), ("rigid", b), ("line", b), ("rigid", "")]
+    closures = [
+        Closure(f"c{k}", kind, a, to, place=(0.3, 0.1, -0.2), axis=tuple(random_unit(s.random)), turn=turn, sigma=0.01)
+        for k, (kind, to) in enumerate(kinds)
+    ]
+    return replace(s.body, closures=tuple(closures))
+
+
 # One entry for each public row maker: scene -> (state -> rows).
 CASES = {
+    "closure_rows": lambda s: lambda state, body=closed_body(s): closure_rows(body, state),
     "point_rows": lambda s: lambda state: point_rows(s.body, state, s.points, s.target, sigma=s.sigma),
     "plane_rows": lambda s: lambda state: plane_rows(s.body, state, s.points, s.target, s.normal, sigma=s.sigma),
     "ray_rows": lambda s: lambda state: ray_rows(s.body, state, s.points, s.line, sigma=s.sigma),

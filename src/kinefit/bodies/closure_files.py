@@ -120,7 +120,7 @@ def _closure(body: Body, r: ClosureRecord, source: str) -> Closure:
     if (r.kind in _CLOSE) != (r.axis is not None):
         raise wrong(f"a {r.kind} closure with axis {r.axis}", "Give an axis to lines and planes, and to no other.")
     if r.turn is not None and r.kind != "rigid":
-        raise wrong(f"a {r.kind} closure with a turn", "Leave it out: only rigid closures hold how segments are turned.")
+        raise wrong(f"a {r.kind} closure with a turn", "Leave it out: only rigid closures hold turns.")
     if r.mode == "hard" and (r.sigma is not None or r.turn_sigma is not None):
         raise wrong("a hard closure with a standard deviation", 'Leave it out, or set mode = "soft".')
     sigmas = (0.005 if r.sigma is None else r.sigma, 2.0 if r.turn_sigma is None else r.turn_sigma, r.std, r.turn_std)
@@ -173,7 +173,7 @@ def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, 
     for name in r.moves:
         kinds = [name in closures, name in body.landmarks.names, name in body.tree.segments]
         if sum(kinds) != 1:
-            problem = f"'{name}' is " + ("a name of several things" if sum(kinds) else "no landmark, segment or closure")
+            problem = f"'{name}' is " + ("a name of several things" if sum(kinds) else "nothing of the body")
             raise wrong(problem, "Name landmarks, segments or closures of this body.")
         if r.about is not None and not (kinds[0] and closures[name].kind == "rigid"):
             raise wrong(f"an angle that moves '{name}'", "Angles turn rigid closures, and nothing else.")

@@ -1,4 +1,4 @@
-"""Closed chains: points of a body that stay on other points, on lines, on planes, or segments that stay together (P3 3.2).
+"""Closed chains: points of a body that stay on points, lines or planes, segments that stay together (P3 3.2).
 
 A body is an open tree; what closes it (a boot in its binding, a hand on a bar, a pedal's axis on the bike) is told by
 closures between its landmarks, or between a landmark and the world. What of the gear is not known, such as how far the
@@ -118,7 +118,7 @@ class Dimension:
 
 
 def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
-    """The body with gear of other dimensions [m] or [rad]; lengths that a person's size stretches are added to as they are.
+    """The body with gear of other dimensions [m] or [rad]; what moves shifts by the change, whatever its scale.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Departures from the usual posture that go together, as a body file states them."""
+"""The usual posture, and departures from it that go together, as a body file states them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -40,3 +40,26 @@ def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: st
         return replace(tree, couplings=lines)
     except BodyError as error:
         raise BodyError(error.problem, file=source, place="coupling", remedy=error.remedy) from error
+
+
+def with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
+    """The tree with another usual posture: values [deg] or [m] of some coordinates.
+
+    Raises
+    ------
+    BodyError
+        A coordinate that is not there, or a value beyond its range.
+    """
+    out = np.array(tree.usual)
+    for name, value in usual.items():
+        place = f"usual {name}"
+        if name not in tree.coordinates:
+            problem = choices("coordinate", name, tree.coordinates)
+            raise BodyError(problem, file=source, place=place, remedy="Use one of these.")
+        d = tree.coordinate(name)
+        unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
+        if not tree.lower[d] <= value * unit <= tree.upper[d]:
+            ends = f"{tree.lower[d] / unit:g} to {tree.upper[d] / unit:g}"
+            raise BodyError(f"{value:g} is out of its range", file=source, place=place, remedy=f"Give {ends}.")
+        out[d] = value * unit
+    return replace(tree, usual=out)

@@ -13,7 +13,7 @@ import numpy as np
 from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closure_files import closed, with_closure_images
-from kinefit.bodies.couplings import coupled
+from kinefit.bodies.couplings import coupled, with_posture
 from kinefit.bodies.morph_files import morphs_of, with_images
 from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
 from kinefit.bodies.serial import saved_body
@@ -72,6 +72,19 @@ def catalogue() -> tuple[str, ...]:
     return tuple(sorted(e.name[:-5] for e in folder.iterdir() if e.name.endswith(".toml")))
 
 
+def catalogue_text(name: str) -> str:
+    """The TOML of a body of the catalogue, for a copy of one's own.
+
+    Raises
+    ------
+    BodyError
+        Unknown name.
+    """
+    if name not in catalogue():
+        raise BodyError(choices("body in the catalogue named", name, catalogue()), remedy="Name one of these.")
+    return _text(name)[0]
+
+
 def parse_body(text: str, source: str = "body") -> Body:
     """Body from TOML text; `source` names it in messages."""
     record = _record(text, source)
@@ -84,7 +97,8 @@ def parse_body(text: str, source: str = "body") -> Body:
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
-    tree = coupled(_tree(segments, index, source), record.coupling, source)
+    usual = {**({_left(n): v for n, v in record.usual.items()} if mirror else {}), **record.usual}
+    tree = with_posture(coupled(_tree(segments, index, source), record.coupling, source), usual, source)
     body = Body(
         name=record.body.name,
         tree=tree,

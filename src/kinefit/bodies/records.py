@@ -76,6 +76,7 @@ class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
     body: HeadRecord
     segment: list[SegmentRecord] = []
+    usual: dict[str, float] = {}
     coupling: list[CouplingRecord] = []
     closure: list[ClosureRecord] = []
     dimension: list[DimensionRecord] = []
@@ -102,6 +103,7 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
     return FileRecord(
         body=head,
         segment=segments + list(mine.values()),
+        usual=base.usual | own.usual,
         coupling=list(couplings.values()),
         closure=list(closures.values()),
         dimension=list(dimensions.values()),

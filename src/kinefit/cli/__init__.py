@@ -17,8 +17,8 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "markers", "view", "export", "retarget", "simulate",
-    "evaluate", "warmup",
+    "demo", "init", "calibrate", "detect", "check", "track", "markers", "body", "view", "export", "retarget",
+    "simulate", "evaluate", "warmup",
 )  # fmt: skip
 
 _EPILOG = """\b

@@ -5,8 +5,8 @@ A point x_a of one segment stays at x_b of another (or of the world) along the d
     r = n·(x_b − x_a),    δr = −(n, x_a × n)·(δξ_a − δξ_b)
 
 Both twists act at x_a, since n turns with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
-δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows of their standard deviation, as in the paper; hard ones
-are equations for `solvers.closed`, or rows of `STIFF` where a quadratic cost is asked for.
+δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows of their standard deviation, as in the paper; hard
+ones are equations for `solvers.closed`, or rows of `STIFF` where a quadratic cost is asked for.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ def _loose(body: Body) -> NDArray:
     for d in body.dimensions:
         if d.std > 0.0:
             step = 0.1 * d.std
-            ends = [closure_values(with_dimensions(body, {d.name: d.value + s * step}), body.usual_state()) for s in (1, -1)]
+            worlds = [with_dimensions(body, {d.name: d.value + s * step}) for s in (1.0, -1.0)]
+            ends = [closure_values(one, body.usual_state()) for one in worlds]
             variance += np.square((ends[0] - ends[1]) / (2.0 * step) * d.std)
     out = np.sqrt(variance)
     out[out < 1e-9] = 0.0
@@ -125,7 +126,7 @@ def closure_values(body: Body, state: BodyState) -> NDArray:
 
 
 def _placed(body: Body, state: BodyState, frames: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Values (m,), points x_a (K, 3), directions of all equations (m, 3) in the world, frames of the turns (K, 3, 3)."""
+    """Values (m,), points x_a (K, 3), directions of all equations (m, 3), frames of the turns (K, 3, 3); in the world."""
     t = _table(body)
     f = np.concatenate([frames, _WORLD])[t.segments]
     R = f[..., :9].reshape(-1, 2, 3, 3)
@@ -160,7 +161,7 @@ def closure_rows(body: Body, state: BodyState) -> DofRows:
     return closed_at(body, state).rows()
 
 
-def soft_rows(body: Body, state: BodyState) -> list[DofRows]:
+def soft_closures(body: Body, state: BodyState) -> list[DofRows]:
     """Rows of the closures that do not hold exactly, where there are any."""
     if not body.closures:
         return []
@@ -169,7 +170,7 @@ def soft_rows(body: Body, state: BodyState) -> list[DofRows]:
     return [closed.chosen(soft).rows()] if soft.any() else []
 
 
-def all_rows(body: Body, state: BodyState) -> list[DofRows]:
+def every_closure(body: Body, state: BodyState) -> list[DofRows]:
     """Rows of all closures, where there are any: for quadratic costs."""
     return [closure_rows(body, state)] if body.closures else []
 

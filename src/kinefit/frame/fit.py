@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_rows
+from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_closures
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.prediction import belief
@@ -24,7 +24,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_fit, closed_step, on_null_space
 from kinefit.solvers.equations import Equations, inverse, joint_moves, normal_equations
-from kinefit.solvers.least_squares import Fit, gauss_newton, levenberg_marquardt
+from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
@@ -194,7 +194,7 @@ class FrameFit:
         if held is not None:
             parts.append(belief(scene.state, *held))
         parts.append(prior_rows(self.body, scene.state))
-        parts += soft_rows(self.body, scene.state)
+        parts += soft_closures(self.body, scene.state)
         return [*parts, *self.apart(scene)] if apart else parts
 
     def apart(self, scene: Scene) -> list[AnyRows]:

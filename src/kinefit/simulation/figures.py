@@ -6,10 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import MeshSurface
+from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
+from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
+from kinefit.simulation.placing import look_at
+from kinefit.solvers.mobility import closed_poses
 
 _GREY = (128, 128, 128)
 _COLOURS = {"_l": (196, 120, 60), "_r": (60, 110, 200), "": (150, 175, 110)}  # BGR: left, right, middle
@@ -47,6 +50,44 @@ def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | Non
         cv2.fillPoly(image, [corners], (colour * shade).tolist(), cv2.LINE_AA, _FINE)
         cv2.polylines(image, [corners], True, (colour * shade * 0.6).tolist(), 1, cv2.LINE_AA, _FINE)
     return image
+
+
+def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 900)) -> NDArray:
+    """Picture (H, W, 3) of a body in the closed pose nearest to its usual one, BGR 8 bit.
+
+    Parameters
+    ----------
+    azimuth : [deg] of the camera about the upright, 0 in front of the body.
+    size : (width, height) [px]
+
+    Raises
+    ------
+    BodyError
+        Closures that contradict each other; a body without surfaces.
+    """
+    if not body.surfaces:
+        raise BodyError(f"body '{body.name}' has no surfaces to draw", remedy="Give its segments some.")
+    state = closed_poses(body, most=1)[0] if body.closures else body.usual_state()
+    count = len(body.tree.segments)
+    motion = Motion(
+        body, 1.0, np.zeros(1), state.T_world_root[None], state.angles[None], np.zeros((1, body.tree.n_dofs)),
+        np.zeros((1, count, 3)), np.ones(1), np.ones((1, count)),
+    )  # fmt: skip
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    all_of = [
+        limb.vertices if isinstance(limb, MeshSurface) else np.array([limb.start, limb.end]) for limb in body.surfaces
+    ]
+    x = np.concatenate([
+        (points + body.tree.rest[limb.segment]) @ frames[limb.segment, :9].reshape(3, 3).T + frames[limb.segment, 9:]
+        for points, limb in zip(all_of, body.surfaces)
+    ])  # fmt: skip
+    centre, far = 0.5 * (x.min(axis=0) + x.max(axis=0)), float(np.linalg.norm(np.ptp(x, axis=0)))
+    a, distance = np.radians(azimuth), 2.2 * far
+    eye = centre + distance * np.array([np.cos(a) * 0.97, 0.25, np.sin(a) * 0.97])
+    T = look_at(eye, centre, np.array([0.0, 1.0, 0.0]))
+    focal = 0.85 * min(size) * distance / far
+    matrix = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
+    return draw_figure(motion, 0, Camera("portrait", size, matrix, np.zeros(0), "radtan", T))
 
 
 def _rim(limb: Surface, R_camera_segment: NDArray) -> NDArray:

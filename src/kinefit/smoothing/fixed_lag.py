@@ -230,11 +230,8 @@ class FixedLag:
                 number = self._count - len(self._frames) + f + 1
                 observed = self._told >= number - self._memory
                 matched = (*frame.points, *frame.surfaces)
-                out.append(
-                    judged(
-                        self._costs.scene(self._frames, f), self._exact(frame.state, found[f]), matched, self._last.iterations, observed=observed
-                    )
-                )
+                scene, sure = self._costs.scene(self._frames, f), self._exact(frame.state, found[f])
+                out.append(judged(scene, sure, matched, self._last.iterations, observed=observed))
         return out
 
 

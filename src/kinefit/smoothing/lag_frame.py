@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import all_rows, looped
+from kinefit.correspondences.closures import every_closure, looped
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.rows import AnyRows
@@ -111,7 +111,7 @@ class FrameCosts:
         others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
         told = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
-        closed = all_rows(self.body, scene.state)
+        closed = every_closure(self.body, scene.state)
         if closed:
             H = H + normal_equations(self.body, scene.state, closed).matrix
         for several, far in ((others, False), (pixels, True)):
@@ -172,7 +172,7 @@ class FrameCosts:
         if frame.points or body.closures or (frame.surfaces and frame.H is None):
             scene = self.scene(frames, f)
         if frame.points or body.closures:
-            rows = [*self._rows(frame.points, scene), *all_rows(body, scene.state)]
+            rows = [*self._rows(frame.points, scene), *every_closure(body, scene.state)]
             points = normal_equations(body, scene.state, rows)
             H, g, cost = points.matrix, points.gradient, points.cost
         if frame.surfaces:

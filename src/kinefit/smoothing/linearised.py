@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import all_rows
+from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import evidence_of
 from kinefit.frame.trust import unseen
@@ -130,7 +130,7 @@ class OtherSensors:
             rows[k] = sum(int(np.sum(squares_of(r)[1] > 0.25)) for r in parts)
             if matched:
                 parts += self.apart(scene)
-            parts += all_rows(body, scene.state)
+            parts += every_closure(body, scene.state)
             if parts:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost

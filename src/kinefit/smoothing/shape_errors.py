@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import all_rows
+from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
@@ -118,7 +118,7 @@ class _Frame:
         """Rows of points, and of what closes chains."""
         scene = self._scene(values)
         points = [(m.sensor, rows) for m in self.matched if m.of_points for rows in rows_at(m, scene)]
-        return [*points, *((CLOSURES, rows) for rows in all_rows(scene.body, scene.state))]
+        return [*points, *((CLOSURES, rows) for rows in every_closure(scene.body, scene.state))]
 
     def points(self, step: NDArray) -> NDArray:
         """(n, q) ∂g/∂θ of all points."""

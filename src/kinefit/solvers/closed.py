@@ -105,7 +105,7 @@ def _step(
     H: NDArray, g: NDArray, damping: float, A: NDArray, c: NDArray, state: BodyState,
     bounds: tuple[NDArray, NDArray], locked: NDArray,
 ) -> tuple[NDArray, float]:  # fmt: skip
-    """δ (n,) of the constrained step and the fall of the cost that it predicts, from a state that is on the equations."""
+    """δ (n,) of the constrained step from a state at which c = 0, and the fall of the cost that it predicts."""
     damped = H + damping * np.eye(len(H))
     at_limit = np.zeros(len(g), bool)
     at_limit[6:] = ((state.angles <= bounds[0]) & (g[6:] < 0.0)) | ((state.angles >= bounds[1]) & (g[6:] > 0.0))

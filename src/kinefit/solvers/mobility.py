@@ -1,14 +1,14 @@
 """How freely a body with closures moves: Gruebler's count beside the rank of what closes it (P3 eq. 9, 3).
 
-Gruebler: N moving links and g joints of fᵢ freedoms leave F = 6 (N − g) + Σ fᵢ; every joint of the tree is one, and every
-closure another. That count knows of no geometry. The rank of the closures' Jacobian at closed poses does: where equations
-follow from others, the body moves more freely than F says, and is over-constrained.
+Gruebler: N moving links and g joints of fᵢ freedoms leave F = 6 (N − g) + Σ fᵢ; every joint of the tree is one, and
+every closure another. That count knows of no geometry. The rank of the closures' Jacobian at closed poses does: where
+equations follow from others, the body moves more freely than F says, and is over-constrained.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -124,7 +124,8 @@ def contradictory(body: Body, state: BodyState) -> BodyError:
         off = float(np.linalg.norm(closed.value[owner == k][:3]))
         turn = float(np.linalg.norm(closed.value[owner == k][3:]))
         if off > 1e-4 or turn > 1e-3:
-            told.append(f"'{c.name}' by {1e3 * off:.1f} mm" + (f" and {np.degrees(turn):.1f} deg" if turn > 0.0 else ""))
+            turned = f" and {np.degrees(turn):.1f} deg" if turn > 0.0 else ""
+            told.append(f"'{c.name}' by {1e3 * off:.1f} mm{turned}")
     problem = f"closures of body '{body.name}' that contradict each other: in the best pose found they are off, "
     remedy = "Correct the places of their landmarks and their joints' ranges, or make one of them soft."
     return BodyError(problem + ", ".join(told), remedy=remedy)
@@ -172,7 +173,7 @@ def _closed(body: Body, start: BodyState) -> tuple[BodyState, float]:
 
     def rows(state: BodyState) -> list[DofRows]:
         closed = closed_at(body, state)
-        return [DofRows(closed.jacobian, -closed.value, np.full(len(closed.value), _SOFT**-2), np.full(len(closed.value), -1))]
+        return [replace(closed, sigma=np.full(len(closed.value), _SOFT)).rows()]
 
     near = levenberg_marquardt(
         body, start, lambda state: [*rows(state), prior_rows(body, state)], max_iterations=60, tolerance=1e-6

@@ -13,8 +13,8 @@ from kinefit.correspondences.closures import closed_at, closure_values
 from kinefit.rows import DofRows
 
 HELD = 1e-3
-"""[m, rad] standard deviation of a hard closure where poses are fitted along with parameters: exact enough for these, and
-no stiffer than what cameras see."""
+"""[m, rad] standard deviation of a hard closure where poses are fitted along with parameters: exact enough for these,
+and no stiffer than what cameras see."""
 
 
 def closing_rows(body: Body, state: BodyState) -> list[DofRows]:

@@ -1,4 +1,4 @@
-"""What is not known of gear, as parameters of a subject fit: its dimensions, and where it stands in the world (P3 5)."""
+"""What is not known of gear, as parameters of a subject fit: dimensions, and places in the world (P3 5)."""
 
 from __future__ import annotations
 

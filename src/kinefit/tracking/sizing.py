@@ -173,8 +173,8 @@ def _by_all(
         )  # fmt: skip
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
-    keypoints = bool(r.keypoints)
-    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and (tracked.measurements[k] or keypoints)]
+    shown = [bool(measured) or bool(r.keypoints) for measured in tracked.measurements]
+    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and shown[k]]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
     surfaces = any(not m.settled for k in good for m in tracked.measurements[k])

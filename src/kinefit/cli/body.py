@@ -1,0 +1,100 @@
+"""`kinefit body`: the bodies that come along, copies of them, and whether a body's closed chains hold together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _screen
+
+_FILE = click.Path(path_type=Path)
+
+
+@click.group(short_help="List, copy and draw bodies; check closed chains.", invoke_without_command=True,
+             epilog="""\b
+Examples:
+  kinefit body                                   what comes along: people, and people with gear
+  kinefit body copy snowboarder                  snowboarder.toml, to change and to name in a take
+  kinefit body check snowboarder.toml            degrees of freedom, closures, what contradicts what
+  kinefit body picture cyclist -o cyclist.png    the body in a closed pose
+""")  # fmt: skip
+@click.pass_context
+def body(ctx: click.Context) -> None:
+    """List, copy and draw bodies; check closed chains. Without a command: list."""
+    if ctx.invoked_subcommand is not None:
+        return
+    from kinefit.bodies import catalogue, load_body
+
+    for name in catalogue():
+        one = load_body(name)
+        gear = [s for s, g in zip(one.tree.segments, one.segment_scale) if one.gear_scale[g]]
+        told = f"{len(one.tree.segments)} segments, {one.tree.n_dofs - 6 * (not one.tree.root_free)} degrees of freedom"
+        if gear:
+            told += f", {len(one.closures)} closure{'s' * (len(one.closures) != 1)}; gear: {', '.join(gear)}"
+        _screen.say(f"{name:18s} {told}")
+
+
+@body.command(short_help="A body file of the catalogue, to change.")
+@click.argument("name")
+@click.argument("file", type=_FILE, required=False)
+def copy(name: str, file: Path | None) -> None:
+    """Write a body of the catalogue as a TOML file of your own."""
+    from kinefit.bodies.files import catalogue_text
+    from kinefit.errors import FileError
+
+    text, target = catalogue_text(name), file or Path(f"{name}.toml")
+    if target.exists():
+        raise FileError("this file exists already", file=target, remedy="Name another file, or move it away.")
+    target.write_text(text, encoding="utf-8")
+    _screen.say(f"{target}: name it in the take, body = \"{target}\"")
+
+
+@body.command(short_help="Degrees of freedom, and whether closures hold together.")
+@click.argument("file")
+def check(file: str) -> None:
+    """Gruebler's count of a body beside the rank of what closes it; what follows from what; what contradicts what."""
+    from kinefit.bodies import load_body
+    from kinefit.solvers.mobility import check_closed, mobility
+
+    one = load_body(file)
+    m = mobility(one)
+    _screen.say(f"body '{one.name}': {m.links} links, {m.joints} joints, {m.open_dofs} degrees of freedom as a tree")
+    for c in one.closures:
+        where = f"'{c.to}'" if c.to else "a place in the world" + (" that is estimated" if c.place_std > 0.0 else "")
+        _screen.say(f"  closure '{c.name}': {c.kind}, '{c.point}' and {where}, {'hard' if c.hard else 'soft'}")
+    for d in one.dimensions:
+        value, unit = (d.value * 57.29577951308232, "deg") if d.turns else (d.value, "m")
+        _screen.say(f"  dimension '{d.name}': {value:.4g} {unit}{', to estimate' if d.std > 0.0 else ''}")
+    _screen.say(f"Gruebler: F = {m.gruebler}")
+    _screen.say(f"rank of the closures: {m.rank} of {m.equations} equations; mobility: {m.mobility}")
+    if m.agrees:
+        _screen.say("both agree")
+    else:
+        few = m.mobility - m.gruebler
+        _screen.say(f"they disagree by {few}: the mechanism is over-constrained; so many equations follow from others")
+        for line in m.redundant:
+            _screen.say(f"  {line}")
+    if m.rank + m.mobility != m.open_dofs:
+        _screen.say("the rank leaves directions in which no finite step leads: the poses are singular")
+    check_closed(one)
+
+
+@body.command(short_help="A picture of a body in a closed pose.")
+@click.argument("file")
+@click.option("-o", "--out", type=_FILE, required=True, help="PNG or JPEG file.")
+@click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] of the camera, 0 in front.")
+def picture(file: str, out: Path, azimuth: float) -> None:
+    """Draw a body in the closed pose nearest to its usual one."""
+    import cv2
+
+    from kinefit.bodies import load_body
+    from kinefit.errors import FileError
+    from kinefit.simulation.figures import portrait
+
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise FileError("a picture is a PNG or a JPEG file", file=out, remedy=f"Call it {out.stem}.png.")
+    written, data = cv2.imencode(out.suffix, portrait(load_body(file), azimuth))
+    assert written
+    out.write_bytes(data.tobytes())
+    _screen.say(str(out))
