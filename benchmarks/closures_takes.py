@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +10,10 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.closures import Closure
+from kinefit.bodies.closures import Closure, with_dimensions
 from kinefit.correspondences import prior_rows
 from kinefit.correspondences.closures import closed_at
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.rows import AnyRows, DofRows, ParameterRows
 from kinefit.simulation import simulate_keypoints, studio_rig
@@ -24,6 +24,8 @@ from kinefit.tracking.recording import Recording
 LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")
 PLACED = "driven"
 RATE = 50.0
+DRIFT = 2.0
+"""[px] standard deviation of what a detector's errors have that lasts, beside as much noise as is told."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +66,14 @@ def cyclist(seed: int, *, seconds: float = 4.0, cameras: int = 4, leg: bool = Fa
     return _take(generic, drive, seconds, cameras, seed, leg, noise)
 
 
-def snowboarder(seed: int, *, seconds: float = 4.0, cameras: int = 7, leg: bool = False, noise: float = 3.0) -> Take:
-    """Somebody who carves and jumps on a board."""
+def snowboarder(
+    seed: int, *, seconds: float = 4.0, cameras: int = 7, leg: bool = False, noise: float = 3.0,
+    gear: Mapping[str, float] | None = None,
+) -> Take:  # fmt: skip
+    """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's."""
     random = np.random.default_rng(seed)
     generic = load_body("snowboarder")
-    person = _person(generic, random)
+    person = with_dimensions(_person(generic, random), gear or {})
     wave, usual = _waves(random, len(person.tree.coordinates)), _posture(person, RIDING)
     phase, speed, jump = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.7, 1.1), random.uniform(1.2, 2.4)
 
@@ -154,7 +159,9 @@ def _take(
         states.append(_solved(body, towards, driven, states[-1] if states else None))
     motion = _motion(body if of is None else of, states)
     rig = studio_rig(motion, cameras=cameras, up="y")
-    seen = simulate_keypoints(motion, rig, noise_px=noise, outliers=0.03, missing=0.05, seed=seed)
+    seen = simulate_keypoints(
+        motion, rig, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
+    )
     hidden = np.zeros(frames, bool)
     if leg:
         hidden[frames // 4 : 3 * frames // 4] = True
@@ -220,7 +227,3 @@ def _motion(body: Body, states: list[BodyState]) -> Motion:
         up="y",
     )  # fmt: skip
 
-
-def rig_of(take: Take) -> Rig:
-    """The cameras of a take."""
-    return take.recording.rig

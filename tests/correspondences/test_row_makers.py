@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -124,7 +125,7 @@ def closed_body(s):
 
 # One entry for each public row maker: scene -> (state -> rows).
 CASES = {
-    "closure_rows": lambda s: lambda state, body=closed_body(s): closure_rows(body, state),
+    "closure_rows": lambda s: partial(closure_rows, closed_body(s)),
     "point_rows": lambda s: lambda state: point_rows(s.body, state, s.points, s.target, sigma=s.sigma),
     "plane_rows": lambda s: lambda state: plane_rows(s.body, state, s.points, s.target, s.normal, sigma=s.sigma),
     "ray_rows": lambda s: lambda state: ray_rows(s.body, state, s.points, s.line, sigma=s.sigma),

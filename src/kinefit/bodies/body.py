@@ -168,7 +168,7 @@ class Body:
         return se3.apply(Ts[:, points.segments], points.points)
 
     def scaled(self, scales: NDArray) -> Body:
-        """The body with every scale group but that of gear stretched: (G,) factors; joints and all points move along."""
+        """The body with every scale group but gear's stretched: (G,) factors; joints and points move along."""
         factors = np.asarray(scales, float)
         if factors.shape != (len(self.scale_groups),) or not np.all(np.isfinite(factors)) or np.any(factors <= 0):
             raise BodyError(

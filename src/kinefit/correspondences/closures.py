@@ -126,7 +126,7 @@ def closure_values(body: Body, state: BodyState) -> NDArray:
 
 
 def _placed(body: Body, state: BodyState, frames: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Values (m,), points x_a (K, 3), directions of all equations (m, 3), frames of the turns (K, 3, 3); in the world."""
+    """Values (m,), points x_a (K, 3), directions of all equations (m, 3), turns' frames (K, 3, 3)."""
     t = _table(body)
     f = np.concatenate([frames, _WORLD])[t.segments]
     R = f[..., :9].reshape(-1, 2, 3, 3)

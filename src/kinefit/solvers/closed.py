@@ -27,6 +27,7 @@ from kinefit.solvers.least_squares import Fit, MakeRows, Step, bounds_of
 CLOSED = 1e-9
 """[m, rad] by which an equation may be off and still hold."""
 
+_EXACT = 1e-13  # [m, rad] at which no further step is taken; far from the world's origin rounding ends it before
 _RANK = 1e-7  # of the largest singular value of A, below which an equation follows from the others
 _BACK = 30  # Newton steps back onto the equations
 _ACTIVE = 6  # rounds of holding coordinates at the limits that a step would leave
@@ -69,15 +70,15 @@ def onto(
     c, A = constraint(state)
     worst, best = float(np.abs(c).max(initial=0.0)), float(c @ c)
     for _ in range(steps):
-        if worst <= CLOSED:
+        if worst <= _EXACT:
             break
-        held, share = fixed.copy(), 1.0
+        share, stops = 1.0, np.zeros(len(fixed), bool)
         for _ in range(_ACTIVE):
-            delta = null_space(A, c, held).back
-            out = _beyond(state, delta, bounds) & ~held
+            delta = null_space(*_stopped(A, c, state, stops, bounds), fixed).back
+            out = _beyond(state, delta, bounds) & ~stops & ~fixed
             if not out.any():
                 break
-            held |= out
+            stops |= out
         moved = None
         while share > 1e-3:  # a step that leads away from the equations was too long
             trial = state.retract(share * delta, bounds)
@@ -101,6 +102,19 @@ def _beyond(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -
     return out
 
 
+def _stopped(
+    A: NDArray, c: NDArray, state: BodyState, stops: NDArray, bounds: tuple[NDArray, NDArray]
+) -> tuple[NDArray, NDArray]:
+    """Equations by which some coordinates, too, go to the nearer of their limits and no farther."""
+    at = np.flatnonzero(stops)
+    if not len(at):
+        return A, c
+    q = state.angles[at - 6]
+    low, high = bounds[0][at - 6], bounds[1][at - 6]
+    nearer = np.where(np.abs(q - low) < np.abs(q - high), q - low, q - high)
+    return np.concatenate([A, np.eye(A.shape[1])[at]]), np.concatenate([c, nearer])
+
+
 def _step(
     H: NDArray, g: NDArray, damping: float, A: NDArray, c: NDArray, state: BodyState,
     bounds: tuple[NDArray, NDArray], locked: NDArray,
@@ -109,17 +123,16 @@ def _step(
     damped = H + damping * np.eye(len(H))
     at_limit = np.zeros(len(g), bool)
     at_limit[6:] = ((state.angles <= bounds[0]) & (g[6:] < 0.0)) | ((state.angles >= bounds[1]) & (g[6:] > 0.0))
-    held = locked | at_limit
-    delta = np.zeros(len(g))
+    held, stops, delta = locked | at_limit, np.zeros(len(g), bool), np.zeros(len(g))
     for _ in range(_ACTIVE):
-        null = null_space(A, c, held)
+        null = null_space(*_stopped(A, c, state, stops, bounds), held)
         Z = null.free
         push = Z.T @ (g - damped @ null.back)
         delta = null.back + Z @ np.linalg.solve(Z.T @ damped @ Z, push)
-        out = _beyond(state, delta, bounds) & ~held
+        out = _beyond(state, delta, bounds) & ~held & ~stops
         if not out.any():
             break
-        held |= out
+        stops |= out
     return delta, float(delta @ g) + damping * float(delta @ delta)
 
 

@@ -1,0 +1,15 @@
+"""Every figure of closed chains: `python -m benchmarks.closures`; some parts: `... closures closures_mobility`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "closures_planar": "the planar pedal example: closed form, explicit chain, soft and hard closures",
+    "closures_mobility": "Gruebler's count, rank and mobility of the catalogue's bodies",
+    "closures_people": "a cyclist and a snowboarder, simulated, with closures and without",
+    "closures_gear": "dimensions of gear that are estimated",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)
