@@ -40,7 +40,7 @@ def joints(motion: Motion) -> NDArray:
     """(F, S, 3) [m] joint centres of the person, gear left out."""
     body = motion.body
     person = ~body.gear_scale[body.segment_scale]
-    return motion.segment_poses()[:, person, :3, 3]
+    return motion.segment_poses()[..., :3, 3][:, person]
 
 
 def left(motion: Motion) -> list[int]:
@@ -127,7 +127,8 @@ def bars(name: str, whole, hidden) -> None:
         loose = 100.0 * float(np.mean(np.concatenate([cover(t, m[1]) for t, *m in takes])))
         closed_std, loose_std = (np.mean([foot_bar(m[k]) for _, *m in takes]) for k in (0, 1))
         print(f"  without closures: {loose:.1f} %")
-        figure(f"{name}{what}: error bar of the left foot over that without closures", closed_std / loose_std, "", "<= 1")
+        share = closed_std / loose_std
+        figure(f"{name}{what}: error bar of the left foot, over that without closures", share, "of it", "<= 1")
 
 
 def cover(take: Take, motion: Motion) -> NDArray:

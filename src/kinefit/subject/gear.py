@@ -31,6 +31,7 @@ class Gear:
     """
 
     body: Body
+    of_points = True
 
     @cached_property
     def dimensions(self) -> tuple[Dimension, ...]:

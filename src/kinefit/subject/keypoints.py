@@ -17,9 +17,10 @@ from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.triangulation import triangulated
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
+from kinefit.subject.gear import Gear
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
@@ -91,18 +92,21 @@ def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
     lengths: SegmentScales, scales: NDArray,
 ) -> tuple[SubjectFit, NDArray]:  # fmt: skip
-    """Lengths and points, with as much freedom for a detector's points as this take asks for; and their covariance.
+    """Lengths, points and gear, with as much freedom for a detector's points as this take asks for; their covariance.
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis.
     """
-    spread, start = _SHIFT, None
-    for _ in range(_ROUNDS):
-        points = [PointOffsets(body, name, spread) for name in channels.sets if name]
+    spread, start, gear = _SHIFT, None, Gear(body)
+    for k in range(_ROUNDS):
+        kinds: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
         if start is None:
-            start = np.concatenate([np.log(scales), *(one.mean for one in points)])
+            start = np.concatenate([np.log(scales), *(one.mean for one in kinds[1:])])
+        if k and gear.names:  # which poses of the first round have brought into place
+            kinds.append(gear)
+            start = np.concatenate([start, gear.start(states)])
         found = joint.fit_subject(
-            body, channels.rig, steps, states, [lengths, *points], start=start, rounds=1, looks=len(steps)
+            body, channels.rig, steps, states, kinds, start=start, rounds=1, looks=len(steps)
         )
         start, states = found.mean, found.states
         covariance = inverse(found.prior.information + found.information / _excess(found, steps))

@@ -20,6 +20,7 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
+from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
@@ -100,7 +101,7 @@ def fitted_to_person(
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         found = fit_subject(body, channels, frames=frames or 25, height=height, trial=trial, progress=progress)
-        person = _wearing(person, found)
+        person = _wearing(person, found, **_gear_of(body, found))
     elif recording.markers and recording.marker_sets[0][0]:
         person = _by_markers(person, height, progress)
     else:
@@ -109,6 +110,7 @@ def fitted_to_person(
             person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
         if recording.depth:
             person = _by_depth(person, progress)
+    unknown = unknown and (bool(recording.sensors) or has_unknown_gear(person.subject.body))
     return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
 
 
@@ -120,6 +122,15 @@ def _others(recording: Recording) -> bool:
 def _wearing(person: Person, subject: Subject, **told: Any) -> Person:
     channels = person.channels.with_points(subject.body)
     return replace(person, subject=subject, channels=channels, told={**person.told, **told})
+
+
+def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
+    """What keypoints told of a body's gear, with standard deviations."""
+    names = Gear(body).names
+    if not names or found.fit is None or found.covariance is None:
+        return {}
+    std = dict(zip(found.fit.names, np.sqrt(np.diag(found.covariance))))
+    return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
 
 
 def _by_markers(person: Person, height: float | None, progress: Progress | None) -> Person:

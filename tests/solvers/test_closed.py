@@ -1,0 +1,104 @@
+"""Fits under equations that hold exactly: against a general optimiser, at limits, and their covariances."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from kinefit.bodies import BodyState, load_body, parse_body
+from kinefit.correspondences import point_rows, prior_rows
+from kinefit.correspondences.closures import closed_at, hard_equations
+from kinefit.solvers.closed import CLOSED, closed_fit, null_space, on_null_space, onto
+from kinefit.solvers.equations import inverse
+
+LEG = """
+[body]
+name = "pedal"
+
+[[segment]]
+name = "ground"
+joint = { name = "world", type = "fixed" }
+
+[[segment]]
+name = "thigh"
+parent = "ground"
+joint = { name = "hip", type = "revolute", axes = ["z"] }
+
+[[segment]]
+name = "shank"
+parent = "thigh"
+joint = { name = "knee", type = "revolute", at = [0.0, 0.45, 0.0], axes = ["z"], range = [[-170, 0]] }
+
+[[segment]]
+name = "crank"
+parent = "ground"
+joint = { name = "axis", type = "revolute", at = [0.0, 0.6, 0.0], axes = ["z"] }
+
+[landmarks]
+joint = { segment = "shank", at = [0.0, 0.0, 0.0] }
+foot = { segment = "shank", at = [0.0, 0.3, 0.0] }
+pedal = { segment = "crank", at = [0.0, 0.15, 0.0] }
+
+[[closure]]
+name = "foot"
+point = "foot"
+to = "pedal"
+mode = "hard"
+"""
+
+
+@pytest.fixture
+def leg():
+    return parse_body(LEG)
+
+
+def at(angles):
+    return BodyState(np.eye(4), np.array(angles, float))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_constrained_fit_is_that_of_a_general_optimiser(leg, seed):
+    random, equations = np.random.default_rng(seed), hard_equations(leg)
+    points = leg.landmarks.select(("joint", "foot"))
+    start, off = onto(leg, at([0.3, -0.9, 0.8 + seed]), equations)
+    assert off <= CLOSED
+    target = leg.positions(start, points) + random.normal(scale=0.01, size=(2, 3)) * [1.0, 1.0, 0.0]
+    rows = lambda state: [point_rows(leg, state, points, target, sigma=0.005)]
+    fit = closed_fit(leg, start, rows, equations, tolerance=1e-14)
+    assert fit.converged and np.abs(equations(fit.state)[0]).max() <= CLOSED
+    cost = lambda q: float(np.sum((leg.positions(at(q), points) - target) ** 2)) * 0.005**-2
+    best = minimize(
+        cost, start.angles, method="SLSQP", options={"maxiter": 300, "ftol": 1e-14},
+        constraints={"type": "eq", "fun": lambda q: equations(at(q))[0][:2]},
+    )  # fmt: skip
+    assert fit.equations.cost == pytest.approx(best.fun, rel=1e-5)
+    np.testing.assert_allclose(fit.state.angles, best.x, atol=1e-4)
+
+
+def test_a_limit_ends_the_way_along_the_chain(leg):
+    """The stretched leg: the knee stops at its limit, and the chain stays closed."""
+    equations, points = hard_equations(leg), leg.landmarks.select(("foot",))
+    start, _ = onto(leg, at([0.2, -0.5, -0.5]), equations)
+    rows = lambda state: [point_rows(leg, state, points, np.array([[0.0, 0.9, 0.0]]), sigma=0.005)]
+    fit = closed_fit(leg, start, rows, equations, tolerance=1e-14)
+    assert np.abs(equations(fit.state)[0]).max() <= CLOSED and fit.state.angles[1] <= 0.0
+    assert leg.positions(fit.state, points)[0, 1] == pytest.approx(0.75, abs=1e-5)
+
+
+def test_equations_that_cannot_be_met_end_a_fit(leg):
+    far = parse_body(LEG.replace("at = [0.0, 0.6, 0.0]", "at = [0.0, 1.6, 0.0]"))
+    equations = hard_equations(far)
+    fit = closed_fit(far, at([0.1, -0.3, 0.4]), lambda s: [prior_rows(far, s)], equations)
+    assert not fit.converged and np.abs(equations(fit.state)[0]).max() > 0.5
+
+
+def test_a_covariance_on_the_null_space_is_that_of_endless_weight():
+    body = load_body("snowboarder")
+    random = np.random.default_rng(1)
+    B = random.normal(size=(80, body.tree.n_dofs))
+    P = inverse(B.T @ B)
+    A = closed_at(body, body.usual_state()).jacobian
+    exact = on_null_space(P, np.concatenate([A, A[:1]]))  # an equation said twice changes nothing
+    np.testing.assert_allclose(exact, inverse(B.T @ B + 1e8 * A.T @ A), atol=1e-6 * P.max())
+    assert np.abs(A @ exact).max() < 1e-9 and np.all(np.diag(exact) <= np.diag(P) + 1e-12)
+    Z = null_space(A, np.zeros(len(A)), np.zeros(A.shape[1], bool)).free
+    np.testing.assert_allclose(exact, Z @ inverse(Z.T @ B.T @ B @ Z) @ Z.T, atol=1e-9)
