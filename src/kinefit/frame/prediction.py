@@ -9,6 +9,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import inverse
 
+_FIXED = 1e-4  # [m, rad] standard deviation of a root that stays where it is put
+
 
 class Prediction:
     """Pose, velocity and their joint covariance, carried from frame to frame.
@@ -34,9 +36,12 @@ class Prediction:
         self._bounds = body.tree.lower, body.tree.upper
         self._keep = float(np.exp(-dt / memory))
         jolt = np.concatenate([np.full(3, root_acceleration), np.full(n - 3, angle_acceleration)]) * dt**2
+        self._moves = (np.arange(n) >= 6) | body.tree.root_free
+        jolt = jolt * self._moves
         self._noise = [np.diag(jolt**2 * share) for share in (0.25, 0.5, 1.0)]
         self._first_velocity = np.diag(np.concatenate([np.full(3, 1.0), np.full(n - 3, 5.0)]) * dt) ** 2
-        self._wide = np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)])
+        self._first_velocity *= self._moves
+        self._wide = np.where(self._moves, np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)]), _FIXED)
         self.state: BodyState | None = None
         self._velocity, self._halted = np.zeros(n), False
 
@@ -60,7 +65,7 @@ class Prediction:
     def go_on(self, state: BodyState, std: NDArray, velocity: NDArray) -> None:
         """Begin with what is known already; velocity (n,) [m, rad] a frame."""
         self.start(state, std)
-        self._velocity = velocity
+        self._velocity = velocity * self._moves
 
     def change_chart(self, angles: NDArray, signs: NDArray) -> None:
         """Go on in other charts of some ball joints: their angles (D,), and the signs (D,) of how they change."""
@@ -101,7 +106,7 @@ class Prediction:
     def correct(self, state: BodyState, posterior: NDArray) -> None:
         """Take the fitted state, with the covariance (n, n) that its normal matrix gives, prediction included."""
         gain = self._vx @ self._information
-        self._velocity = self._velocity + gain @ self._ahead.difference(state)
+        self._velocity = (self._velocity + gain @ self._ahead.difference(state)) * self._moves
         vv = self._vv - gain @ (self._xx - posterior) @ gain.T
         self._vv = 0.5 * (vv + vv.T)
         self._vx = gain @ posterior

@@ -81,6 +81,8 @@ class Gear:
     def start(self, states: Sequence[BodyState]) -> NDArray:
         """(p,) the prior means of dimensions, and places as some tracked poses have them: their median."""
         out, at = self.mean, len(self.dimensions)
+        if not len(states):
+            return out
         for c in self.places:
             point = self.body.landmarks.select((c.point,))
             segment = int(point.segments[0])

@@ -213,7 +213,7 @@ def _by_all(
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states
     lengths = points is None and person.subject.fit is None and not person.joint
-    left = of_all(r, person.subject.body, states, size=size, lengths=lengths, surfaces=surfaces)
+    left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces, states=states)
     if left is not None:
         found = fit(left, steps, states)
         person, states = _by_joint(person, found), found.states

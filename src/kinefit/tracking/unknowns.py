@@ -75,18 +75,18 @@ def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
 
 
 def of_all(
-    recording: Recording, body: Body, states: Sequence[BodyState], *, size: bool, lengths: bool, surfaces: bool
+    recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool, states: Sequence[BodyState] = ()
 ) -> Unknowns | None:
     """What is left for all sensors together: the body's surface, gear, and what sensors do not know of themselves.
 
     Parameters
     ----------
     body : as sized as it is already
-    states : some poses of it
     size : whether anything of the body is sought
     lengths : whether neither points nor a few depth images have told them: nearest points of a surface of simple
         shapes, frame after frame, are surer of lengths than they are right
     surfaces : whether any sensor sees them
+    states : some poses of the body, which tell where gear begins
     """
     found: list[tuple[Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers):
