@@ -24,6 +24,9 @@ from kinefit.tracking.recording import Recording
 LEG = ("LKnee", "LAnkle", "LBigToe", "LSmallToe", "LHeel")
 PLACED = "driven"
 RATE = 50.0
+SET, SHIFT = "BODY_25B", 0.01
+"""The detector's points, and how far [m] they are from those of the body, one standard deviation along each axis."""
+
 DRIFT = 2.0
 """[px] standard deviation of what a detector's errors have that lasts, beside as much noise as is told."""
 
@@ -46,7 +49,7 @@ class Take:
     hidden: NDArray
 
 
-def cyclist(seed: int, *, seconds: float = 4.0, cameras: int = 4, leg: bool = False, noise: float = 3.0) -> Take:
+def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = False, noise: float = 3.0) -> Take:
     """Somebody who pedals on a bike that stands, seen by cameras about it."""
     random = np.random.default_rng(seed)
     generic = load_body("cyclist")
@@ -67,7 +70,7 @@ def cyclist(seed: int, *, seconds: float = 4.0, cameras: int = 4, leg: bool = Fa
 
 
 def snowboarder(
-    seed: int, *, seconds: float = 4.0, cameras: int = 7, leg: bool = False, noise: float = 3.0,
+    seed: int, *, seconds: float = 3.0, cameras: int = 7, leg: bool = False, noise: float = 3.0,
     gear: Mapping[str, float] | None = None,
 ) -> Take:  # fmt: skip
     """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's."""
@@ -111,9 +114,14 @@ RIDING = {
 
 
 def _person(generic: Body, random: np.random.Generator) -> Body:
-    """Somebody of another size, each length by itself."""
+    """Somebody of another size, each length by itself, whose points a detector sees where it was taught to."""
     size = random.normal(1.0, 0.04)
-    return generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
+    body = generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
+    points, shifts = body.keypoints(SET), dict[str, NDArray]()
+    for name in points.names:
+        shifts.setdefault(name.lstrip("LR"), random.normal(scale=SHIFT, size=3))
+    side = np.array([[1.0, 1.0, -1.0 if name[0] == "L" else 1.0 if name[0] == "R" else 0.0] for name in points.names])
+    return body.with_keypoints(SET, points.points + np.stack([shifts[n.lstrip("LR")] for n in points.names]) * side)
 
 
 def _known_stand(body: Body, T: NDArray) -> Body:
@@ -160,7 +168,7 @@ def _take(
     motion = _motion(body if of is None else of, states)
     rig = studio_rig(motion, cameras=cameras, up="y")
     seen = simulate_keypoints(
-        motion, rig, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
+        motion, rig, SET, noise_px=noise, drift_px=DRIFT, outliers=0.03, missing=0.05, seed=seed
     )
     hidden = np.zeros(frames, bool)
     if leg:

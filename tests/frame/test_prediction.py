@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,7 +91,8 @@ def test_halt_stays():
 
 def test_what_is_out_of_sight_may_go_on_as_it_went():
     """Halted for a second, a walker who in truth walks on stays within two standard deviations."""
-    prediction, speed = Prediction(BODY, DT, angle_acceleration=ACCELERATION, root_acceleration=1.0, memory=0.1), 1.5
+    walker = replace(BODY, tree=replace(BODY.tree, root_free=True))
+    prediction, speed = Prediction(walker, DT, angle_acceleration=ACCELERATION, root_acceleration=1.0, memory=0.1), 1.5
     step = np.zeros(N)
     step[0] = speed * DT
     prediction.start(BODY.usual_state())

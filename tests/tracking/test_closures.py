@@ -1,4 +1,4 @@
-"""Closed chains in the tracker, smoothed, a lag behind, and with gear that is not known: a leg on a pedal, by markers."""
+"""Closed chains in the tracker, smoothed, a lag behind, with unknown gear: a leg on a pedal, seen by markers."""
 
 from dataclasses import replace
 from functools import cache
