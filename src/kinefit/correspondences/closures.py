@@ -27,8 +27,6 @@ from kinefit.rows import DofRows
 STIFF = 1e-4
 """[m, rad] standard deviation of a hard closure where it enters a quadratic cost; what is solved is then made exact."""
 
-_WORLD = np.array([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])  # frame of segment -1
-
 
 @dataclass(frozen=True, eq=False)
 class Closed:
@@ -62,41 +60,39 @@ class Closed:
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Closures of a body as arrays: K closures, m equations, numbered `first` .. of each."""
+    """Closures of a body as arrays, as `_kernels_closures.close` takes them: K closures, m equations."""
 
-    segments: NDArray  # (K, 2) int, -1 for the world
-    rest: NDArray  # (K, 2, 3) [m] points in the root frame at rest, or in the world
-    directions: NDArray  # (m, 3) in the other's frame, zeros for a turn
+    segments: NDArray
+    rest: NDArray
+    directions: NDArray
+    first: NDArray
+    rigid: NDArray
+    turns: NDArray
     owner: NDArray  # (m,) int
-    rigid: tuple[tuple[int, int], ...]  # closure, first of its turn equations
-    turns: NDArray  # (K, 3, 3)
     sigma: NDArray  # (m,)
 
 
 @lru_cache(maxsize=256)
 def _table(body: Body) -> _Table:
-    names, marks, rest = list(body.landmarks.names), body.landmarks, body.points_rest(body.landmarks)
-    segments, points, directions, owner, sigma, rigid = [], [], [], [], [], []
-    for k, c in enumerate(body.closures):
-        a = names.index(c.point)
-        b = names.index(c.to) if c.to else -1
+    marks = body.landmarks
+    names, rest = {name: k for k, name in enumerate(marks.names)}, body.points_rest(marks)
+    segments, points, directions, sigma, turns = [], [], [np.zeros((0, 3))], list[float](), []
+    for c in body.closures:
+        a, b = names[c.point], names[c.to] if c.to else -1
         segments.append((marks.segments[a], marks.segments[b] if c.to else -1))
         points.append((rest[a], rest[b] if c.to else np.array(c.place)))
-        E = c.directions
-        directions.append(E)
-        place = c.place_std if c.place_std > 0.0 else 0.0
-        sigma += [0.0 if c.hard and not place else float(np.hypot(0.0 if c.hard else c.sigma, place))] * len(E)
+        directions.append(c.directions)
+        sigma += [float(np.hypot(0.0 if c.hard else c.sigma, c.place_std))] * len(c.directions)
+        turns.append(se3.exp_so3(np.array(c.turn)))
         if c.kind == "rigid":
-            rigid.append((k, sum(map(len, directions))))
             directions.append(np.zeros((3, 3)))
-            turn = 0.0 if c.hard else c.turn_sigma
-            sigma += [float(np.hypot(turn, c.turn_std))] * 3
-        owner += [k] * c.rows
-    turns = se3.exp_so3(np.array([c.turn for c in body.closures]).reshape(-1, 3))
+            sigma += [float(np.hypot(0.0 if c.hard else c.turn_sigma, c.turn_std))] * 3
+    counts = [c.rows for c in body.closures]
     return _Table(
         np.array(segments, np.int64).reshape(-1, 2), np.array(points, float).reshape(-1, 2, 3),
-        np.concatenate([*directions, np.zeros((0, 3))]), np.array(owner, np.int64), tuple(rigid), turns,
-        np.array(sigma, float),
+        np.concatenate(directions), np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.array([c.kind == "rigid" for c in body.closures], bool), np.array(turns, float).reshape(-1, 3, 3),
+        np.repeat(np.arange(len(counts)), counts), np.array(sigma, float),
     )  # fmt: skip
 
 
@@ -122,38 +118,25 @@ def _loose(body: Body) -> NDArray:
 
 def closure_values(body: Body, state: BodyState) -> NDArray:
     """(m,) [m, rad] how far every equation of a body's closures is off."""
-    return _placed(body, state, body.tree.forward(state.T_world_root, state.angles)[0])[0]
+    return _closed(body, state, 0)[0]
 
 
-def _placed(body: Body, state: BodyState, frames: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Values (m,), points x_a (K, 3), directions of all equations (m, 3), turns' frames (K, 3, 3)."""
-    t = _table(body)
-    f = np.concatenate([frames, _WORLD])[t.segments]
-    R = f[..., :9].reshape(-1, 2, 3, 3)
-    x = (R @ t.rest[..., None])[..., 0] + f[..., 9:]
-    n = (R[t.owner, 1] @ t.directions[:, :, None])[..., 0]
-    value = np.einsum("mi,mi->m", n, (x[:, 0] - x[:, 1])[t.owner])
-    M = R[:, 1] @ t.turns
-    for k, first in t.rigid:
-        value[first : first + 3] = se3.log_so3(M[k].T @ R[k, 0])
-    return value, x[:, 0], n, M
+def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]:
+    """Values (m,), and their Jacobian with so many lines: m or none."""
+    t, tree = _table(body), body.tree
+    frames, screws = tree.forward(state.T_world_root, state.angles)
+    value, J = np.empty(len(t.owner)), np.zeros((lines, tree.n_dofs))
+    _kernels_closures.close(
+        frames, screws, np.ascontiguousarray(state.T_world_root[:3, 3]), t.segments, t.rest, t.directions, t.first,
+        t.rigid, t.turns, tree.dof_parent, tree.last_dof, value, J,
+    )  # fmt: skip
+    return value, J
 
 
 def closed_at(body: Body, state: BodyState) -> Closed:
     """The closures of a body at a state."""
-    t, tree = _table(body), body.tree
-    frames, screws = tree.forward(state.T_world_root, state.angles)
-    value, x, n, M = _placed(body, state, frames)
-    data = np.zeros((2, len(t.owner), 6))  # what of the twists of both segments each equation takes
-    data[:, :, :3] = n
-    data[:, :, 3:] = np.cross(x[t.owner] - state.T_world_root[:3, 3], n)
-    for k, first in t.rigid:
-        e = value[first : first + 3]
-        data[:, first : first + 3, 3:] = np.linalg.solve(se3.left_jacobian_so3(e), M[k].T)
-    data[1] *= -1.0
-    J, segments = np.zeros((len(t.owner), tree.n_dofs)), np.ascontiguousarray(t.segments[t.owner].T)
-    _kernels_closures.twists(data, segments, screws, tree.dof_parent, tree.last_dof, J)
-    return Closed(value, J, np.hypot(t.sigma, _loose(body)))
+    t = _table(body)
+    return Closed(*_closed(body, state, len(t.owner)), np.hypot(t.sigma, _loose(body)))
 
 
 def closure_rows(body: Body, state: BodyState) -> DofRows:
