@@ -12,7 +12,7 @@ from kinefit.errors import FileError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.markers import UNITS
-from kinefit.readers.take.entries import SKIN_SETS, StartEntry
+from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -83,6 +83,8 @@ def _values(take: Take) -> None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
         if take.size is False and key != "size" and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Leave one of both out.")
+    if take.calibration is not None:
+        _calibration(take, take.calibration, refuse)
     if take.pose is not None:
         _pose(take, take.pose, refuse)
     if take.frames is not None and not -_MOST < take.frames[0] < take.frames[1] < _MOST:
@@ -141,6 +143,21 @@ def _values(take: Take) -> None:
 def _is_size(size: tuple[int, int]) -> bool:
     """Whether an image may have a size [px]."""
     return 1 <= min(size) and max(size) < 100_000
+
+
+def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str, str], None]) -> None:
+    """Standard deviations of cameras' poses: both, and for keypoints."""
+    given = entry.position_sigma, entry.rotation_sigma
+    told, place = f"position_sigma {given[0]}, rotation_sigma {given[1]}", "[calibration]"
+    if given == (None, None):
+        return
+    if given[0] is None or given[1] is None or (min(given) <= 0 and max(given) != 0) or min(given) < 0:
+        refuse(told, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
+    elif not (given[0] < 1 and given[1] < 30):
+        refuse(told, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
+    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    if not take.keypoints and any(others):
+        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
 
 
 def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:
