@@ -55,8 +55,8 @@ class TrackSettings:
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
         catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces for exact everywhere.
     camera_shift, camera_turn : float [m], [rad]
-        Standard deviations of each camera's calibrated position and of its direction: so far keypoints of several
-        cameras may move them, and what is left of it is in the error bars. 0 and 0 take calibrations for exact.
+        Standard deviations of each camera's calibrated position and of its direction, for error bars; and how far
+        markers beside keypoints may move cameras. 0 and 0 take calibrations for exact.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]

@@ -135,8 +135,12 @@ class Known:
         if subject.fit is not None and subject.covariance is not None:
             cameras = next((p for p in subject.fit.parameters if isinstance(p, CameraExtrinsics)), None)
             moves, covariance = point_moves(subject.fit), subject.covariance
-            if cameras is not None or std is None:
-                return cls(moves, cameras, covariance)
+            if cameras is not None:
+                stay = np.zeros(len(covariance))  # where they were found, and the motion was not
+                stay[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
+                return cls(moves, cameras, covariance + np.outer(stay, stay))
+            if std is None:
+                return cls(moves, None, covariance)
         else:
             moves, covariance = None, np.zeros((0, 0))
         if std is None or not len(channels.camera):

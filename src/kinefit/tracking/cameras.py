@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -24,14 +23,14 @@ def of_cameras(found: SubjectFit) -> CameraExtrinsics | None:
     return next((p for p in found.parameters if isinstance(p, CameraExtrinsics)), None)
 
 
-def as_told(found: Sequence[tuple[SubjectFit, NDArray]]) -> dict[str, Any]:
-    """How far the last of several fits (fit, covariance) that sought cameras moved them, for `Motion.provenance`."""
-    for fit, covariance in reversed(found):
+def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
+    """How far the last of several fits that sought cameras moved them, for `Motion.provenance`."""
+    for fit in reversed(found):
         first = 0
         for one in fit.parameters:
             own, first = slice(first, first + len(one.names)), first + len(one.names)
             if isinstance(one, CameraExtrinsics):
-                values, std = fit.mean[own].reshape(-1, 6), np.sqrt(np.diag(covariance)[own]).reshape(-1, 6)
+                values, std = fit.mean[own].reshape(-1, 6), fit.std[own].reshape(-1, 6)
                 return {
                     name: {"moved": value.tolist(), "std": s.round(6).tolist()}
                     for name, value, s in zip(one.free, values, std)
@@ -52,7 +51,7 @@ def sentences(provenance: Mapping[str, Any], std: tuple[float, float] | None) ->
         if np.any(np.abs(moved) > _FAR * np.repeat(std, 3)):  # type: ignore[arg-type]
             shift, turn = 1e3 * np.linalg.norm(moved[:3]), np.degrees(np.linalg.norm(moved[3:]))
             out.append(
-                f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than that can "
+                f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than it may "
                 "be off by: `kinefit check` looks closer"
             )
     return out

@@ -123,11 +123,7 @@ def motion_of(
         )
         provenance["sensor noise"] = noise_of_others.as_told()
     answers = [partial(shape_errors, one, settings, seen) for one in found]
-    fits = [(one, one.covariance) for one in found]
-    if subject.fit is not None and subject.covariance is not None:
-        fits.insert(0, (subject.fit, subject.covariance))
-    cameras = as_told(fits)
-    if cameras:
+    if cameras := as_told(found):
         provenance[CAMERAS] = cameras
     elsewhere = any(of_cameras(one) is not None for one in found)
     results, detectors = with_lasting_errors(

@@ -107,7 +107,7 @@ def fitted_to_person(
             body, channels, frames=frames or 25, height=height, trial=trial, cameras=settings.camera_std,
             progress=progress,
         )  # fmt: skip
-        person = _wearing(_seen_by(person, found.fit.rig) if found.fit is not None else person, found)
+        person = _wearing(person, found)
     elif recording.markers and recording.marker_sets[0][0]:
         person = _by_markers(person, height, progress)
     else:
@@ -215,8 +215,9 @@ def _by_all(
 
     points = None
     if size:
-        known = {"calibrated": person.calibrated, "cameras": settings.camera_std}
-        points = of_points(r, generic, person.subject, height, trial, **known)
+        points = of_points(
+            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_std
+        )  # fmt: skip
     if points is not None:
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states

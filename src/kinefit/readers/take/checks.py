@@ -147,13 +147,13 @@ def _is_size(size: tuple[int, int]) -> bool:
 
 def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str, str], None]) -> None:
     """Standard deviations of cameras' poses: both, and for keypoints."""
-    given = entry.position_sigma, entry.rotation_sigma
-    told, place = f"position_sigma {given[0]}, rotation_sigma {given[1]}", "[calibration]"
-    if given == (None, None):
+    shift, turn = entry.position_sigma, entry.rotation_sigma
+    told, place = f"position_sigma {shift}, rotation_sigma {turn}", "[calibration]"
+    if shift is None and turn is None:
         return
-    if given[0] is None or given[1] is None or (min(given) <= 0 and max(given) != 0) or min(given) < 0:
+    if shift is None or turn is None or (min(shift, turn) <= 0 and not shift == turn == 0):
         refuse(told, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
-    elif not (given[0] < 1 and given[1] < 30):
+    elif not (shift < 1 and turn < 30):
         refuse(told, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
     others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin)
     if not take.keypoints and any(others):
