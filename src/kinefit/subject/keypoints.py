@@ -21,6 +21,7 @@ from kinefit.subject.gear import Gear
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
@@ -38,6 +39,7 @@ def fit_subject(
     frames: int = 25,
     height: float | None = None,
     trial: Subject | None = None,
+    cameras: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Subject:
     """Bone lengths and the places of the detectors' points on a body, with no pose given.
@@ -48,6 +50,9 @@ def fit_subject(
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
+
+    cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
+        default: the calibration is exact.
 
     Raises
     ------
@@ -81,7 +86,7 @@ def fit_subject(
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
-    found, covariance = _fitted(body, channels, steps, list(states.values()), lengths, scales)
+    found, covariance = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
@@ -90,30 +95,43 @@ def fit_subject(
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray,
+    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
 ) -> tuple[SubjectFit, NDArray]:  # fmt: skip
-    """Lengths, points and gear, with as much freedom for a detector's points as this take asks for; their covariance.
+    """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
-    one centimetre, which counts as much as `_BELIEF` points seen along one axis.
+    one centimetre, which counts as much as `_BELIEF` points seen along one axis. What a detector errs by lasts, and
+    would move cameras: their calibration counts for more by the excess of the round before.
     """
-    spread, start, gear = _SHIFT, None, Gear(body)
+    spread, excess_of, start, gear = _SHIFT, 1.0, None, Gear(body)
+    used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     for k in range(_ROUNDS):
-        kinds: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
-        if start is None:
-            start = np.concatenate([np.log(scales), *(one.mean for one in kinds[1:])])
+        parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
+        before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
-            kinds.append(gear)
-            start = np.concatenate([start, gear.start(states)])
+            parameters.append(gear)
+        of_body = sum(len(one.names) for one in parameters)
+        if std is not None:
+            held = np.array(std) / np.sqrt(excess_of)
+            parameters.append(CameraExtrinsics(channels.rig, None, (float(held[0]), float(held[1])), used))
+        if start is None:
+            start = np.concatenate([np.log(scales), *(one.mean for one in parameters[1:])])
+        elif of_body > before:
+            start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            body, channels.rig, steps, states, kinds, start=start, rounds=1, looks=len(steps)
+            body, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
         )
-        start, states = found.mean, found.states
-        covariance = inverse(found.prior.information + found.information / _excess(found, steps))
-        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(found.prior.information), spread**-2)
+        start, states, prior = found.mean, found.states, found.prior.information.copy()
+        prior[of_body:, of_body:] /= excess_of
+        excess_of = _excess(found, steps)
+        covariance = inverse(prior + found.information / excess_of)
+        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
+        open_to[of_body:] = False
         told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
-    return found, _UNTOLD * covariance
+        excess_of = max(excess_of, 1.0)
+    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
+    return found, wider[:, None] * covariance * wider
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:
