@@ -9,6 +9,7 @@ PARTS = {
     "closures_mobility": "Gruebler's count, rank and mobility of the catalogue's bodies",
     "closures_people": "a cyclist and a snowboarder, simulated, with closures and without",
     "closures_gear": "dimensions of gear that are estimated",
+    "closures_contacts": "feet that leave the ground and come back",
 }
 
 if __name__ == "__main__":

@@ -64,9 +64,9 @@ def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = Fa
 
     def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
         posture = usual + wave(t) * _give(person)
-        return person, _towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
+        return person, towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
 
-    return _take(generic, drive, seconds, cameras, seed, leg, noise)
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise)
 
 
 def snowboarder(
@@ -94,9 +94,9 @@ def snowboarder(
         for name, share in (("hip_flexion", 1.0), ("knee_angle", 1.2)):
             for side in "lr":
                 posture[names.index(f"{name}_{side}")] += share * crouch
-        return body, _towards(person, posture), {}
+        return body, towards(person, posture), {}
 
-    return _take(generic, drive, seconds, cameras, seed, leg, noise, person)
+    return from_drive(generic, drive, seconds, cameras, seed, leg, noise, person)
 
 
 CYCLING = {
@@ -146,7 +146,8 @@ def _give(body: Body) -> NDArray:
     return np.radians([{"neck_rotation": 15.0, "ankle_angle": 8.0, "arm_add": 6.0}.get(c, 3.0) for c in named])
 
 
-def _towards(body: Body, posture: NDArray) -> ParameterRows:
+def towards(body: Body, posture: NDArray) -> ParameterRows:
+    """Rows whose residuals are the angles of a posture (D,) [rad], of ten degrees each."""
     held = np.flatnonzero(np.isfinite(body.tree.spread))
     return ParameterRows(6 + held, posture[held], np.full(len(held), np.radians(10.0) ** -2))
 
@@ -157,9 +158,11 @@ def _waves(random: np.random.Generator, count: int):
     return lambda t: np.sin(2.0 * np.pi * speed * t + phase).sum(axis=0) / np.sqrt(1.5)
 
 
-def _take(
-    generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool, noise: float, of: Body | None = None
-) -> Take:
+def from_drive(
+    generic: Body, drive, seconds: float, cameras: int, seed: int, leg: bool = False, noise: float = 3.0,
+    of: Body | None = None,
+) -> Take:  # fmt: skip
+    """A take of whatever a function of time [s] says: a body, the posture it is drawn towards, coordinates it has."""
     frames = int(amount(seconds, min(seconds, 1.0)) * RATE)
     states, body = list[BodyState](), generic
     for f in range(frames):

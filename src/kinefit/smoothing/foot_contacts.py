@@ -1,4 +1,4 @@
-"""Feet on the floor: points of the soles that stay low and hardly move, and where they rest."""
+"""Feet on the floor: points of the soles that stay low and hardly move, where they rest, and when they leave."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from kinefit.motion import UP_AXES
 
 _SOLE = 0.04  # [m] above the lowest landmark of the body at rest, up to which one counts as of a sole
 _SLOW = 0.15  # [m/s]: a foot that swings reaches several m/s; one that stands seems to move by its noise
+_LETS_GO = 0.30  # [m/s] at which a point that rested leaves: of 1 to 6 times `_SLOW`, in simulated jumps,
+# all from 1.5 on end a foot's flicker, and none holds it in flight (seeds 0 to 2, `benchmarks.closures_contacts`)
 _LOW = 0.04  # [m] above where the point rests: a foot that is lifted to step clears more within few frames
 _LEAST = 0.1  # [s] that a contact lasts at least; the shortest stance of a sprinter
 _GIVES = 0.01  # [m] that a resting point still moves, one standard deviation: soles and skin give
@@ -48,6 +50,8 @@ def soles(body: Body) -> PointSet:
 def find_contacts(body: Body, roots: NDArray, angles: NDArray, rate: float, up: str) -> Contacts:
     """Contacts of the soles with a level floor in a smoothed motion.
 
+    Contacts switch with hysteresis: a point must be slow for a while to rest, and twice as fast to leave.
+
     The floor's height is taken for each point on its own, since its place on the sole is not known to the centimetre:
     the median of those of its slow frames that are near the lowest.
 
@@ -68,7 +72,10 @@ def find_contacts(body: Body, roots: NDArray, angles: NDArray, rate: float, up: 
             continue
         lowest = np.quantile(height[slow, p], 0.1)
         floor = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
-        for run in _runs(slow & (np.abs(height[:, p] - floor) < _LOW), int(np.ceil(_LEAST * rate))):
+        near = np.abs(height[:, p] - floor) < _LOW
+        for run in _runs((speed[:, p] < _LETS_GO) & near, 1):
+            if np.count_nonzero(slow[run]) < _LEAST * rate:
+                continue
             middle = np.median(x[run, p], axis=0)
             places[run, p] = middle + (floor - middle @ axis) * axis
             weight[run, p] = _GIVES**-2
