@@ -17,7 +17,7 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "markers", "body", "view", "export", "retarget",
+    "demo", "init", "calibrate", "detect", "check", "track", "markers", "body", "view", "replay", "export", "retarget",
     "simulate", "evaluate", "warmup",
 )  # fmt: skip
 

@@ -1,0 +1,158 @@
+"""A motion seen anew: on a slope, carried along, by a camera that was not there (P3 4, fig. 13)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError, ObservationError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera
+from kinefit.motion import UP_AXES, Motion
+from kinefit.simulation.figures import draw_figure
+from kinefit.simulation.placing import look_at, places
+
+_SNOW, _SKY = (245, 240, 235), (225, 190, 150)  # BGR
+_GRID, _FAR = 1.0, 30  # [m] between the lines of a slope, and how many of them to either side
+_BEHIND = 0.3  # [m] before a camera, nearer than which no line is drawn
+
+
+def replayed(
+    motion: Motion, *, slope: float = 30.0, heading: float = 0.0, speed: float = 0.0, gain: float = 0.0
+) -> Motion:
+    """The motion on an inclined floor, carried down it by s(t) = v t + a t² / 2 along the fall line.
+
+    Parameters
+    ----------
+    slope : [deg] of the floor, below 90.
+    heading : [deg] of the fall line about the vertical axis.
+    speed, gain : v [m/s] and a [m/s²].
+
+    Raises
+    ------
+    ObservationError
+        Numbers that are not finite, a slope of 90 degrees and more.
+    """
+    if not np.isfinite([slope, heading, speed, gain]).all() or abs(slope) >= 90.0:
+        problem = f"a slope of {slope:g} deg with {speed:g} m/s and {gain:g} m/s²"
+        raise ObservationError(problem, remedy="Give a slope below 90 degrees, and finite numbers.")
+    down, T = _ground(motion, slope, heading)
+    t = motion.times - motion.times[0]
+    carried = np.tile(np.eye(4), (len(motion), 1, 1))
+    carried[:, :3, 3] = (speed * t + 0.5 * gain * t**2)[:, None] * down
+    return replace(
+        motion, Ts_world_root=carried @ T @ motion.Ts_world_root, joint_std=_turned(motion.joint_std, T[:3, :3]),
+        residuals={}, name=f"{motion.name} replayed",
+        provenance={**motion.provenance, "replay": {"slope": slope, "heading": heading, "speed": speed, "gain": gain}},
+    )  # fmt: skip
+
+
+def _ground(motion: Motion, slope: float, heading: float) -> tuple[NDArray, NDArray]:
+    """Fall line (3,), and T (4, 4) from a level floor to the inclined one, about where the person first stands."""
+    up, down, R = _inclined(motion, slope, heading)
+    x = places(motion).reshape(len(motion), -1, 3)
+    foot = x[0].mean(axis=0)
+    foot = foot + (float((x @ up).min()) - foot @ up) * up
+    return down, se3.transform(R, foot - R @ foot)
+
+
+def _inclined(motion: Motion, slope: float, heading: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Upwards (3,), the fall line (3,), and R (3, 3) that inclines the floor."""
+    up = np.array(UP_AXES[motion.up])
+    level = se3.exp_so3(np.radians(heading) * up) @ np.roll(up, 1)
+    R = se3.exp_so3(np.radians(slope) * np.cross(level, -up))
+    return up, R @ level, R
+
+
+def _turned(std: NDArray, R: NDArray) -> NDArray:
+    """(F, S, 3) standard deviations along axes that were turned, as if errors along them were independent."""
+    known = np.isfinite(std).all(axis=-1, keepdims=True)
+    return np.where(known, np.sqrt(np.square(np.where(known, std, 0.0)) @ np.square(R).T), np.inf)
+
+
+def film(
+    motion: Motion, path: str | os.PathLike[str], *, slope: float = 30.0, heading: float = 0.0, azimuth: float = 60.0,
+    size: tuple[int, int] = (960, 720),
+) -> None:  # fmt: skip
+    """Write a video (.mp4) of a motion that `replayed` gave, on its slope, by a camera that pans with it.
+
+    Parameters
+    ----------
+    slope, heading : as of `replayed`
+    azimuth : [deg] of the camera about the vertical axis, from the fall line.
+    size : (width, height) [px], even
+
+    Raises
+    ------
+    ExportError
+        Another suffix, or a file that cannot be written.
+    """
+    target = Path(path)
+    if target.suffix.lower() != ".mp4":
+        raise ExportError("a video is an .mp4 file", file=path, remedy=f"Call it {target.stem}.mp4.")
+    lines = _lines(motion, slope, heading)
+    codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    try:
+        with av.open(str(target), "w") as container:
+            stream = container.add_stream(codec, rate=Fraction(motion.rate).limit_denominator(1001))
+            stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+            for frame, camera in enumerate(_cameras(motion, heading, azimuth, size)):
+                image = draw_figure(motion, frame, camera, _backdrop(camera, lines))
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            container.mux(stream.encode())
+    except OSError as error:
+        problem = f"the video cannot be written ({error.strerror or error})"
+        raise ExportError(problem, file=path, remedy="Name a folder that can be written, with room.") from error
+
+
+def _cameras(motion: Motion, heading: float, azimuth: float, size: tuple[int, int]) -> list[Camera]:
+    """Of every frame the camera, which stands beside the middle of the way and turns with the person."""
+    up = np.array(UP_AXES[motion.up])
+    x = places(motion).reshape(len(motion), -1, 3).mean(axis=1)
+    side = se3.exp_so3(np.radians(heading + azimuth) * up) @ np.roll(up, 1)
+    way = float(np.linalg.norm(x[-1] - x[0]))
+    eye = x[len(x) // 2] + (4.0 + 0.6 * way) * side + (1.0 + 0.1 * way) * up
+    out = []
+    for middle in x:
+        focal = 0.32 * size[1] * float(np.linalg.norm(middle - eye))
+        matrix = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
+        out.append(Camera("replay", size, matrix, np.zeros(0), "radtan", look_at(eye, middle, up)))
+    return out
+
+
+def _lines(motion: Motion, slope: float, heading: float) -> NDArray:
+    """(L, 2, 3) [m] lines of a grid on the slope, below the person's way."""
+    up, down, R = _inclined(motion, slope, heading)
+    across, normal = np.cross(R @ up, down), R @ up
+    x = places(motion)
+    at = x[: len(x) // len(motion)].mean(axis=0)
+    at = at + (float((x @ normal).min()) - at @ normal) * normal
+    way = max(float(((x - at) @ down).max()), 0.0)
+    steps = np.arange(-_FAR, _FAR + 1) * _GRID
+    along = [(at + s * across - 10.0 * down, at + s * across + (way + 20.0) * down) for s in steps]
+    rungs = np.arange(-10.0, way + 20.0, _GRID)
+    return np.array([*along, *((at + r * down - _FAR * across, at + r * down + _FAR * across) for r in rungs)])
+
+
+def _backdrop(camera: Camera, lines: NDArray) -> NDArray:
+    """The slope's grid before the sky."""
+    image = np.full((camera.size[1], camera.size[0], 3), _SKY, np.uint8)
+    ends = lines @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    for a, b in ends:
+        if min(a[2], b[2]) < _BEHIND:
+            if max(a[2], b[2]) < _BEHIND:
+                continue
+            far, near = (a, b) if a[2] > b[2] else (b, a)
+            near = near + (far - near) * (_BEHIND - near[2]) / (far[2] - near[2])
+            a, b = far, near
+        p, q = (camera.matrix @ v for v in (a, b))
+        start, end = (np.clip(np.round(v[:2] / v[2]), -20000, 20000).astype(int).tolist() for v in (p, q))
+        cv2.line(image, start, end, _SNOW, 1, cv2.LINE_AA)
+    return image

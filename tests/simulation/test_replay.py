@@ -1,0 +1,60 @@
+"""A motion on a slope: inclined as a whole, carried as told, filmed."""
+
+import av
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kinefit.cli import main
+from kinefit.errors import ExportError, ObservationError
+from kinefit.exporters.motion_file import write_motion
+from kinefit.readers.motion import read_motion
+from kinefit.simulation.exercise import squat_and_wave
+from kinefit.simulation.replay import film, replayed
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return squat_and_wave(rate=25.0, duration=0.4, up="z")
+
+
+@pytest.mark.parametrize("slope", [0.0, 30.0, -20.0])
+def test_all_is_inclined_and_carried_down_the_fall_line(motion, slope):
+    moved = replayed(motion, slope=slope, heading=40.0, speed=3.0, gain=2.0)
+    a, b = motion.positions(), moved.positions()
+    between = lambda x: np.linalg.norm(x[:, :, None] - x[:, None], axis=-1)
+    np.testing.assert_allclose(between(a), between(b), atol=1e-12)  # of one body, rigidly moved
+    t = motion.times - motion.times[0]
+    still = replayed(motion, slope=slope, heading=40.0)
+    way = (b - still.positions()).mean(axis=1)
+    np.testing.assert_allclose(np.linalg.norm(way, axis=1), 3.0 * t + t**2, atol=1e-12)
+    np.testing.assert_allclose(way[:, 2], -np.sin(np.radians(slope)) * (3.0 * t + t**2), atol=1e-12)
+    up = still.Ts_world_root[0, :3, :3] @ motion.Ts_world_root[0, :3, :3].T @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up[2])) == pytest.approx(abs(slope), abs=1e-4)
+    np.testing.assert_allclose((moved.joint_std**2).sum(axis=2), (motion.joint_std**2).sum(axis=2), atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [{"slope": 90.0}, {"speed": np.inf}, {"gain": np.nan}])
+def test_what_cannot_be_is_told(motion, wrong):
+    with pytest.raises(ObservationError, match="Give a slope below 90"):
+        replayed(motion, **wrong)
+
+
+def test_a_film_shows_the_person_on_the_slope(motion, tmp_path):
+    film(replayed(motion, speed=2.0), tmp_path / "ride.mp4", size=(320, 240))
+    with av.open(str(tmp_path / "ride.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert len(frames) == len(motion) and frames[0].shape == (240, 320, 3)
+    middle = frames[4][80:160, 130:190].reshape(-1, 3).astype(int)
+    assert np.mean(middle[:, 2] < 160) > 0.1  # darker than the sky
+    with pytest.raises(ExportError, match=r"\.mp4"):
+        film(motion, tmp_path / "ride.gif")
+
+
+def test_the_command_writes_motions_and_videos(motion, tmp_path):
+    write_motion(motion, tmp_path / "motion.npz")
+    run = lambda *words: CliRunner().invoke(main, ["replay", str(tmp_path / "motion.npz"), *words])
+    assert run("-o", str(tmp_path / "ride.npz"), "--slope", "20").exit_code == 0
+    assert read_motion(tmp_path / "ride.npz").provenance["replay"]["slope"] == 20.0
+    assert run("-o", str(tmp_path / "ride.mp4")).exit_code == 0 and (tmp_path / "ride.mp4").stat().st_size > 1000
+    assert run("-o", str(tmp_path / "ride.avi")).exit_code == 2
