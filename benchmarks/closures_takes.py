@@ -14,8 +14,10 @@ from kinefit.bodies.closures import Closure, with_dimensions
 from kinefit.correspondences import prior_rows
 from kinefit.correspondences.closures import closed_at
 from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.rows import AnyRows, DofRows, ParameterRows
+from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.solvers.closed import CLOSED, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -177,8 +179,17 @@ def from_drive(
     if leg:
         hidden[frames // 4 : 3 * frames // 4] = True
         seen = [_without(k, hidden) for k in seen]
-    recording = Recording.of_keypoints(rig, seen, accuracy=noise, up="y")
+    recording = Recording.of_keypoints(_calibrated(rig, seed), seen, accuracy=noise, up="y")
     return Take(motion, generic, recording, hidden)
+
+
+def _calibrated(rig: Rig, seed: int) -> Rig:
+    """The cameras as a calibration has them, by what the tracker takes a calibration to be off."""
+    std, random = TrackSettings().camera_std, np.random.default_rng(seed + 1000)
+    if std is None:
+        return rig
+    twists = random.normal(size=(len(rig), 6)) * np.repeat(std, 3)
+    return Rig(tuple(c.with_pose(se3.exp(xi) @ c.T_camera_world) for c, xi in zip(rig, twists)))
 
 
 def _without(k, hidden: NDArray):
