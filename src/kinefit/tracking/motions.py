@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
+from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Matched, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
@@ -122,7 +123,15 @@ def motion_of(
             body, others, matched, take.roots, take.angles, surfaces=smooth or lag is not None
         )
         provenance["sensor noise"] = noise_of_others.as_told()
-    answers = [partial(shape_errors, one, settings, seen) for one in found]
+
+    def weighed(f: int) -> tuple[Scene, list[Matched]]:
+        """The same with keypoints as they took part."""
+        scene, several = seen(f)
+        pixels = {"weight": weight[f], "loss": SQUARED}
+        return scene, [replace(m, **pixels) if isinstance(m, KeypointMatched) else m for m in several]
+
+    scale = None if others is None else others.scale
+    answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
     if cameras := as_told(found):
         provenance[CAMERAS] = cameras
     elsewhere = any(of_cameras(one) is not None for one in found)
