@@ -27,6 +27,9 @@ UP_AXES = {
 }
 
 
+_AT_ONCE = 2000  # frames of which all segments' poses are made at once
+
+
 def rotation_between_up(source: str, target: str) -> NDArray:
     """(3, 3) rotation that takes a world with vertical axis `source` to one with vertical axis `target`.
 
@@ -181,7 +184,10 @@ class Motion:
     @property
     def joint_centres(self) -> NDArray:
         """(F, S, 3) [m] joint centres in the world, in the order of `body.joints`; `joint_std` are their deviations."""
-        return self.segment_poses()[..., :3, 3]
+        starts = range(0, max(len(self), 1), _AT_ONCE)
+        poses = (self.body.tree.segment_poses(self.Ts_world_root[i : i + _AT_ONCE], self.angles[i : i + _AT_ONCE])
+                 for i in starts)  # fmt: skip
+        return np.concatenate([T[..., :3, 3] for T in poses])
 
     def to_dataframe(self) -> Any:
         """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.

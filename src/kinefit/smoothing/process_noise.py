@@ -13,7 +13,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.motion_prior import MotionPrior
 from kinefit.solvers.seen_points import SeenPoints
@@ -114,6 +114,11 @@ class SmoothTake:
         used = (self.confidence > 0) & np.isfinite(r2)
         s2 = np.where(used, self.confidence * r2 / np.square(sigma), 0.0)
         return np.where(used, self.loss.factor(s2), 0.0)
+
+    def agreeing(self, sigma: NDArray) -> NDArray:
+        """(T, N) robust factor of every channel at its states, 0 where unseen."""
+        parts = [self.part(some) for some in stretches(len(self.roots))]
+        return np.concatenate([p.factors(sigma, p.fitted(p.roots, p.angles)) for p in parts])
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """All frames together, from where they are."""
