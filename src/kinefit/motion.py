@@ -137,8 +137,11 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"):
-            array = np.array(getattr(self, name), dtype=float)
-            array.flags.writeable = False
+            array = getattr(self, name)
+            mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
+            if not mine or array.flags.writeable:
+                array = np.array(array, dtype=float)  # nobody else's
+                array.flags.writeable = False
             object.__setattr__(self, name, array)
         if self.up not in UP_AXES:
             raise ObservationError(choices("vertical axis", self.up, UP_AXES))

@@ -84,13 +84,13 @@ def with_lasting_errors(
         moves, Sigma = point_moves(subject.fit), subject.covariance
     layout = Layout(channels.with_points(body), body)
     half, n = round(_TIED * rate), body.tree.n_dofs
-    weights = pooled(weight, half)
     nothing = np.zeros((n, n)), np.zeros((n, n))
     sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
 
     def lasts(f: int) -> Lasting:
         more = nothing if others is None else others.pooled(f, half)
-        return lasting(moves, Sigma, layout, results[f].state, weights[f], noise, *more)
+        near = weight[max(f - half, 0) : f + half + 1]
+        return lasting(moves, Sigma, layout, results[f].state, near.mean(axis=0), noise, *more)
 
     shapes = []
     if answers:
@@ -125,14 +125,6 @@ def _left_over(take: SmoothTake) -> tuple[NDArray, NDArray]:
             values.append(np.full((_APART, *values[0].shape[1:]), np.nan))
             factors.append(np.zeros((_APART, factors[0].shape[1])))
     return np.concatenate(values), np.concatenate(factors)
-
-
-def pooled(values: NDArray, half: int) -> NDArray:
-    """Values (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
-    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    frames = np.arange(len(values))
-    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(values))
-    return np.maximum((total[high] - total[low]) / (high - low)[:, None], 0.0)
 
 
 def lasting(

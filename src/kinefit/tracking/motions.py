@@ -145,6 +145,8 @@ def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str
         out["Ts_world_root"][f], out["angles"][f] = r.state.T_world_root, r.state.angles
         for name in ("dof_std", "joint_std", "quality", "segment_quality"):
             out[name][f] = getattr(r, name)
+    for array in out.values():
+        array.flags.writeable = False  # for a motion to take them as they are
     return out
 
 
