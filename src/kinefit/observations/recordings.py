@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,16 @@ class Detections:
         object.__setattr__(self, "confidence", confidence)
         object.__setattr__(self, "mask_runs", runs)
         object.__setattr__(self, "mask_starts", starts)
+
+    def within(self, first: int, frames: int) -> Detections:
+        """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
+        after, people = frames - first - len(self), self.points.shape[1]
+        around = ((first, after), (0, 0), (0, 0))
+        return replace(
+            self, points=np.pad(self.points, (*around, (0, 0)), constant_values=np.nan),
+            confidence=np.pad(self.confidence, around),
+            mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)
