@@ -140,7 +140,12 @@ class Motion:
             array = getattr(self, name)
             mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
             if not mine or array.flags.writeable:
-                array = np.array(array, dtype=float)  # nobody else's
+                try:
+                    array = np.array(array, dtype=float)  # nobody else's
+                except (TypeError, ValueError) as error:
+                    problem = f"{name} of a motion is a {type(array).__name__} that is no array of numbers"
+                    remedy = "Give arrays of as many frames as there are times."
+                    raise ObservationError(problem, remedy=remedy) from error
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
         if self.up not in UP_AXES:
@@ -190,7 +195,7 @@ class Motion:
         starts = range(0, max(len(self), 1), _AT_ONCE)
         poses = (self.body.tree.segment_poses(self.Ts_world_root[i : i + _AT_ONCE], self.angles[i : i + _AT_ONCE])
                  for i in starts)  # fmt: skip
-        return np.concatenate([T[..., :3, 3] for T in poses])
+        return np.concatenate([T[..., :3, 3].copy() for T in poses])
 
     def to_dataframe(self) -> Any:
         """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -123,21 +124,33 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
     segments = bone_names(body, names or "kinefit", place)
     bones = tuple(segments) if names else body.joints
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
-    quality = {name: motion.segment_quality[:, s] for s, name in enumerate(segments)}
-    whole: dict[str, Callable[[], Table]] = {
-        "angles": lambda: angle_columns(motion, factor, unit),
-        "joints": lambda: joint_columns(motion, bones, factor, unit),
-        "landmarks": lambda: place_columns(body.landmarks.names, factor * motion.positions(), unit),
-        "quality": lambda: {"quality": motion.quality} | quality,
-    }
+    stretches = [slice(row, row + _ROWS) for row in range(0, max(len(motion), 1), _ROWS)]
 
-    def pieces(columns: Callable[[], Table]) -> Iterator[Table]:
-        table = start | columns()
-        for row in range(0, max(len(motion), 1), _ROWS):
-            yield {name: column[row : row + _ROWS] for name, column in table.items()}
+    def angles() -> Iterator[Table]:
+        whole = angle_columns(motion, factor, unit)  # of a quaternion's two signs the nearer to the frame before
+        for some in stretches:
+            yield {name: column[some] for name, column in (start | whole).items()}
+
+    def of_parts(columns: Callable[[Motion], Table]) -> Iterator[Table]:
+        for some in stretches:
+            yield {name: column[some] for name, column in start.items()} | columns(_part(motion, some))
+
+    def landmarks(part: Motion) -> Table:
+        return place_columns(body.landmarks.names, factor * part.positions(), unit)
+
+    def quality(part: Motion) -> Table:
+        return {"quality": part.quality, **{name: part.segment_quality[:, s] for s, name in enumerate(segments)}}
 
     residuals = _long(lambda sensor, frames: _residuals(motion, sensor, frames, factor, unit, segments), motion)
-    return {name: pieces(columns) for name, columns in whole.items()} | {"residuals": residuals}
+    return {
+        "angles": angles(), "joints": of_parts(lambda part: joint_columns(part, bones, factor, unit)),
+        "landmarks": of_parts(landmarks), "quality": of_parts(quality), "residuals": residuals,
+    }  # fmt: skip
+
+
+def _part(motion: Motion, some: slice) -> Motion:
+    fields = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
+    return replace(motion, residuals={}, **{name: getattr(motion, name)[some] for name in fields})
 
 
 def _residuals(

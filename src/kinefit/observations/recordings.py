@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.observations.arrays import frozen
+from kinefit.observations.arrays import check_seen, frozen
 
 _MOST_PIXELS = 200_000_000  # of an image; beyond, a size is damaged
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
@@ -55,6 +55,7 @@ class Keypoints:
     source: str = ""
 
     def __post_init__(self) -> None:
+        check_seen(self.camera, self.rate, self.names)
         points, confidence = frozen(self.points), frozen(self.confidence)
         if points.ndim != 4 or points.shape[2:] != (len(self.names), 2) or confidence.shape != points.shape[:3]:
             raise ObservationError(
@@ -234,6 +235,7 @@ class Markers:
     events: tuple[MarkerEvent, ...] = ()
 
     def __post_init__(self) -> None:
+        check_seen(self.source, self.rate, self.names)
         positions = frozen(self.positions)
         if positions.ndim != 3 or positions.shape[1:] != (len(self.names), 3):
             raise ObservationError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 
+from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
@@ -26,6 +27,7 @@ from kinefit.tracking.video import Progress, track
 _USUAL = "humanoid"  # body of a take that names none
 
 
+@checked
 def track_take(
     take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, settings: TrackSettings | None = None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
@@ -20,6 +21,7 @@ from kinefit.tracking.run import run
 from kinefit.tracking.sizing import channels_of, fitted_to_person
 
 
+@checked
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
     height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
