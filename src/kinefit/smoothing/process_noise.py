@@ -55,7 +55,7 @@ class SmoothTake:
 
     `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): its process noise
     over time, as a factor; `others`: what all sensors but the keypoints measured, `linear` the same about
-    the states.
+    the states; `speed_std` (n,) [m/s, rad/s] of the rates of change, which nine tenths of the frames fall below.
     """
 
     body: Body
@@ -73,6 +73,7 @@ class SmoothTake:
     contacts: Contacts | None = None
     others: OtherSensors | None = None
     linear: Linearised | None = None
+    speed_std: NDArray | None = None
 
     def renewed(self, *, keep: bool = False) -> SmoothTake:
         """With all other sensors matched and linearised anew about the states; `keep` keeps the matches."""

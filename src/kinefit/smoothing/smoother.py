@@ -25,6 +25,7 @@ from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enlive
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.equations import inverse
+from kinefit.solvers.smoothing import Posterior
 
 _PARTS = 3  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
@@ -234,7 +235,7 @@ def _solve(
     windows = parts(len(take.roots), window, overlap)
     for last in [True] if others is None else [False] * (_PASSES - 1) + [True]:
         roots, angles, linear = np.array(take.roots), np.array(take.angles), None
-        covariances = Spool()
+        covariances, speeds = Spool(), []
         if others is not None:
             matched = Spool[tuple[Matched, ...]]()
             spans = [whole for whole, _ in windows]
@@ -244,10 +245,19 @@ def _solve(
             fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
+            speeds.append(_speed_std(post, part.dt)[max(inside.start - 1, 0) : inside.stop - 1])
             for covariance in post.frames[inside]:
                 covariances.append(covariance[packed])
-        take = replace(take, roots=roots, angles=angles)
+        moving = np.concatenate(speeds)
+        speed_std = np.percentile(moving, 90.0, axis=0) if len(moving) else None
+        take = replace(take, roots=roots, angles=angles, speed_std=speed_std)
     return take, covariances, matched
+
+
+def _speed_std(post: Posterior, dt: float) -> NDArray:
+    """(T - 1, n) [m/s, rad/s] standard deviation of each change to the next frame; errors that last are in none."""
+    own = np.einsum("tii->ti", post.frames)
+    return np.sqrt(np.maximum(own[1:] + own[:-1] - 2.0 * np.einsum("tii->ti", post.following), 0.0)) / dt
 
 
 def _swaps(take: SmoothTake) -> NDArray:
@@ -274,11 +284,13 @@ def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
         }
         for q, label in enumerate(take.channels.sources)
     }
+    speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
     scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
         "acceleration": {name: round(float(v), 2) for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
+        "speed_std": speeds,
         "pixel_sigma": sigma,
         "sigma_factor": scale,
         "liveliest": round(float(take.live.max()), 2),

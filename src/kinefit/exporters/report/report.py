@@ -18,8 +18,9 @@ import numpy as np
 
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
+from kinefit.exporters.curves import curves
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import curves, cycle_plots, joint_plots
+from kinefit.exporters.report.angles import cycle_plots, joint_plots
 from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
