@@ -190,7 +190,7 @@ def _summary(
     about = (
         "± is two standard deviations. That of a range takes its two ends to err on their own. A * marks what was "
         "observed in a part of the frames only; an angle with a standard deviation above 45° counts as not observed. "
-        "The greatest speed is of the angles as they are, without a deviation of its own."
+        "That of the greatest speed is what smoothing leaves of a change from frame to frame in lively moments."
     )
     return p.section(
         "Summary", p.facts(facts), *parts, p.heading("How far every joint moved"), ranges_table(motion),
