@@ -152,7 +152,7 @@ def run(
         tracker.start_at(state)
     frames, at = _Frames(checkpoint), begin
     if checkpoint is not None:
-        checkpoint.know(layout=layout, channels=channels, body=body, rig=recording.rig, settings=settings)
+        checkpoint.know(layout=layout, channels=channels, body=body, found_rig=recording.rig, settings=settings)
         tracker, at = frames.go_on(checkpoint, tracker, at)
 
     def step(tracker: Tracker, i: int, time: float) -> bool:

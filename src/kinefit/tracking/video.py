@@ -98,8 +98,9 @@ def track(
         if recording.sensors:
             problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
             raise ObservationError(problem, remedy="Leave the checkpoint out.")
+        whole = {name: getattr(recording, name) for name in ("steps", "keypoints", "people", "markers", "depth", "rig")}
         pixels = {"uv": channels.uv, "confidence": channels.confidence}
-        checkpoint.know(recording=recording, rig=recording.rig, settings=settings, **pixels)
+        checkpoint.know(recording=recording, settings=settings, **whole, **pixels)
         person = checkpoint.piece("person", fitted)
     tracked = run(
         person.recording, person.subject.body, person.channels, settings, start=person.start, values=person.values,
