@@ -1,10 +1,10 @@
 """Least-squares matching of drawn texture, whose motion is exact, beside OpenCV in one run.
 
-Texture is a sum of cosines with a Gaussian spectrum, drawn analytically in both images: tiles of 40 px, each moved by its
-own random shift (within half a pixel) and affine map (up to 5 %), with 2 % noise and whole grey values. All three are given
-the tile's centre and no deformation. OpenCV's PyrLK has a window of 13 px, no pyramid; ECC an affine map over 13x13 px, no
-Gauss filter, each until nothing moves by 0.001. Grain (standard deviation of the drawn blobs) 1.2 px, seeds not used in
-development; the bias curve has no noise, one shift for all, and whole grey values not rounded.
+Texture is a sum of cosines with a Gaussian spectrum, drawn analytically in both images: tiles of 40 px, each moved by
+its own random shift (within half a pixel) and affine map (up to 5 %), with 2 % noise and whole grey values. All three
+are given the tile's centre and no deformation. OpenCV's PyrLK has a window of 13 px, no pyramid; ECC an affine map over
+13x13 px, no Gauss filter, each until nothing moves by 0.001. Grain (standard deviation of the drawn blobs) 1.2 px,
+seeds not used in development; the bias curve has no noise, one shift for all, and whole grey values not rounded.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ class Texture:
 
 
 def drawn(
-    tiles: int, seed: int, *, shift: float | None = None, stretch: float = 0.05, noise: float = NOISE, grain: float = GRAIN
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    tiles: int, seed: int, *, shift: float | None = None, stretch: float = 0.05, noise: float = NOISE,
+    grain: float = GRAIN,
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:  # fmt: skip
     """Two images of tiles x tiles; the tiles' centres (N, 2), where they went (N, 2), and their maps (N, 2, 2)."""
     rng = np.random.default_rng(seed)
     texture, size = Texture(seed + 1, grain), tiles * TILE
@@ -89,7 +90,7 @@ def _precision() -> None:
     ecc, ecc_spent = _timed(lambda: _ecc(first, second, at))
     lk_rms, ecc_rms = _rms(lk - goal), _rms(ecc - goal)
     count = len(at)
-    print(f"# {count} tiles; RMS [px] of found, found [%], points/s: kinefit {rms:.4f}, {100 * matches.found.mean():.1f}, "
+    print(f"# {count} tiles; RMS [px], found [%], points/s: kinefit {rms:.4f}, {100 * matches.found.mean():.1f}, "
           f"{count / spent:.0f}; PyrLK {lk_rms:.4f}, {_found(lk):.1f}, {count / lk_spent:.0f}; ECC {ecc_rms:.4f}, "
           f"{_found(ecc):.1f}, {count / ecc_spent:.0f}")  # fmt: skip
     figure("lsm_precision", rms, "px", "<= 0.03")
@@ -100,9 +101,9 @@ def _precision() -> None:
     figure("lsm_points_a_second", count / spent, "points/s", ">= 10000")
     figure("lsm_intervals_low", inside, "% in 95 % intervals", ">= 93")
     figure("lsm_intervals_high", inside, "% in 95 % intervals", "<= 97")
-    _, low, at, goal, _ = drawn(amount(30, 6), SEED + 5, stretch=0.0)
+    first, second, at, goal, _ = drawn(amount(20, 6), SEED + 5, stretch=0.0)
     for window in (9, 13, 21):
-        told = match(SplineImage.of(_), SplineImage.of(low), at, window=window)
+        told = match(SplineImage.of(first), SplineImage.of(second), at, window=window)
         error = (told.uv - goal)[told.found]
         inside = 100 * np.mean(np.abs(error) <= 1.96 * told.std[told.found])
         print(f"#   shifts alone, window {window}: {_rms(error):.4f} px, 95 % intervals hold {inside:.1f} %")
@@ -112,13 +113,13 @@ def _bias() -> None:
     """Mean error over the sub-pixel shift, for textures from fine to coarse."""
     worst = {}
     for grain in (0.7, 1.0, 1.2, 1.5):
-        told = []
-        for shift in (0.0, 0.125, 0.25, 0.375, 0.5):
+        told, shifts = [], (0.0, 0.125, 0.25, 0.375, 0.5)
+        for shift in shifts:
             first, second, at, goal, _ = drawn(amount(12, 4), 77, shift=shift, stretch=0.0, noise=0.0, grain=grain)
             found = match(SplineImage.of(first), SplineImage.of(second), at)
             told.append(float(np.nanmean(found.uv - goal)))
         worst[grain] = np.abs(told).max()
-        print(f"# bias, grain {grain} px: " + ", ".join(f"{s:g} px {b:+.5f}" for s, b in zip((0, 0.125, 0.25, 0.375, 0.5), told)))
+        print(f"# bias, grain {grain} px: " + ", ".join(f"{s:g} px {b:+.5f}" for s, b in zip(shifts, told)))
     figure("lsm_bias_grain_1", worst[1.0], "px", "<= 0.002")
 
 
@@ -145,7 +146,8 @@ def _found(uv: NDArray) -> float:
 def _lucas_kanade(first: NDArray, second: NDArray, at: NDArray) -> NDArray:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 0.001)
     start = at.astype(np.float32).reshape(-1, 1, 2)
-    uv, status, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=(13, 13), maxLevel=0, criteria=criteria)
+    told = cv2.calcOpticalFlowPyrLK(first, second, start, None, winSize=(13, 13), maxLevel=0, criteria=criteria)
+    uv, status = told[:2]
     return np.where(status == 1, uv[:, 0], np.nan)
 
 

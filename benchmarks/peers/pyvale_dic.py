@@ -2,7 +2,8 @@
 
 Run by `benchmarks.peers.environments` as `python -m benchmarks.peers.pyvale_dic FOLDER` with a Python that has pyvale.
 FOLDER holds ``pair.json``: the two images, the windows, the step, the seed and how often each is timed. For each window
-``pyvale_WINDOW.npz`` gets ``points``, ``shift`` (N, 2) [px]; time is the processor's, of the whole call, least of several.
+``pyvale_WINDOW.npz`` gets ``points``, ``shift`` (N, 2) [px]; time is the processor's, of the whole call, least of
+several.
 """
 
 from __future__ import annotations

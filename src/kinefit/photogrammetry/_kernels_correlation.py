@@ -25,7 +25,7 @@ def search_boxes(first, second, at, centres, half, reach, places, best, runner_u
         places[k, 0] = places[k, 1] = best[k] = runner_up[k] = math.nan
         if not (abs(at[k, 0]) + abs(at[k, 1]) + abs(centres[k, 0]) + abs(centres[k, 1]) < math.inf):
             continue
-        i, j = int(math.floor(at[k, 0] + 0.5)), int(math.floor(at[k, 1] + 0.5))
+        i, j = math.floor(at[k, 0] + 0.5), math.floor(at[k, 1] + 0.5)
         if i < half or j < half or i + half >= first.shape[1] or j + half >= first.shape[0]:
             continue
         part_u, part_v = at[k, 0] - i, at[k, 1] - j
@@ -42,7 +42,7 @@ def search_boxes(first, second, at, centres, half, reach, places, best, runner_u
                 energy += f[y, x] * f[y, x]
         if not energy > 0.0:
             continue
-        a, b = int(math.floor(centres[k, 0] - part_u + 0.5)), int(math.floor(centres[k, 1] - part_v + 0.5))
+        a, b = math.floor(centres[k, 0] - part_u + 0.5), math.floor(centres[k, 1] - part_v + 0.5)
         top, high_a, high_b = -2.0, 0, 0
         for dy in range(side):
             for dx in range(side):
@@ -52,13 +52,13 @@ def search_boxes(first, second, at, centres, half, reach, places, best, runner_u
                     continue
                 h0 = h1 = hh = 0.0
                 for y in range(n):
-                    r0, r1, rr = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                    r0 = r1 = rr = np.float32(0.0)
                     for x in range(n):
                         h = second[up + y, left + x] - mean
                         r0 += h
                         r1 += h * f[y, x]
                         rr += h * h
-                    h0, h1, hh = h0 + r0, h1 + r1, hh + rr
+                    h0, h1, hh = h0 + float(r0), h1 + float(r1), hh + float(rr)
                 variance = hh - h0 * h0 / (n * n)
                 value = h1 / math.sqrt(energy * variance) if variance > 0.0 else 0.0
                 score[dy, dx] = value

@@ -6,7 +6,6 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.photogrammetry._kernels_matching import (
-    A,
     CORRELATION,
     DIVERGED,
     FOUND,
@@ -55,11 +54,12 @@ def pop(keys, items, size):
 
 @jit
 def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, share, least, reach, out):
-    """Match a grid of places (N, 2) [px], `columns` a row, of one spline in another, from seeds (S,) with starts (S, 6).
+    """Match a grid of places (N, 2) [px], `columns` a row, from seeds (S,) with starts (S, 6) in the second spline.
 
-    A place is tried from the found neighbour of the highest correlation, with its map carried over, and again from later
-    ones where that failed. A match of less than the `least` correlation, or further than `reach` [px] from where the
-    neighbour's map says, is none. A place with a NaN is left out. Fills out (N, 15); counts the matches that were tried.
+    A place is tried from the found neighbour of the highest correlation, with its map carried over, and again from
+    later ones where that failed. A match of less than the `least` correlation, or further than `reach` [px] from where
+    the neighbour's map says, is none. A place with a NaN is left out. Fills out (N, 15); counts the matches that were
+    tried.
     """
     count = at.shape[0]
     f, fx, fy, rows, m, b, kept = room(halves)

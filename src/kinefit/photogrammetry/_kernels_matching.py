@@ -2,8 +2,8 @@
 
 The unknowns are those of Gruen (1985): an affine map of six parameters, and a gain and an offset of the grey values.
 The template f is fixed, so its normal matrix over [x f_x, y f_x, x f_y, y f_y, 1, f, f_x, f_y] is set up and factored
-once (inverse composition, Baker and Matthews 2004); an iteration samples the other image and solves. A gain that is not 1
-scales the first six, as h = r0 + r1 f(x + d) = r0 + r1 f + r1 (d . grad f).
+once (inverse composition, Baker and Matthews 2004); an iteration samples the other image and solves. A gain that is
+not 1 scales the first six, as h = r0 + r1 f(x + d) = r0 + r1 f + r1 (d . grad f).
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from kinefit.photogrammetry._kernels_spline import slope_noise, slopes, value, v
 
 SIZE = 8  # unknowns
 # Row of results: u, v, A (2x2), offset, gain, correlation, var u, cov uv, var v, noise, iterations, status.
-U, V, A, OFFSET, GAIN, CORRELATION, VAR_U, COV, VAR_V, NOISE, ITERATIONS, STATUS = 0, 1, 2, 6, 7, 8, 9, 10, 11, 12, 13, 14
+U, V, A, OFFSET, GAIN, CORRELATION, VAR_U, COV, VAR_V = 0, 1, 2, 6, 7, 8, 9, 10, 11
+NOISE, ITERATIONS, STATUS = 12, 13, 14
 ROW = 15
 FOUND, FLAT, OUTSIDE, DIVERGED, NOT_TRIED = 0, 1, 2, 3, 4
 
@@ -82,12 +83,14 @@ def template(c, u, v, half, f, fx, fy, rows):
             rows[0, x] = b0 * p + b1 * q + b2 * r + b3 * s + b4 * t + b5 * w
             rows[1, x] = e0 * p + e1 * q + e2 * r + e3 * s + e4 * t + e5 * w
         for x in range(n):
-            p, q, r, s, t, w = rows[0, x], rows[0, x + 1], rows[0, x + 2], rows[0, x + 3], rows[0, x + 4], rows[0, x + 5]
+            p, q, r = rows[0, x], rows[0, x + 1], rows[0, x + 2]
+            s, t, w = rows[0, x + 3], rows[0, x + 4], rows[0, x + 5]
             grey = a0 * p + a1 * q + a2 * r + a3 * s + a4 * t + a5 * w
             f[y, x] = grey
             total += grey
             fx[y, x] = d0 * p + d1 * q + d2 * r + d3 * s + d4 * t + d5 * w
-            p, q, r, s, t, w = rows[1, x], rows[1, x + 1], rows[1, x + 2], rows[1, x + 3], rows[1, x + 4], rows[1, x + 5]
+            p, q, r = rows[1, x], rows[1, x + 1], rows[1, x + 2]
+            s, t, w = rows[1, x + 3], rows[1, x + 4], rows[1, x + 5]
             fy[y, x] = a0 * p + a1 * q + a2 * r + a3 * s + a4 * t + a5 * w
     return total / (n * n)
 
@@ -163,7 +166,8 @@ def composed(a, b, d, e, x, scale):
     d11, d12, d21, d22 = 1.0 + x[0] * scale, x[1] * scale, x[2] * scale, 1.0 + x[3] * scale
     det = d11 * d22 - d12 * d21
     ok = det > 0.1 and det < 10.0
-    return ok, (a * d22 - b * d21) / det, (b * d11 - a * d12) / det, (d * d22 - e * d21) / det, (e * d11 - d * d12) / det
+    a, b, d, e = a / det, b / det, d / det, e / det
+    return ok, a * d22 - b * d21, b * d11 - a * d12, d * d22 - e * d21, e * d11 - d * d12
 
 
 @jit
@@ -233,9 +237,9 @@ def covariance(m, at_u, at_v, half, gain, square, share, out):
 
     share : part of the variance of the noise that is the template's; the rest is the other image's.
 
-    The spline smooths the noise of the residuals, which is undone, and the noise of the template makes its own gradients
-    steeper than they are: G of the 2x2 normal matrix S is noise. The covariance is sigma² (S - G)^-1 S (S - G)^-1, as
-    residuals are compared along noisy gradients (S), and a shift moves them along the true ones (S - G).
+    The spline smooths the noise of the residuals, which is undone, and the noise of the template makes its own
+    gradients steeper than they are: G of the 2x2 normal matrix S is noise. The covariance is sigma² (S - G)^-1 S (S -
+    G)^-1, as residuals are compared along noisy gradients (S), and a shift moves them along the true ones (S - G).
     """
     n = 2 * half + 1
     u, v, a11, a12, a21, a22 = out[U], out[V], out[A], out[A + 1], out[A + 2], out[A + 3]

@@ -1,8 +1,9 @@
 """Compiled multi-image matching: one window in several images at once, kept on the lines of sight of its cameras.
 
 The geometrically constrained form of Gruen and Baltsavias (1988), with one unknown place for all images: the distance
-along the template's ray. Each image contributes the shift that it would choose and its normal matrix, what the affine map
-and the grey values have to say eliminated; the distance follows from all, then maps and grey values at that distance.
+along the template's ray. Each image contributes the shift that it would choose and its normal matrix, what the affine
+map and the grey values have to say eliminated; the distance follows from all, then maps and grey values at that
+distance.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from kinefit.photogrammetry._kernels_matching import (
     fits,
     normal_matrix,
     right_side,
+    room,
     template,
 )
 
@@ -55,21 +57,20 @@ def conditional(m, y, b, gain, du, dv):
 
 
 @jit
-def match_rays(first, images, sizes, cameras, at, origin, rays, starts, half, steps, tolerance, share, out, each):
+def match_rays(first, images, sizes, cameras, at, origin, rays, starts, halves, steps, tolerance, share, out, each):
     """Match windows about places (N, 2) of a template in K images (K, H, W) of `sizes` (K, 2) and packed cameras.
 
     rays : (N, 3) unit directions of the places; origin (3,) [m] where they come from.
     starts : (N, 1 + 4 K) distance [m], and the 2x2 map into each image; an image with a NaN is left out.
     Fills out (N, 7) and, for each image, each (N, K, 15).
     """
-    n, count = 2 * half + 1, images.shape[0]
-    f, fx, fy = np.empty((n, n), np.float32), np.empty((n, n), np.float32), np.empty((n, n), np.float32)
-    rows, m, b = np.empty((2, n + 5)), np.empty((SIZE, SIZE)), np.empty(SIZE)
+    count = images.shape[0]
+    f, fx, fy, rows, m, b, _ = room(halves)
     y, moves, squares = np.empty((count, SIZE)), np.empty((count, 6)), np.empty(count)
     used = np.empty(count, np.bool_)
     for k in range(at.shape[0]):
         _match_ray(
-            first, images, sizes, cameras, at[k], origin, rays[k], starts[k], half, steps, tolerance, share,
+            first, images, sizes, cameras, at[k], origin, rays[k], starts[k], halves[k], steps, tolerance, share,
             f, fx, fy, rows, m, b, y, moves, squares, used, out[k], each[k],
         )  # fmt: skip
 
@@ -117,7 +118,7 @@ def _match_ray(
             if not ok or not fits(c, u, v, a11, a12, a21, a22, half):
                 used[i] = False
                 continue
-            shift, hh = right_side(c, f, fx, fy, half, mean, u, v, a11, a12, a21, a22, b)
+            _, hh = right_side(c, f, fx, fy, half, mean, u, v, a11, a12, a21, a22, b)
             variance = hh - b[4] * b[4] / n
             each[i, CORRELATION] = b[5] / math.sqrt(f_f * variance) if variance > 0.0 else 0.0
             squares[i] = hh

@@ -96,7 +96,7 @@ def slopes(t):
 @jit
 def weights32(t):
     """The six weights in single precision."""
-    k1, k2, k5, k10, k20 = np.float32(1.0), np.float32(2.0), np.float32(5.0), np.float32(10.0), np.float32(20.0)
+    k1, k5, k10, k20 = np.float32(1.0), np.float32(5.0), np.float32(10.0), np.float32(20.0)
     k26, k66, k30, k60, k50 = np.float32(26.0), np.float32(66.0), np.float32(30.0), np.float32(60.0), np.float32(50.0)
     t2 = t * t
     t3, s = t2 * t, k1 - t
@@ -147,7 +147,8 @@ def values(c, uv, out):
         out[n] = value(c, u, v) if inside(c, u, v) else math.nan
 
 
-# How a spline passes on the variance of white noise of the pixels, by the place t between them: mean, cos 2 pi t, cos 4 pi t.
+# How a spline passes on the variance of white noise of the pixels, by the place t between them: mean, cos 2 pi t, cos
+# 4 pi t.
 _VALUE = (0.91796918, 0.08175161, 0.00026418)
 _SLOPE = (2.67797400, -0.77729295, -0.00624300)
 

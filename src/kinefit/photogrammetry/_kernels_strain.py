@@ -16,8 +16,9 @@ COLUMNS = 12
 def strains(x, d, columns, reach, overlap, filled, out):
     """Green-Lagrange strain of points (N, 3) that moved by d (N, 3), on a grid of `columns` a row.
 
-    Positions and displacements within `reach` rows and columns are each fitted by a plane over the indices i, j; the change
-    of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with a NaN are left out.
+    Positions and displacements within `reach` rows and columns are each fitted by a plane over the indices i, j; the
+    change of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with a NaN are
+    left out.
     overlap : factor of the variance for windows of neighbours that share pixels.
     filled : least part of the (2 reach + 1)² points that must be there. NaN in out (N, 12) where fewer are.
     """

@@ -1,7 +1,8 @@
 """Adaptive least-squares matching: where a window of one image is in another, to hundredths of a pixel.
 
-The window is moved and deformed by an affine map, and its grey values are stretched and shifted, so that the sum of squared
-differences is least (A. Gruen, Adaptive least squares correlation, 1985). Every match has its standard deviation.
+The window is moved and deformed by an affine map, and its grey values are stretched and shifted, so that the sum of
+squared differences is least (A. Gruen, Adaptive least squares correlation, 1985). Every match has its standard
+deviation.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry import _kernels_matching as kernels
+from kinefit.photogrammetry.noise_correlation import variance_factor
 from kinefit.photogrammetry.spline_image import SplineImage, template_share
 
 WINDOW = 13
@@ -60,11 +62,15 @@ class Matches:
     status: NDArray
 
     @classmethod
-    def of(cls, points: NDArray, rows: NDArray) -> Matches:
-        """From rows (N, 15) of the kernels."""
+    def of(
+        cls, points: NDArray, rows: NDArray, first: SplineImage, second: SplineImage, halves: NDArray[np.int64]
+    ) -> Matches:
+        """From rows (N, 15) of the kernels; covariances grow where the noise of neighbouring pixels goes together."""
         status = rows[:, kernels.STATUS].astype(np.int64)
-        out = np.where((status == kernels.FOUND)[:, None], rows, np.nan)
-        covariance = out[:, [kernels.VAR_U, kernels.COV, kernels.COV, kernels.VAR_V]].reshape(-1, 2, 2)
+        found = status == kernels.FOUND
+        out = np.where(found[:, None], rows, np.nan)
+        factor = variance_factor(first, second, points[found], rows[found], halves[found])
+        covariance = factor * out[:, [kernels.VAR_U, kernels.COV, kernels.COV, kernels.VAR_V]].reshape(-1, 2, 2)
         return cls(
             points, out[:, : kernels.A], out[:, kernels.A : kernels.A + 4].reshape(-1, 2, 2), out[:, kernels.GAIN],
             out[:, kernels.OFFSET], out[:, kernels.CORRELATION], covariance, out[:, kernels.NOISE],
@@ -96,7 +102,8 @@ class Matches:
             for name, value in vars(self).items()
             if name in ("uv", "deformation", "gain", "offset", "correlation", "covariance", "noise")
         }
-        return replace(self, **rows, status=np.where(good, self.status, np.where(self.found, kernels.DIVERGED, self.status)))
+        lost = self.found & ~good
+        return replace(self, **rows, status=np.where(lost, kernels.DIVERGED, self.status))
 
 
 def halves_of(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
@@ -164,7 +171,7 @@ def match(
     kernels.match_points(
         first.coefficients, second.coefficients, at, begin, halves, steps, tolerance, template_share(first, second), out
     )
-    return Matches.of(at, out)
+    return Matches.of(at, out, first, second, halves)
 
 
 def _from_above(

@@ -148,4 +148,4 @@ def grow(
         first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, steps, tolerance,
         template_share(first, second), least, grid.step / 2 if reach is None else reach, out,
     )  # fmt: skip
-    return Matches.of(grid.points, out)
+    return Matches.of(grid.points, out, first, second, halves)

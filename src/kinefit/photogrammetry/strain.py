@@ -55,12 +55,13 @@ def strain(
 
     Parameters
     ----------
-    reference : (N, 2) [px] or (N, 3) [m], a grid of `columns` points a row, of the state that the strain is told against
+    reference : (N, 2) [px] or (N, 3) [m], a grid of `columns` points a row, of the state that the strain is told
+        against
     displacement : (N, 2 or 3) from there
     gauge : length over which derivatives are taken, in the unit of `reference`: the planes reach over the points within
         half of it on either side
-    window : side of the matching windows, in the same unit: where it is more than the grid's step, neighbours share pixels
-        and err alike, and the standard deviations grow accordingly
+    window : side of the matching windows, in the same unit: where it is more than the grid's step, neighbours share
+        pixels and err alike, and the standard deviations grow accordingly
 
     Raises
     ------
