@@ -65,7 +65,8 @@ def run() -> None:
         T, residual = rigid_motion(surfaces[0].x_world, surface.x_world)
         lengths = 1e3 * np.linalg.norm(residual, axis=1)
         angle = np.rad2deg(np.arccos((np.trace(T[:3, :3]) - 1) / 2))
-        print(f"# 1 to {k}: turned by {angle:.3f} degrees; a coordinate {1e3 * np.sqrt(np.nanmean(residual**2)):.4f} mm")
+        rms = 1e3 * np.sqrt(np.nanmean(residual**2))
+        print(f"# 1 to {k}: turned by {angle:.3f} degrees; a coordinate {rms:.4f} mm")
         figure(f"cylinder_rigid_motion_{k}", float(np.sqrt(np.nanmean(lengths**2))), "mm RMS in space", "<= 0.02")
     seeds, spent = sift_seeds(first, states[0][1], (rig.cameras[0], rig.cameras[1])), []
     for _ in range(3):
@@ -120,6 +121,12 @@ def _camera(name: str, p: NDArray) -> Camera:
     return Camera(name, SIZE, np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]]), p[4:8], "radtan", T)
 
 
+def _numbers(camera: Camera) -> NDArray:
+    K, T = camera.matrix, camera.T_camera_world
+    inner = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    return np.concatenate([inner, camera.distortion, log_so3(T[:3, :3]), T[:3, 3]])
+
+
 def adjusted(rig: Rig, objects: list[tuple[NDArray, NDArray]], uv: NDArray) -> Rig:
     """Both cameras by least squares: squares to 0.3 px, rays of matches (N, 2, 2) [px] that meet to 0.1 px.
 
@@ -127,10 +134,7 @@ def adjusted(rig: Rig, objects: list[tuple[NDArray, NDArray]], uv: NDArray) -> R
     """
     from scipy.optimize import least_squares
 
-    start = np.concatenate([
-        [*c.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *c.distortion, *log_so3(c.T_camera_world[:3, :3]), *c.T_camera_world[:3, 3]]
-        for c in rig
-    ])  # fmt: skip
+    start = np.concatenate([_numbers(camera) for camera in rig])
     scale = np.tile([5, 5, 5, 5, 0.01, 0.02, 1e-3, 1e-3, *[0.01] * 6], 2)
     prior = np.array([8, 8, 8, 8, 0.01, 0.03, 0.002, 0.002])
     ties = uv[:: max(1, len(uv) // 1000)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError
-from kinefit.exporters.surface_files import point_columns, write_field_picture, write_points_csv, write_surface_vtk
+from kinefit.errors import FileError, ObservationError, TrackingError
+from kinefit.exporters.surface_files import (
+    point_columns,
+    write_field_picture,
+    write_paths_csv,
+    write_point_picture,
+    write_points_csv,
+    write_surface_vtk,
+)
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
@@ -20,7 +28,10 @@ from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
+from kinefit.photogrammetry.trajectories import Trajectories, uniform
 from kinefit.readers.image_folders import images_in
+from kinefit.readers.video import Video, check_rates
 
 _PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
@@ -42,14 +53,18 @@ class Wanted:
     still: int | None
     field: str | None
 
+    def side_of_all(self) -> int:
+        """Side of the windows [px], of all."""
+        if not self.window.isdigit():
+            problem = f"a window of '{self.window}'"
+            raise ObservationError(problem, remedy="Give an odd number of pixels; or 'texture' for photographs.")
+        return int(self.window)
+
     def side(self, first: SplineImage, second: SplineImage, grid: Grid) -> int | NDArray:
         """Side of the windows [px], of all or of each place."""
         if self.window == "texture":
             return windows_by_texture(first, second, np.nan_to_num(grid.points))
-        if not self.window.isdigit():
-            problem = f"a window of '{self.window}'"
-            raise ObservationError(problem, remedy="Give an odd number of pixels, or 'texture'.")
-        return int(self.window)
+        return self.side_of_all()
 
 
 @dataclass(frozen=True)
@@ -212,5 +227,55 @@ def _about(surface: Surface, k: int) -> str:
 
 
 def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -> list[str]:
-    """Track the surface through videos and write it; what to say about it."""
-    raise ObservationError("videos", remedy="not yet")
+    """Track the surface through videos and write its paths; what to say about them.
+
+    Raises
+    ------
+    ObservationError
+        Options that are for photographs, or videos of other rates.
+    """
+    photographs = {"--gauge": wanted.gauge, "--still": wanted.still, "--incremental": wanted.incremental or None}
+    given = [name for name, value in photographs.items() if value is not None]
+    if given:
+        problem = f"{', '.join(given)} with videos"
+        raise ObservationError(problem, remedy="These are for photographs: states of one surface.")
+    rig = with_field(rig, wanted.field)
+    with ExitStack() as opened:
+        videos = [opened.enter_context(Video(path)) for path in views.videos]
+        check_rates({name: video.rate for name, video in zip(views.names, videos)})
+        count = min(len(video) for video in videos)
+        settings = SurfaceTracking(
+            window=wanted.side_of_all(), step=wanted.step,
+            least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+        )  # fmt: skip
+        seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
+        tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds)
+        told = []
+        for k in range(count):
+            images = [spline_of(video.read(k), wanted.field) for video in videos]
+            try:
+                points = tracker.update(images)
+            except TrackingError as error:
+                told.append(f"stopped: {error}")
+                break
+            if k in (0, count // 2, count - 1):
+                write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
+            progress("frames", k + 1, count)
+    paths = tracker.trajectories()
+    speed = float(np.nanpercentile(np.linalg.norm(paths.velocity, axis=2), 99)) if len(paths.times) > 1 else 0.0
+    kept = paths.kept(uniform(paths, radius=_surroundings(paths))) if len(paths.times) > 2 else paths
+    write_paths_csv(kept, wanted.out / "trajectories.csv")
+    live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
+    lengths = kept.live.sum(axis=0)
+    lengths = lengths[lengths > 0]
+    told.insert(0, f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} "
+                f"points a frame, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")  # fmt: skip
+    return told
+
+
+def _surroundings(paths: Trajectories) -> float:
+    """[m] about a point within which the surface moves alike: five times the distance of neighbours."""
+    x = paths.x_world[0][paths.live[0]]
+    gaps = np.linalg.norm(x[:, None] - x[None, :200], axis=2)
+    gaps[gaps == 0] = np.inf
+    return 5.0 * float(np.median(gaps.min(axis=0)))

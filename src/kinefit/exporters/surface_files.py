@@ -14,6 +14,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.photogrammetry.strain import Strain
 from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.trajectories import Trajectories
 
 _LARGEST = 1400  # [px] of a picture's longer side
 _BAR = 90  # [px] of the scale beside it
@@ -111,6 +112,27 @@ def write_field_picture(
     picture = cv2.addWeighted(painted, 0.75, picture, 0.25, 0)
     data = cv2.imencode(".png", np.hstack([picture, _scale(picture.shape[0], bottom, top, title, unit)]))[1]
     write_bytes(Path(path), data.tobytes())
+
+
+def write_paths_csv(paths: Trajectories, path: str | PathLike[str]) -> None:
+    """Write a row for each point and time: metres, seconds, m/s and m/s². Errors as of `write_points_csv`."""
+    velocity, acceleration = paths.velocity, paths.acceleration
+    names = [*"xyz", *(f"std_{a}" for a in "xyz"), *(f"v{a}" for a in "xyz"), *(f"a{a}" for a in "xyz")]
+    lines = [",".join(["time_s", "point", *names])]
+    for k, time in enumerate(paths.times):
+        index = np.flatnonzero(paths.live[k])
+        table = np.hstack([paths.x_world[k, index], paths.std[k, index], velocity[k, index], acceleration[k, index]])
+        for p, row in zip(index, table):
+            lines.append(f"{time:.6f},{p}," + ",".join(f"{v:.6g}" if np.isfinite(v) else "" for v in row))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_point_picture(uv: NDArray, image: NDArray, path: str | PathLike[str]) -> None:
+    """Draw points (M, 2) [px] on an image (H, W): PNG."""
+    picture = cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    for place in np.rint(uv * 8).astype(int):
+        cv2.circle(picture, (int(place[0]), int(place[1])), 12, (0, 200, 255), -1, cv2.LINE_AA, 3)
+    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def _scale(height: int, bottom: float, top: float, title: str, unit: str) -> NDArray:

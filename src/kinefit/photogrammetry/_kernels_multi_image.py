@@ -191,13 +191,14 @@ def _match_ray(
     if not total > 0.0:
         out[STATE] = FLAT
         return
-    variance = common = 0.0  # the noise of the template is the same in all
+    variance = mu = mv = 0.0  # the noise of the template moves all images' windows alike, so it may cancel
     for i in range(count):
         if used[i] and each[i, STATUS] == FOUND:
-            own = _information(each[i], moves[i, 4], moves[i, 5])
+            own, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
             variance += (1.0 - share) * own / (total * total)
-            common += math.sqrt(share * own) / total
-    out[VARIANCE] = variance + common * common
+            root = math.sqrt(own / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
+            mu, mv = mu + root * qu, mv + root * qv
+    out[VARIANCE] = variance + share * (s00 * mu * mu + 2.0 * s01 * mu * mv + s11 * mv * mv) / (total * total)
 
 
 @jit

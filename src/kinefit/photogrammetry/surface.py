@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.photogrammetry.intersection import Intersections, intersect
+from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
 from kinefit.photogrammetry.multi_image import match_along_rays
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
@@ -36,6 +36,7 @@ class Surface:
     uv : (N, C, 2) [px] in each camera; NaN where not matched
     correlation : (N,) the lowest of the matches
     parallax : (N,) [px] by which the rays miss each other in the images
+    deformation : (N, C - 1, 2, 2) of an offset in the first image to each other one
     """
 
     grid: Grid
@@ -45,6 +46,7 @@ class Surface:
     uv: NDArray
     correlation: NDArray
     parallax: NDArray
+    deformation: NDArray
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -156,19 +158,23 @@ def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Mat
     told = intersect(rig, uv, covariance)
     seen = [m.correlation for m in (*others, *([own] if own else []))]
     correlation = np.min([np.where(np.isfinite(c), c, 1.0) for c in seen], axis=0)
-    return _surface(rig, grid, told, uv, correlation)
-
-
-def _surface(rig: Rig, grid: Grid, told: Intersections, uv: NDArray, correlation: NDArray) -> Surface:
     gap = told.parallax
-    middle = np.nanmedian(gap) if np.isfinite(gap).any() else 0.0
-    spread = 1.4826 * np.nanmedian(np.abs(gap - middle)) if np.isfinite(gap).any() else 0.0
-    good = gap <= max(_LEAST_PARALLAX, middle + _OUTLYING * spread)
-    x = np.where(good[:, None], told.x_world, np.nan)
-    covariance = np.where(good[:, None, None], told.covariance, np.nan)
-    kept = np.where(good[:, None, None], uv, np.nan)
-    alike, gap = np.where(good, correlation, np.nan), np.where(good, gap, np.nan)
-    return Surface(grid, rig.names, x, covariance, kept, alike, gap)
+    good = gap <= largest_parallax(gap)
+    keep = good[:, None, None]
+    return Surface(
+        grid, rig.names, np.where(keep[..., 0], told.x_world, np.nan), np.where(keep, told.covariance, np.nan),
+        np.where(keep, uv, np.nan), np.where(good, correlation, np.nan), np.where(good, gap, np.nan),
+        np.stack([m.deformation for m in others], axis=1),
+    )  # fmt: skip
+
+
+def largest_parallax(gaps: NDArray) -> float:
+    """[px] by which rays may miss each other, by what most (N,) do: more is a wrong match, not the calibration."""
+    told = gaps[np.isfinite(gaps)]
+    if not len(told):
+        return _LEAST_PARALLAX
+    middle = np.median(told)
+    return max(_LEAST_PARALLAX, float(middle + _OUTLYING * 1.4826 * np.median(np.abs(told - middle))))
 
 
 def match_rays(
@@ -199,7 +205,7 @@ def match_rays(
     return Surface(
         surface.grid, rig.names, np.where(keep, told.x_world, np.nan),
         np.where(keep[..., None], covariance + across, np.nan), np.where(keep[..., None], uv, np.nan),
-        np.where(good, told.correlation, np.nan), np.where(good, told.parallax, np.nan),
+        np.where(good, told.correlation, np.nan), np.where(good, told.parallax, np.nan), surface.deformation,
     )  # fmt: skip
 
 
