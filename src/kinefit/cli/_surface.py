@@ -30,6 +30,7 @@ from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_
 from kinefit.photogrammetry.surface import Surface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, uniform
+from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.image_folders import images_in
 from kinefit.readers.video import Video, check_rates
 
@@ -76,8 +77,8 @@ class Views:
     videos: tuple[Path, ...]
 
 
-def read_views(rig: Rig, views: Sequence[str]) -> tuple[Rig, Views]:
-    """Cameras that are named, and their files.
+def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig, Views]:
+    """Cameras that are named, and their files; a calibration that states no image size has that of the first view.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def read_views(rig: Rig, views: Sequence[str]) -> tuple[Rig, Views]:
     for view in views:
         name, sign, path = view.partition("=")
         if not sign or not path:
-            raise ObservationError(f"a view '{view}'", remedy=f"Write CAMERA=PATH; cameras: {', '.join(rig.names)}.")
+            raise ObservationError(f"a view '{view}'", remedy="Write CAMERA=PATH, with the camera's name.")
         place = Path(path)
         names.append(name)
         if place.is_dir() or "*" in place.name:
@@ -106,6 +107,13 @@ def read_views(rig: Rig, views: Sequence[str]) -> tuple[Rig, Views]:
         counts = ", ".join(str(len(files)) for files in photographs)
         problem = f"{len(names)} views: {len(videos)} videos, photographs: {counts or 'none'}"
         raise ObservationError(problem, remedy="Give two views or more, all videos or all with as many photographs.")
+    if photographs:
+        size = read_picture(photographs[0][0]).shape[1::-1]
+    else:
+        with Video(videos[0]) as video:
+            size = video.size
+    metres = float(unit) if _is_number(unit) else unit
+    rig = read_calibration(calibration, unit=metres, image_size=size)
     return rig.select(tuple(names)), Views(tuple(names), tuple(photographs), tuple(videos))
 
 
@@ -268,8 +276,8 @@ def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -
     live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
     lengths = kept.live.sum(axis=0)
     lengths = lengths[lengths > 0]
-    told.insert(0, f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} "
-                f"points a frame, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")  # fmt: skip
+    about = f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} a frame"
+    told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
     return told
 
 

@@ -20,7 +20,7 @@ Examples:
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.argument("views", nargs=-1, required=True, metavar="CAMERA=PATH...")
 @click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("surface"), help="Folder.")
-@click.option("--unit", default="auto", help="Of the calibration's lengths: m, cm, mm ...  [default: what it states]")
+@click.option("--unit", default="auto", help="Of the calibration: m, cm, mm ..., or metres.  [default: as it states]")
 @click.option("--window", default="13", show_default=True, help="Side [px] of the windows, odd, or 'texture'.")
 @click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="[px] from point to point.")
 @click.option("--mask", type=click.Path(path_type=Path), help="PNG over the first image, black where no point is.")
@@ -46,9 +46,8 @@ def surface(
     points.
     """
     from kinefit.cli._surface import Wanted, measure_photographs, measure_videos, read_views
-    from kinefit.readers.calibration.read import read_calibration
 
-    rig, paths = read_views(read_calibration(calibration, unit=unit), views)
+    rig, paths = read_views(calibration, unit, views)
     wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field)
     with _screen.bars() as progress:
         if paths.videos:

@@ -138,7 +138,7 @@ def write_point_picture(uv: NDArray, image: NDArray, path: str | PathLike[str]) 
 def _scale(height: int, bottom: float, top: float, title: str, unit: str) -> NDArray:
     """A bar of colours (height, 2 * _BAR, 3) with its ends and its middle."""
     out = np.full((height, 2 * _BAR, 3), 255, np.uint8)
-    first, last = 50, height - 20
+    first, last = min(50, height // 3), height - min(20, height // 5)
     ramp = np.linspace(255, 0, last - first).astype(np.uint8).reshape(-1, 1)
     out[first:last, 10:30] = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)
     for text, y in ((title, 18), (f"[{unit}]", 38)):

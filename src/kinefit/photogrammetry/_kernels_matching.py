@@ -238,8 +238,10 @@ def covariance(m, at_u, at_v, half, gain, square, share, out):
     share : part of the variance of the noise that is the template's; the rest is the other image's.
 
     The spline smooths the noise of the residuals, which is undone, and the noise of the template makes its own
-    gradients steeper than they are: G of the 2x2 normal matrix S is noise. The covariance is sigma² (S - G)^-1 S (S -
-    G)^-1, as residuals are compared along noisy gradients (S), and a shift moves them along the true ones (S - G).
+    gradients steeper than they are: G of the 2x2 normal matrix S is noise, T = S - G is not. A shift moves residuals
+    along the true gradients; the other image's noise is compared along the noisy ones, the template's along the true
+    ones, as it is orthogonal to its own derivative. So the covariance is sigma² T^-1 (share T + (1 - share) / gain² S)
+    T^-1.
     """
     n = 2 * half + 1
     u, v, a11, a12, a21, a22 = out[U], out[V], out[A], out[A + 1], out[A + 2], out[A + 3]
@@ -255,9 +257,10 @@ def covariance(m, at_u, at_v, half, gain, square, share, out):
         out[STATUS] = FLAT
         return
     i00, i01, i11 = t11 / det, -s01 / det, t00 / det
-    p00, p01, p10, p11 = i00 * s00 + i01 * s01, i00 * s01 + i01 * s11, i01 * s00 + i11 * s01, i01 * s01 + i11 * s11
-    scale = sigma2 * (share + (1.0 - share) / (gain * gain))
-    c00, c01, c11 = scale * (p00 * i00 + p01 * i01), scale * (p00 * i01 + p01 * i11), scale * (p10 * i01 + p11 * i11)
+    own, other = share, (1.0 - share) / (gain * gain)
+    m00, m01, m11 = own * t00 + other * s00, (own + other) * s01, own * t11 + other * s11
+    p00, p01, p10, p11 = i00 * m00 + i01 * m01, i00 * m01 + i01 * m11, i01 * m00 + i11 * m01, i01 * m01 + i11 * m11
+    c00, c01, c11 = sigma2 * (p00 * i00 + p01 * i01), sigma2 * (p00 * i01 + p01 * i11), sigma2 * (p10 * i01 + p11 * i11)
     out[NOISE] = math.sqrt(sigma2)
     out[VAR_U] = a11 * a11 * c00 + 2.0 * a11 * a12 * c01 + a12 * a12 * c11
     out[COV] = a11 * a21 * c00 + (a11 * a22 + a12 * a21) * c01 + a12 * a22 * c11
@@ -310,4 +313,4 @@ def predict(first, at, half, variance, share, out):
         feigned = n * n * share * variance * slope_noise(at[k, 0] - math.floor(at[k, 0]))
         least = 0.5 * (s00 + s11) - math.sqrt(0.25 * (s00 - s11) ** 2 + s01 * s01)
         if least > feigned:
-            out[k] = math.sqrt(variance * least) / (least - feigned)
+            out[k] = math.sqrt(variance * (least - share * feigned)) / (least - feigned)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
+from kinefit.photogrammetry.correlation import search_box
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
 from kinefit.photogrammetry.multi_image import match_along_rays
@@ -19,6 +20,7 @@ from kinefit.photogrammetry.spline_image import SplineImage
 
 _EXACT = 1e-6  # [px²] of the template's own place, which defines the point
 _FEWEST = 3  # points of a surface
+_ALIKE = 0.95  # of the best correlation; of random texture the runner-up has 0.6 to 0.8 of it
 _OUTLYING = 6.0  # robust deviations of the parallax beyond which a match is a wrong one
 _LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration leaves as much
 
@@ -125,6 +127,8 @@ def measure(
         found.append(grow(first, image, grid, start, window=window, least=least))
         if found[-1].found.sum() < _FEWEST:
             _refuse(first, camera.name)
+        if seeds is None:
+            _refuse_repeated(first, image, found[-1], camera.name)
     surface = from_matches(rig, grid, None, found)
     if constrained if constrained is not None else len(rig) > 2:
         surface = match_rays(rig, images, surface, found, window=window, least=least)
@@ -135,11 +139,26 @@ def _refuse(first: SplineImage, camera: str) -> None:
     """Say why nothing was matched."""
     contrast = float(np.std(first.grey))
     if contrast < 3.0 * first.noise:
-        problem = f"no texture: grey values scatter by {contrast:.1f}, noise by {first.noise:.1f}"
+        problem = f"no texture coarser than noise: grey values scatter by {contrast:.1f}, noise by {first.noise:.1f}"
         raise ObservationError(problem, place="first camera", remedy="Put texture on the surface, or light it better.")
     problem = "nothing of the first image is found in it"
     remedy = "Give seeds by hand, a larger window, or a mask; texture that repeats is found nowhere for sure."
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
+
+
+def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, camera: str) -> None:
+    """Refuse texture that looks the same again nearby, where nobody said which place is meant.
+
+    Of 50 points windows of 13 px are sought about their matches; texture repeats where most are as well found
+    elsewhere.
+    """
+    index = np.flatnonzero(found.found)
+    index = index[np.linspace(0, len(index) - 1, min(len(index), 50)).astype(int)]
+    told = search_box(first, second, found.points[index], found.uv[index], reach=3 * WINDOW)
+    seen = np.isfinite(told.best)
+    if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
+        problem = "texture that repeats: most points are found as well elsewhere, so their distance is not known"
+        raise ObservationError(problem, place=f"camera {camera}", remedy="Give seeds by hand: they say where.")
 
 
 def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> Surface:
