@@ -96,7 +96,8 @@ def test_a_real_board_from_seeds_by_hand_is_flat(data_dir, tmp_path):
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     result = call(
         pictures, f"left={pictures / 'left01.jpg'}", f"right={pictures / 'right01.jpg'}", "--unit", 0.025,
-        "--window", 41, "--seeds", tmp_path / "seeds.csv", "--mask", tmp_path / "mask.png", "--step", 8, "-o", tmp_path / "out",
+        "--window", 41, "--seeds", tmp_path / "seeds.csv", "--mask", tmp_path / "mask.png", "--step", 8,
+        "-o", tmp_path / "out",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     with (tmp_path / "out" / "points_000.csv").open() as file:

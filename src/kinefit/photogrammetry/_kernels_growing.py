@@ -53,7 +53,7 @@ def pop(keys, items, size):
 
 
 @jit
-def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, share, least, reach, out):
+def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, share, own, least, reach, out):
     """Match a grid of places (N, 2) [px], `columns` a row, from seeds (S,) with starts (S, 6) in the second spline.
 
     A place is tried from the found neighbour of the highest correlation, with its map carried over, and again from
@@ -73,7 +73,7 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
         if out[k, STATUS] == FOUND or not (abs(at[k, 0]) < np.inf and abs(at[k, 1]) < np.inf):
             continue
         match_point(
-            first, second, at[k, 0], at[k, 1], starts[s], halves[k], steps, tolerance, share,
+            first, second, at[k, 0], at[k, 1], starts[s], halves[k], steps, tolerance, share, own,
             f, fx, fy, rows, m, b, kept, out[k],
         )  # fmt: skip
         tried += 1
@@ -105,7 +105,7 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
             for i in range(4):
                 start[2 + i] = out[k, A + i]
             match_point(
-                first, second, at[other, 0], at[other, 1], start, halves[other], steps, tolerance, share,
+                first, second, at[other, 0], at[other, 1], start, halves[other], steps, tolerance, share, own,
                 f, fx, fy, rows, m, b, kept, out[other],
             )  # fmt: skip
             tried += 1

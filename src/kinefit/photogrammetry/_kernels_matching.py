@@ -171,7 +171,7 @@ def composed(a, b, d, e, x, scale):
 
 
 @jit
-def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share, f, fx, fy, rows, m, b, kept, out):
+def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share, own, f, fx, fy, rows, m, b, kept, out):
     """Match the window about (at_u, at_v) of the first spline in the second, from `start`; fills a row of results.
 
     start : (6,) u, v [px] and the map (2, 2) row by row.
@@ -228,14 +228,15 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
     out[STATUS], out[GAIN], out[OFFSET] = status, gain, b[4] + shift - gain * mean
     out[CORRELATION] = correlation
     if status == FOUND:
-        covariance(m, at_u, at_v, half, gain, square, share, out)
+        covariance(m, at_u, at_v, half, gain, square, share, own, out)
 
 
 @jit
-def covariance(m, at_u, at_v, half, gain, square, share, out):
+def covariance(m, at_u, at_v, half, gain, square, share, own, out):
     """Fill in the noise and the covariance of the place found, from the factored normal matrix and the residuals.
 
     share : part of the variance of the noise that is the template's; the rest is the other image's.
+    own : variance of the template's noise, where it is less: residuals may also be what the model leaves over.
 
     The spline smooths the noise of the residuals, which is undone, and the noise of the template makes its own
     gradients steeper than they are: G of the 2x2 normal matrix S is noise, T = S - G is not. A shift moves residuals
@@ -250,15 +251,16 @@ def covariance(m, at_u, at_v, half, gain, square, share, out):
     passed += share * gain * gain * value_noise(tu) * value_noise(tv)
     sigma2 = (square if square > 0.0 else 0.0) / ((n * n - SIZE) * passed)
     s00, s01, s11 = m[6, 6] ** 2, m[7, 6] * m[6, 6], m[7, 6] ** 2 + m[7, 7] ** 2
-    t00 = s00 - n * n * share * sigma2 * slope_noise(tu) * value_noise(tv)
-    t11 = s11 - n * n * share * sigma2 * slope_noise(tv) * value_noise(tu)
+    feigned = n * n * (own if own < share * sigma2 else share * sigma2)
+    t00 = s00 - feigned * slope_noise(tu) * value_noise(tv)
+    t11 = s11 - feigned * slope_noise(tv) * value_noise(tu)
     det = t00 * t11 - s01 * s01
     if not (t00 > 0.0 and t11 > 0.0 and det > 0.0):  # nothing but noise
         out[STATUS] = FLAT
         return
     i00, i01, i11 = t11 / det, -s01 / det, t00 / det
-    own, other = share, (1.0 - share) / (gain * gain)
-    m00, m01, m11 = own * t00 + other * s00, (own + other) * s01, own * t11 + other * s11
+    other = (1.0 - share) / (gain * gain)
+    m00, m01, m11 = share * t00 + other * s00, (share + other) * s01, share * t11 + other * s11
     p00, p01, p10, p11 = i00 * m00 + i01 * m01, i00 * m01 + i01 * m11, i01 * m00 + i11 * m01, i01 * m01 + i11 * m11
     c00, c01, c11 = sigma2 * (p00 * i00 + p01 * i01), sigma2 * (p00 * i01 + p01 * i11), sigma2 * (p10 * i01 + p11 * i11)
     out[NOISE] = math.sqrt(sigma2)
@@ -268,12 +270,12 @@ def covariance(m, at_u, at_v, half, gain, square, share, out):
 
 
 @jit
-def match_points(first, second, at, starts, halves, steps, tolerance, share, out):
+def match_points(first, second, at, starts, halves, steps, tolerance, share, own, out):
     """Match windows about places (N, 2), each of 2 half + 1 pixels, from starts (N, 6); fills out (N, 15)."""
     f, fx, fy, rows, m, b, kept = room(halves)
     for k in range(at.shape[0]):
         match_point(
-            first, second, at[k, 0], at[k, 1], starts[k], halves[k], steps, tolerance, share,
+            first, second, at[k, 0], at[k, 1], starts[k], halves[k], steps, tolerance, share, own,
             f, fx, fy, rows, m, b, kept, out[k],
         )  # fmt: skip
 

@@ -57,7 +57,9 @@ def conditional(m, y, b, gain, du, dv):
 
 
 @jit
-def match_rays(first, images, sizes, cameras, at, origin, rays, starts, halves, steps, tolerance, share, out, each):
+def match_rays(
+    first, images, sizes, cameras, at, origin, rays, starts, halves, steps, tolerance, share, own, out, each
+):  # fmt: skip
     """Match windows about places (N, 2) of a template in K images (K, H, W) of `sizes` (K, 2) and packed cameras.
 
     rays : (N, 3) unit directions of the places; origin (3,) [m] where they come from.
@@ -70,14 +72,14 @@ def match_rays(first, images, sizes, cameras, at, origin, rays, starts, halves, 
     used = np.empty(count, np.bool_)
     for k in range(at.shape[0]):
         _match_ray(
-            first, images, sizes, cameras, at[k], origin, rays[k], starts[k], halves[k], steps, tolerance, share,
+            first, images, sizes, cameras, at[k], origin, rays[k], starts[k], halves[k], steps, tolerance, share, own,
             f, fx, fy, rows, m, b, y, moves, squares, used, out[k], each[k],
         )  # fmt: skip
 
 
 @jit
 def _match_ray(
-    first, images, sizes, cameras, at, origin, ray, start, half, steps, tolerance, share,
+    first, images, sizes, cameras, at, origin, ray, start, half, steps, tolerance, share, own,
     f, fx, fy, rows, m, b, y, moves, squares, used, out, each,
 ):  # fmt: skip
     n, count = (2 * half + 1) ** 2, images.shape[0]
@@ -185,7 +187,7 @@ def _match_ray(
     for i in range(count):
         each[i, STATUS] = FOUND if used[i] else OUTSIDE
         if used[i]:
-            covariance(m, at[0], at[1], half, each[i, GAIN], squares[i], share, each[i])
+            covariance(m, at[0], at[1], half, each[i, GAIN], squares[i], share, own, each[i])
             if each[i, STATUS] == FOUND:
                 total += _information(each[i], moves[i, 4], moves[i, 5])
     if not total > 0.0:
@@ -194,9 +196,9 @@ def _match_ray(
     variance = mu = mv = 0.0  # the noise of the template moves all images' windows alike, so it may cancel
     for i in range(count):
         if used[i] and each[i, STATUS] == FOUND:
-            own, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
-            variance += (1.0 - share) * own / (total * total)
-            root = math.sqrt(own / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
+            told, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
+            variance += (1.0 - share) * told / (total * total)
+            root = math.sqrt(told / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
             mu, mv = mu + root * qu, mv + root * qv
     out[VARIANCE] = variance + share * (s00 * mu * mu + 2.0 * s01 * mu * mv + s11 * mv * mv) / (total * total)
 

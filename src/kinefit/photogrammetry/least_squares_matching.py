@@ -169,8 +169,9 @@ def match(
         begin = _from_above(first, second, at, begin, halves, levels, steps)
     out = np.empty((len(at), kernels.ROW))
     kernels.match_points(
-        first.coefficients, second.coefficients, at, begin, halves, steps, tolerance, template_share(first, second), out
-    )
+        first.coefficients, second.coefficients, at, begin, halves, steps, tolerance, template_share(first, second),
+        first.noise**2, out,
+    )  # fmt: skip
     return Matches.of(at, out, first, second, halves)
 
 
@@ -190,7 +191,8 @@ def _from_above(
         start, out = begin.copy(), np.empty((len(at), kernels.ROW))
         start[:, :2] *= scale
         share = template_share(one, two)
-        kernels.match_points(one.coefficients, two.coefficients, at * scale, start, halves, steps, 0.01, share, out)
+        pair = one.coefficients, two.coefficients
+        kernels.match_points(*pair, at * scale, start, halves, steps, 0.01, share, one.noise**2, out)
         good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _HELPFUL)
         if good.any():
             near = np.flatnonzero(good)[_nearest(at, at[good])]

@@ -92,7 +92,7 @@ def match_along_rays(
     noise = np.mean([image.noise**2 for image in images[1:]])
     kernels.match_rays(
         images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, steps, tolerance,
-        float(images[0].noise**2 / (images[0].noise**2 + noise)), out, each,
+        float(images[0].noise**2 / (images[0].noise**2 + noise)), float(images[0].noise**2), out, each,
     )  # fmt: skip
     status = out[:, kernels.STATE].astype(np.int64)
     good = status == matching.FOUND

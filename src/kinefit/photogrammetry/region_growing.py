@@ -146,6 +146,6 @@ def grow(
     out = np.empty((len(grid.points), _kernels_matching.ROW))
     _kernels_growing.grow(
         first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, steps, tolerance,
-        template_share(first, second), least, grid.step / 2 if reach is None else reach, out,
+        template_share(first, second), first.noise**2, least, grid.step / 2 if reach is None else reach, out,
     )  # fmt: skip
     return Matches.of(grid.points, out, first, second, halves)
