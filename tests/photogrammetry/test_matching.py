@@ -89,7 +89,7 @@ def test_noise_of_neighbours_that_goes_together_widens_the_intervals():
     grid = np.stack(np.meshgrid(*[np.arange(15, 226, 15.0)] * 2), axis=-1).reshape(-1, 2)
     found = match(*noisy, grid)
     z = ((found.uv - grid - (0.3, 0.2)) / found.std)[found.found]
-    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.3  # about 2.5 where every pixel's noise is taken for new
+    assert 0.8 < np.sqrt(np.mean(z**2)) < 1.7  # 2.9 where every pixel's noise is taken for new
     rows = np.zeros((len(grid), 8))
     assert variance_factor(*noisy, grid[:5], rows, np.full(5, 6)) == 1.0  # too few to tell
 

@@ -30,35 +30,36 @@ def variance_factor(first: SplineImage, second: SplineImage, at: NDArray, rows: 
     if len(at) < _FEWEST:
         return 1.0
     chosen = np.linspace(0, len(at) - 1, min(len(at), _SAMPLE)).astype(int)
-    residual, slope = np.zeros((_LAGS + 1, 2 * _LAGS + 1)), np.zeros((_LAGS + 1, 2 * _LAGS + 1))
-    passed = []
-    for k in chosen:
-        side = np.arange(-halves[k], halves[k] + 1.0)
-        inner = np.stack(np.meshgrid(side, side), axis=-1)
-        template = first.values(at[k] + inner).reshape(len(side), -1)
-        there = second.values(rows[k, :2] + inner @ rows[k, 2:6].reshape(2, 2).T).reshape(len(side), -1)
-        left = there - rows[k, 6] - rows[k, 7] * template
-        if not np.isfinite(left).all():
-            continue
-        residual += _products(left - left.mean())
-        for gradient in np.gradient(template):
-            slope += _products(gradient)
-        passed.append(_passed(at[k], rows[k, :2], rows[k, 2:6], len(side), rows[k, 7]))
-    if not passed or not (residual[0, _LAGS] > 0 and slope[0, _LAGS] > 0):
+    at, rows = at[chosen], rows[chosen]
+    half = int(halves[chosen].min())
+    side = np.arange(-half, half + 1.0)
+    inner = np.stack(np.meshgrid(side, side), axis=-1)
+    template = first.values(at[:, None, None] + inner).reshape(len(at), len(side), -1)
+    moved = np.einsum("nij,xyj->nxyi", rows[:, 2:6].reshape(-1, 2, 2), inner) + rows[:, None, None, :2]
+    there = second.values(moved).reshape(template.shape)
+    left = there - rows[:, 6, None, None] - rows[:, 7, None, None] * template
+    seen = np.isfinite(left).all(axis=(1, 2))
+    if not seen.any():
+        return 1.0
+    left, template = left[seen], template[seen]
+    residual = _products(left - left.mean(axis=(1, 2), keepdims=True))
+    slope = _products(np.gradient(template, axis=1)) + _products(np.gradient(template, axis=2))
+    if not (residual[0, _LAGS] > 0 and slope[0, _LAGS] > 0):
         return 1.0
     together = (residual / residual[0, _LAGS]) * (slope / slope[0, _LAGS])
     # lags of the first row and below, left to right: each but the zero one stands for its opposite as well
     total = 2.0 * (together[1:].sum() + together[0, _LAGS + 1 :].sum()) + 1.0
+    passed = [_passed(a, row[:2], row[2:6], len(side), row[7]) for a, row in zip(at[seen], rows[seen])]
     return max(1.0, float(total * np.mean(passed)))
 
 
 def _products(field: NDArray) -> NDArray:
-    """(L + 1, 2 L + 1) mean products of a field with itself, moved down by 0..L and right by -L..L."""
-    out, (height, width) = np.empty((_LAGS + 1, 2 * _LAGS + 1)), field.shape
+    """(L + 1, 2 L + 1) mean products of fields (K, n, n) with themselves, moved down by 0..L and right by -L..L."""
+    out, (_, height, width) = np.empty((_LAGS + 1, 2 * _LAGS + 1)), field.shape
     for down in range(_LAGS + 1):
         for right in range(-_LAGS, _LAGS + 1):
-            a = field[: height - down, max(0, -right) : width - max(0, right)]
-            b = field[down:, max(0, right) : width - max(0, -right)]
+            a = field[:, : height - down, max(0, -right) : width - max(0, right)]
+            b = field[:, down:, max(0, right) : width - max(0, -right)]
             out[down, _LAGS + right] = (a * b).mean()
     return out
 
