@@ -10,6 +10,7 @@ The real arm (`stereo_arm_handpose3d`): two webcams turned by 74 degrees against
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -21,10 +22,12 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.lsm import Texture
 from benchmarks.silhouettes_arm import SKIN, camera
 from kinefit.errors import KinefitError
+from kinefit.exporters.surface_files import write_field_picture
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.photogrammetry.region_growing import Grid
 from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.states import measure_states, surface_strain
 from kinefit.photogrammetry.surface import measure
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, uniform, within_bounds
@@ -95,7 +98,27 @@ def _limb() -> None:
     figure("surface_limb_live_points", _fewest(filtered), "points in every frame", ">= 500")
     figure("surface_limb_false_paths", bad, "%", "<= 1")
     figure("surface_limb_regenerated", len(paths.x_world[0]) - live[0], "points", ">= 1")
+    if os.environ.get("KINEFIT_PICTURES"):
+        _draw(rig, rays, texture, Path(os.environ["KINEFIT_PICTURES"]) / "surface_limb.png")
     print(f"# CPU {1e3 * spent / max(len(live) - 1, 1):.0f} ms a frame for {np.mean(live):.0f} points in three views")
+
+
+def _draw(rig: Rig, rays: list[NDArray], texture: Texture, path: Path) -> None:
+    """The limb at frames 0 and 2, turned by 4 degrees: standard deviation, displacement and strain."""
+    rng, grid = np.random.default_rng(SEED), Grid.of(SIZE, 3)
+    states = [[drawn(view, d, texture, frame, rng) for view, d in zip(rig, rays)] for frame in (0, 2)]
+    first, second = measure_states(rig, states, grid, window=21)
+    moved, told = second.x_world - first.x_world, surface_strain(first, second, 0.02, 21)
+    fields = (
+        ("std deviation", "mm", 1e3 * np.linalg.norm(first.std, axis=1)),
+        ("displacement", "mm", 1e3 * np.linalg.norm(moved, axis=1)), ("strain xx, 20 mm", "1e-6", 1e6 * told.xx),
+    )  # fmt: skip
+    parts, one = [], path.with_name("field.png")
+    for title, unit, values in fields:
+        write_field_picture(first, states[0][0].grey, values, one, title=title, unit=unit)
+        parts.append(cv2.imread(str(one)))
+    one.unlink()
+    cv2.imwrite(str(path), np.hstack(parts))
 
 
 def _fewest(paths: Trajectories) -> int:
