@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
+from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Matched, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
@@ -30,6 +31,7 @@ from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, contradictions
+from kinefit.tracking.cameras import CAMERAS, as_told, of_cameras
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
 
@@ -121,8 +123,22 @@ def motion_of(
             body, others, matched, take.roots, take.angles, surfaces=smooth or lag is not None
         )
         provenance["sensor noise"] = noise_of_others.as_told()
-    answers = [partial(shape_errors, one, settings, seen) for one in found]
-    results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others, answers)
+
+    def weighed(f: int) -> tuple[Scene, list[Matched]]:
+        """The same with keypoints as they took part."""
+        scene, several = seen(f)
+        pixels = {"weight": weight[f], "loss": SQUARED}
+        return scene, [replace(m, **pixels) if isinstance(m, KeypointMatched) else m for m in several]
+
+    scale = None if others is None else others.scale
+    answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
+    if cameras := as_told(found):
+        provenance[CAMERAS] = cameras
+    elsewhere = any(of_cameras(one) is not None for one in found)
+    results, detectors = with_lasting_errors(
+        results, subject, take, weight, rate, noise_of_others, answers,
+        cameras=None if elsewhere else settings.camera_std,
+    )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)
     provenance["length_std_m"] = subject.length_std
