@@ -16,7 +16,7 @@ LEVELS = [
     {"_arguments"},
     {"geometry", "_files", "_pictures", "_kernels_rendering", "_kernels_losses"},
     {"bodies", "observations", "motion", "motion_columns"},
-    {"readers", "images", "rendering", "rows", "losses"},
+    {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},
     {"correspondences"},
     {"solvers"},
     {"identification", "sensors"},
