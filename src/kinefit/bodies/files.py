@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closure_files import closed, with_closure_images
@@ -28,6 +29,7 @@ _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
 _CHOOSE = "Use one of these, or add it."
 
 
+@checked
 def load_body(name_or_file: str | Path) -> Body:
     """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
 
@@ -201,9 +203,8 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
     for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
         twice = {n for n in items if items.count(n) > 1}
         if twice:
-            raise BodyError(
-                f"{what} named twice: {', '.join(sorted(twice))}", file=source, remedy="Rename one of them."
-            )
+            problem = f"{what} named twice: {', '.join(sorted(twice))}"
+            raise BodyError(problem, file=source, remedy="Rename one of them.")
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
@@ -224,9 +225,8 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
         stack += reversed([c for c in segments if c.parent == s.name])
     if len(out) != len(segments):
         lost = ", ".join(n for n in names if n not in {s.name for s in out})
-        raise BodyError(
-            f"the segments {lost} form a cycle", file=source, remedy="Every chain of parents must end at the root."
-        )
+        remedy = "Every chain of parents must end at the root."
+        raise BodyError(f"the segments {lost} form a cycle", file=source, remedy=remedy)
     return out
 
 
@@ -305,9 +305,8 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
 
 def _finite(at: Vector, source: str, place: str) -> None:
     if not np.all(np.isfinite(at)):
-        raise BodyError(
-            f"`at` is not finite: {list(at)}", file=source, place=place, remedy="Give three numbers in metres."
-        )
+        problem = f"`at` is not finite: {list(at)}"
+        raise BodyError(problem, file=source, place=place, remedy="Give three numbers in metres.")
 
 
 def _points(
