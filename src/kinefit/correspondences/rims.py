@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,37 @@ from kinefit.rendering import Canvas, Raster
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
 _APART = 0.03  # [m] depth behind a rim from which it is the outline of one part before another, and no crease
+
+
+_MARGIN = 4.0  # [px] of a window about the body
+_CELL = 32  # [px] by which windows grow, so that few canvases serve all of them
+
+
+class Window(NamedTuple):
+    """A part of a camera's image, drawn at another size: pixel i of it is at (i + 0.5) / scale - 0.5 + left.
+
+    Parameters
+    ----------
+    left, top : int [px] of the camera's image
+    size : (width, height) [px] of the window's own
+    scale : float [px] of the window in one of the camera's
+    """
+
+    left: int
+    top: int
+    size: tuple[int, int]
+    scale: float
+
+    @classmethod
+    def about(cls, uv: NDArray, camera: Camera, longest: int) -> Window:
+        """About points (N, 2) [px] of a camera's image, at most `longest` [px] and a margin wide."""
+        size = np.array(camera.size)
+        low, high = np.clip(uv.min(axis=0), 0, size - 1), np.clip(uv.max(axis=0), 0, size - 1)
+        scale = min(longest / max(float((high - low).max()), 1.0), 1.0)
+        margin = np.ceil(_MARGIN / scale)
+        left, top = (int(n) for n in np.floor(low - margin))
+        wide, high_ = (int(-(-n // _CELL) * _CELL) for n in np.ceil((high - low + 2 * margin + 1) * scale))
+        return cls(left, top, (wide, high_), scale)
 
 
 class Triangles(Protocol):
@@ -89,7 +120,7 @@ class RimFinder:
         self._out, self._place = np.empty((4, _ROOM)), np.empty((_ROOM, 2))
         self._kind = np.empty(_ROOM, np.int8)
         self._canvases: dict[tuple[int, int], Canvas] = {}
-        self._last: tuple[Camera, NDArray, Raster] | None = None
+        self._last: tuple[Camera, NDArray, Raster, Window] | None = None
 
     @cached_property
     def _edges(self) -> tuple[NDArray, NDArray]:
@@ -107,9 +138,22 @@ class RimFinder:
         """(H, W) int32 triangle of every pixel of a camera of this size, -1 for none, as it was drawn last."""
         return self._canvases[camera.size].face
 
+    @property
+    def window(self) -> Window:
+        """The part of the image that was drawn last."""
+        assert self._last is not None
+        return self._last[3]
+
+    @property
+    def face(self) -> NDArray:
+        """(h, w) int32 triangle of every pixel of the window that was drawn last, -1 for none."""
+        assert self._last is not None
+        return self._last[2].face
+
     def find(
-        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0
-    ) -> Rim:
+        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
+        close: int | None = None,
+    ) -> Rim:  # fmt: skip
         """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world.
 
         Parameters
@@ -117,16 +161,23 @@ class RimFinder:
         inner : whether outlines of one part before another are wanted, which silhouettes do not show.
         stale : float [px]
             The last virtual image of this camera serves again where no vertex has moved farther since it was drawn.
+        close : int [px], optional
+            Only the part of the image that the body fills is drawn, so many pixels wide at most; see `window`.
         """
         x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
         last = self._last
         if last is not None and last[0] is camera and stale > 0.0 and kernels.shift(uv, last[1], stale) <= stale:
-            drawn = last[2]
+            drawn, w = last[2:]
         else:
-            canvas = self._canvases.setdefault(camera.size, Canvas(camera.size))
-            drawn = canvas.draw(x, self.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
-            self._last = camera, uv, drawn
+            w = Window(0, 0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
+            canvas = self._canvases.setdefault(w.size, Canvas(w.size))
+            fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
+            cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
+            drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
+            self._last = camera, uv, drawn, w
+        if close is not None:
+            uv = (uv + (0.5 - w.left, 0.5 - w.top)) * w.scale - 0.5
         edges, sides = self._edges
         n = kernels.rims(
             x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _NEAR, _APART,
@@ -134,7 +185,10 @@ class RimFinder:
         )  # fmt: skip
         number = self._place[:n, 0].astype(np.int64)
         own = np.where(self._front[sides[number, 0]] == 1, sides[number, 0], sides[number, 1])
+        outline = self._out[:, :n].copy()
+        if close is not None:
+            outline[:2] = (outline[:2] + 0.5) / w.scale - 0.5 + np.array([[w.left], [w.top]])
         return Rim(
-            self._out[:, :n].copy(), edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
+            outline, edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
             self._kind[:n] == kernels.INNER,
         )  # fmt: skip

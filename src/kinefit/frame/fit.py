@@ -101,6 +101,12 @@ class FrameFit:
             gain = found.cost - other.cost if every else sum(e.balance for e in also) - sum(e.balance for e in told)
             if gain > 0.0:
                 found, told = other, also
+        for m, one in zip(measurements, list(told)):
+            for state in m.starts(scene, None if held is None else held[1], one):
+                other = self._fitted(scene.at(state), held, measurements)
+                also = evidence_of(other.scene, other.matched)
+                if sum(e.balance for e in also) > sum(e.balance for e in told):
+                    found, told = other, also
         return self._judged(found, held, told, known)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:

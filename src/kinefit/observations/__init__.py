@@ -7,6 +7,7 @@ one sensor, `frames` what it saw at one time.
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.features import KeypointVideo, LineVideo
 from kinefit.observations.frames import (
+    ColourFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -21,6 +22,7 @@ from kinefit.observations.silhouettes import SilhouetteVideo
 __all__ = [
     "MEDIAPIPE_33",
     "CloudVideo",
+    "ColourFrame",
     "DepthFrame",
     "DepthVideo",
     "Detections",

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, PairRows, ParameterRows
 from kinefit.sensors.checks import check_rows, named
@@ -163,6 +163,17 @@ class Measurement(ABC):
     def hints(self, scene: Scene) -> Hints:
         """What it shows where no pose is known."""
         return Hints()
+
+    def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
+        """Other states that a fit may as well begin at; a sensor that searches gives some where they are of use.
+
+        Parameters
+        ----------
+        scene : where the body is expected
+        information : (n, n) of that, None where nothing was known
+        told : what this measurement says of the state that was found from there
+        """
+        return ()
 
     def depth_image(self) -> DepthSeen | None:
         """A depth image that other sensors may ask what is in front of something."""

@@ -1,0 +1,191 @@
+"""Compiled colour statistics of two regions, and the likelihood of a contour's place along its normals.
+
+A pixel's colour is one of 32768 (five bits a channel); a table gives the bin of each, another the logarithm of the
+ratio of inside to outside of each bin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+from kinefit._kernels_rendering import rasterise
+
+_MOST = 64  # samples of one line, at most
+
+
+@jit
+def _colour(image, j, i):
+    """Number of a pixel's colour, five bits a channel."""
+    return ((image[j, i, 0] >> 3) << 10) | ((image[j, i, 1] >> 3) << 5) | (image[j, i, 2] >> 3)
+
+
+@jit
+def count(image, bins, face, left, top, scale, box, inside, near, far):
+    """Add pixels of an image (H, W, 3) uint8 to the histograms (B,) of inside, near and far outside: one in four.
+
+    face (h, w) is the body as drawn in a window of the image, -1 where it is not: pixel (x, y) of the image lies at
+    ((x - left + 0.5) scale, (y - top + 0.5) scale). Pixels at its edge count for neither. box: left, top, right, bottom
+    [px] of what is near; of what is far one pixel in sixteen is looked at.
+    """
+    height, width = image.shape[:2]
+    for y in range(0, height, 2):
+        for x in range(0, width, 2):
+            if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
+                if not ((y | x) & 2):
+                    far[bins[_colour(image, y, x)]] += 1.0
+                continue
+            here = _drawn(face, x, y, left, top, scale)
+            edge = False
+            for k in range(4):
+                dx, dy = (2 - k if k & 1 else 0), (k - 1 if not (k & 1) else 0)
+                edge = edge or _drawn(face, x + 2.0 * dx, y + 2.0 * dy, left, top, scale) != here
+            if edge:
+                continue
+            if here:
+                inside[bins[_colour(image, y, x)]] += 1.0
+            else:
+                near[bins[_colour(image, y, x)]] += 1.0
+
+
+@jit
+def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, inside, outside):
+    """Add the pixels along the normals of a contour (4, N) to the histograms (A, B) of its points' anchors (N,).
+
+    reach [px] to either side; the pixel next to the contour counts for neither. face, left, top, scale as of `count`.
+    """
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
+        own = anchor[p]
+        for side in range(2):
+            sign = 1.0 if side else -1.0
+            for k in range(2, reach + 2):
+                x, y = u + sign * k * a, v + sign * k * b
+                i, j = math.floor(x + 0.5), math.floor(y + 0.5)
+                if not (0 <= i < width and 0 <= j < height):
+                    break
+                if _drawn(face, x, y, left, top, scale) == (side == 1):
+                    break
+                bin_ = bins[_colour(image, j, i)]
+                if side:
+                    outside[own, bin_] += 1.0
+                else:
+                    inside[own, bin_] += 1.0
+
+
+@jit
+def _drawn(face, x, y, left, top, scale):
+    """Whether the body was drawn at a pixel (x, y) of the image."""
+    i, j = math.floor((x - left + 0.5) * scale), math.floor((y - top + 0.5) * scale)
+    return 0 <= i < face.shape[1] and 0 <= j < face.shape[0] and face[j, i] >= 0
+
+
+@jit
+def profiles(image, bins, ratio, anchor, contour, face, left, top, scale, half, step, guard, out):
+    """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
+
+    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. ratio (A, B), of which a
+    point has the row of its anchor (N,). face (h, w) is the body as drawn, see `count`: where a line has left the body
+    on its other side, or met it again, it tells nothing any more (0); `guard` [px] about the contour always tell.
+    """
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
+        own = anchor[p]
+        for side in range(2):
+            ended = False
+            for q in range(half):
+                k = half + q if side else half - 1 - q
+                total = 0.0
+                if not ended:
+                    for r in range(step):
+                        s = (k - half) * step + r + 0.5
+                        x, y = u + s * a, v + s * b
+                        i, j = math.floor(x + 0.5), math.floor(y + 0.5)
+                        if not (0 <= i < width and 0 <= j < height):
+                            ended = True
+                            break
+                        if abs(s) > guard and _drawn(face, x, y, left, top, scale) == (side == 1):
+                            ended = True
+                            break
+                        total += ratio[own, bins[_colour(image, j, i)]]
+                out[p, k] = total
+
+
+@jit
+def places(lines, step, heat, width, near, out):
+    """Where along each line (N, 2 half) of log ratios the contour is: out (6, N).
+
+    With the contour at boundary c the likelihood is exp(S(c)), S the sum of all log ratios inside of c; it is taken to
+    the power 1 / heat, as neighbouring pixels are alike. out: mean [px] and variance [px²] of the contour's offset,
+    the likelihood's slope and curvature at the offset 0 over a kernel of standard deviation `width` [px], how much better
+    the best place explains the line than no contour on it does, and how much better than the best place within `near`
+    [px] of the offset 0 (both in logarithms).
+    """
+    n = lines.shape[1]
+    half = n // 2
+    total = np.empty(_MOST + 1)
+    for p in range(lines.shape[0]):
+        total[0], best = 0.0, 0.0
+        for k in range(n):
+            total[k + 1] = total[k] + lines[p, k]
+            best = total[k + 1] if total[k + 1] > best else best
+        sum_, mean, square = 0.0, 0.0, 0.0
+        for k in range(n + 1):
+            w = math.exp((total[k] - best) / heat)
+            x = (k - half) * step
+            sum_ += w
+            mean += w * x
+            square += w * x * x
+        mean /= sum_
+        out[0, p] = mean
+        out[1, p] = square / sum_ - mean * mean + step * step / 12.0
+        slope, bend = 0.0, 0.0
+        for k in range(n):
+            x = (k + 0.5 - half) * step / width
+            g = math.exp(-0.5 * x * x) / (width * 2.5066282746310002)
+            slope += lines[p, k] * g
+            bend += lines[p, k] * g * x / width
+        out[2, p], out[3, p] = slope / heat, bend / heat
+        least = total[n] if total[n] > 0.0 else 0.0
+        out[4, p] = best - least
+        here = -math.inf
+        for k in range(n + 1):
+            if abs((k - half) * step) <= near and total[k] > here:
+                here = total[k]
+        out[5, p] = best - here
+
+
+@jit
+def ratio_map(image, bins, ratio, left, top, step, out):
+    """Mean log ratio of cells of step x step pixels, from pixel (left, top) on: out (h, w); 0 outside of the image."""
+    height, width = image.shape[:2]
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            total = 0.0
+            for y in range(top + j * step, top + (j + 1) * step):
+                if 0 <= y < height:
+                    for x in range(left + i * step, left + (i + 1) * step):
+                        if 0 <= x < width:
+                            total += ratio[bins[_colour(image, y, x)]]
+            out[j, i] = total / (step * step)
+
+
+@jit
+def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
+    """How much of a map of log ratios (h, w) lies inside of a body's silhouette, for M poses: out (M,), the sums.
+
+    vertices (V, 3) [m] about the body's middle, in the camera's axes; poses (M, 4, 4) take them to the camera's frame;
+    lens fx, fy, cx, cy, near of the map; room, depth, face as of `rasterise`.
+    """
+    for m in range(len(poses)):
+        rasterise(vertices, poses[m], faces, lens[0], lens[1], lens[2], lens[3], lens[4], False, room, depth, face)
+        total = 0.0
+        for j in range(face.shape[0]):
+            for i in range(face.shape[1]):
+                if face[j, i] >= 0:
+                    total += ratios[j, i]
+        out[m] = total
