@@ -67,6 +67,16 @@ def shift(a, b, most):
 
 
 @jit
+def bounds(uv):
+    """Smallest and largest coordinates of points (N, 2): left, top, right, bottom."""
+    left, top, right, bottom = uv[0, 0], uv[0, 1], uv[0, 0], uv[0, 1]
+    for i in range(len(uv)):
+        left, right = min(left, uv[i, 0]), max(right, uv[i, 0])
+        top, bottom = min(top, uv[i, 1]), max(bottom, uv[i, 1])
+    return left, top, right, bottom
+
+
+@jit
 def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, inner, front, out, place, kind):
     """Rim points of a mesh that was drawn: how many were written.
 

@@ -6,6 +6,7 @@ and triangle of every pixel, tells whether it is seen, and what is behind it: no
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -44,13 +45,14 @@ class Window(NamedTuple):
     @classmethod
     def about(cls, uv: NDArray, camera: Camera, longest: int) -> Window:
         """About points (N, 2) [px] of a camera's image, at most `longest` [px] and a margin wide."""
-        size = np.array(camera.size)
-        low, high = np.clip(uv.min(axis=0), 0, size - 1), np.clip(uv.max(axis=0), 0, size - 1)
-        scale = min(longest / max(float((high - low).max()), 1.0), 1.0)
-        margin = np.ceil(_MARGIN / scale)
-        left, top = (int(n) for n in np.floor(low - margin))
-        wide, high_ = (int(-(-n // _CELL) * _CELL) for n in np.ceil((high - low + 2 * margin + 1) * scale))
-        return cls(left, top, (wide, high_), scale)
+        (left, top, right, bottom), (width, height) = kernels.bounds(uv), camera.size
+        left, right = min(max(left, 0.0), width - 1.0), min(max(right, 0.0), width - 1.0)
+        top, bottom = min(max(top, 0.0), height - 1.0), min(max(bottom, 0.0), height - 1.0)
+        scale = min(longest / max(right - left, bottom - top, 1.0), 1.0)
+        margin = math.ceil(_MARGIN / scale)
+        wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
+        size = math.ceil(wide / _CELL) * _CELL, math.ceil(high / _CELL) * _CELL
+        return cls(math.floor(left - margin), math.floor(top - margin), size, scale)
 
 
 class Triangles(Protocol):
@@ -94,7 +96,7 @@ class Rim:
         s = self.share[:, None]
         return np.asarray((1.0 - s) * vertices[self.vertices[:, 0]] + s * vertices[self.vertices[:, 1]])
 
-    def chosen(self, which: NDArray) -> Rim:
+    def chosen(self, which: NDArray | slice) -> Rim:
         """Some of the points."""
         return Rim(
             np.ascontiguousarray(self.outline[:, which]), self.vertices[which], self.share[which], self.segment[which],
@@ -171,7 +173,9 @@ class RimFinder:
             drawn, w = last[2:]
         else:
             w = Window(0, 0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
-            canvas = self._canvases.setdefault(w.size, Canvas(w.size))
+            if w.size not in self._canvases:
+                self._canvases[w.size] = Canvas(w.size)
+            canvas = self._canvases[w.size]
             fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
             cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
             drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)

@@ -75,7 +75,8 @@ class FrameFit:
 
     def __init__(self, body: Body, settings: TrackSettings) -> None:
         self.body, self.settings = body, settings
-        self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
+        pairs = collision_pairs(body) if body.surfaces else None
+        self._pairs: CollisionPairs | None = pairs if pairs is not None and len(pairs.pairs) else None
 
     def run(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], known: NDArray | None = None

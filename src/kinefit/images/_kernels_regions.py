@@ -31,23 +31,21 @@ def count(image, bins, face, left, top, scale, box, inside, near, far):
     [px] of what is near; of what is far one pixel in sixteen is looked at.
     """
     height, width = image.shape[:2]
-    for y in range(0, height, 2):
-        for x in range(0, width, 2):
+    for y in range(0, height, 4):
+        for x in range(0, width, 4):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
-                if not ((y | x) & 2):
-                    far[bins[_colour(image, y, x)]] += 1.0
-                continue
+                far[bins[_colour(image, y, x)]] += 1.0
+    for y in range(max(box[1], 0), min(box[3], height), 2):
+        for x in range(max(box[0], 0), min(box[2], width), 2):
             here = _drawn(face, x, y, left, top, scale)
-            edge = False
-            for k in range(4):
-                dx, dy = (2 - k if k & 1 else 0), (k - 1 if not (k & 1) else 0)
-                edge = edge or _drawn(face, x + 2.0 * dx, y + 2.0 * dy, left, top, scale) != here
-            if edge:
-                continue
-            if here:
-                inside[bins[_colour(image, y, x)]] += 1.0
-            else:
-                near[bins[_colour(image, y, x)]] += 1.0
+            if (
+                _drawn(face, x - 2, y, left, top, scale) == here and _drawn(face, x + 2, y, left, top, scale) == here
+                and _drawn(face, x, y - 2, left, top, scale) == here and _drawn(face, x, y + 2, left, top, scale) == here
+            ):  # fmt: skip
+                if here:
+                    inside[bins[_colour(image, y, x)]] += 1.0
+                else:
+                    near[bins[_colour(image, y, x)]] += 1.0
 
 
 @jit

@@ -4,6 +4,7 @@ Readers make them, correspondences use them; nothing here opens a file or knows 
 one sensor, `frames` what it saw at one time.
 """
 
+from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.features import KeypointVideo, LineVideo
 from kinefit.observations.frames import (
@@ -23,6 +24,7 @@ __all__ = [
     "MEDIAPIPE_33",
     "CloudVideo",
     "ColourFrame",
+    "ColourVideo",
     "DepthFrame",
     "DepthVideo",
     "Detections",

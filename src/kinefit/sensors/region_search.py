@@ -57,13 +57,16 @@ class Seeker:
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         self.merged, self.count, self.faces = coarse(vertices, faces)
+        #: [m] from end to end
+        self.size = float(np.ptp(vertices, axis=0).max())
+        self._number = np.bincount(self.merged, minlength=self.count)
         self._room = np.empty((6, self.count))
         self._canvases: dict[tuple[int, int], tuple[NDArray, NDArray]] = {}
 
     def posed(self, vertices: NDArray) -> NDArray:
         """(C, 3) of the coarse mesh, from the vertices (V, 3) of the fine one."""
-        n = np.bincount(self.merged, minlength=self.count)
-        return np.stack([np.bincount(self.merged, vertices[:, k], self.count) / n for k in range(3)], axis=1)
+        sums = [np.bincount(self.merged, vertices[:, k], self.count) for k in range(3)]
+        return np.ascontiguousarray((np.array(sums) / self._number).T)
 
     def explained(self, x: NDArray, poses: NDArray, lens: NDArray, ratios: NDArray) -> tuple[NDArray, NDArray]:
         """Sums (M,) of log ratios inside of the silhouettes of M poses (M, 4, 4), and the face drawn last."""
@@ -120,8 +123,7 @@ def seek(
 
     def poses(p: NDArray) -> NDArray:
         out = np.tile(np.eye(4), (len(p), 1, 1))
-        for k in range(len(p)):
-            out[k, :3, :3] = se3.exp_so3(p[k, 3:])
+        out[:, :3, :3] = se3.exp_so3(p[:, 3:])
         out[:, :3, 3] = middle + p[:, :3]
         return out
 

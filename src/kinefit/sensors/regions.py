@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -15,6 +16,7 @@ from kinefit.correspondences import _kernels, _kernels_outlines
 from kinefit.correspondences.morphed import morphed_outline_rows
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import RegionColours, RegionSettings, colour_bins, normalised
@@ -29,6 +31,8 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
 
+_ANYWHERE = 1e4  # [px]
+_FEW = 16  # one vertex in so many tells how far a body has moved
 _GUARD = 4.0  # [px] about a contour in which a line always tells: the body as drawn is that coarse
 _TELLS = 3.0  # by so much (in logarithms) a place must explain a line better than none
 _NEAR = 3.0  # [px] within which the best place of a contour is where it is thought to be
@@ -51,6 +55,7 @@ class RegionSensor(Sensor):
         self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
         self.colours: RegionColours | None = None
         self.ratios: tuple[NDArray, NDArray] | None = None
+        self.reach = _ANYWHERE  # [px] how far from where it is expected the contour may be
         self._anchors: NDArray | None = None
         self.search, self._seeker = SearchSettings(), None
 
@@ -89,7 +94,12 @@ class RegionSensor(Sensor):
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
         """Blend in the colours of a step in which the body was found."""
-        if not sure or not isinstance(measurement, RegionMeasurement) or self.colours is None:
+        if not isinstance(measurement, RegionMeasurement) or self.colours is None:
+            return
+        off = measurement.off(scene)
+        self.reach = 2.0 * off if self.reach >= _ANYWHERE else max(2.0 * off, 0.7 * self.reach)
+        if not sure:
+            self.reach = _ANYWHERE
             return
         self.colours = self.colours.blended(measurement.counted(scene), self.regions)
         self.ratios = self.colours.ratios(self.regions)
@@ -110,21 +120,28 @@ class RegionMeasurement(Measurement):
     def __init__(self, of: RegionSensor, frame: ColourFrame, scene: Scene) -> None:
         self.sensor, self.time, self.of, self.image = of.name, frame.time, of, frame.image
         self.ratios: Any = None
+        self.reach, self._spacing = of.reach, 1.0
+        self.expected = scene.placed(of.camera).project(scene.pose.vertices[::_FEW])
         self._last: tuple[NDArray, Camera, Rim] | None = None
 
-    def rim(self, scene: Scene, stale: float = 0.5) -> Rim:
+    def rim(self, scene: Scene, stale: float = 1.0) -> Rim:
         """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""
         vertices, camera = scene.pose.vertices, scene.placed(self.of.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera:
-            finder, most = scene.surface.rims(camera), self.of.regions.lines
+            finder = scene.surface.rims(camera)
             rim = finder.find(
-                vertices, camera, spacing=1.0, inner=False, stale=stale, close=self.of.settings.outline
+                vertices, camera, spacing=self._spacing, inner=False, stale=stale, close=self.of.settings.outline
             )
-            self._rim_count = len(rim) / finder.window.scale
-            if len(rim) > most:
-                rim = rim.chosen(np.linspace(0, len(rim) - 1, most).astype(np.int64))
+            if self._spacing == 1.0:  # of the first look alone
+                self._spacing = max(len(rim) / self.of.regions.lines, 1.0 + 1e-9)
+                rim = rim.chosen(slice(None, None, max(int(self._spacing), 1)))
             self._last = vertices, camera, rim
         return self._last[2]
+
+    def off(self, scene: Scene) -> float:
+        """[px] how far the body is from where it was expected, at most."""
+        camera = scene.placed(self.of.camera)
+        return float(np.nanmax(np.abs(camera.project(scene.pose.vertices[::_FEW]) - self.expected), initial=0.0))
 
     def drawn(self, scene: Scene) -> tuple[NDArray, int, int, float]:
         """The body as it was drawn last: its faces, and where they are in the image; see `kernels.count`."""
@@ -135,13 +152,14 @@ class RegionMeasurement(Measurement):
     def counted(self, scene: Scene) -> RegionColours:
         """The colours of this image with the body where a scene has it."""
         of, s = self.of, self.of.regions
-        rim = self.rim(scene, stale=0.0)
+        rim = self.rim(scene)
         counts = np.zeros((3, of.count))
         own = np.zeros((2, s.anchors, of.count), np.float32)
         if len(rim):
             low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
             margin = 0.25 * (high - low).sum() + 8.0
-            box, drawn = np.concatenate([low - margin, high + margin]), self.drawn(scene)
+            box = np.concatenate([low - margin, high + margin]).astype(np.int64)
+            drawn = self.drawn(scene)
             kernels.count(self.image, of.bins, *drawn, box, *counts)
             if s.anchors:
                 anchor = of.anchors(scene)[rim.vertices[:, 0]]
@@ -164,16 +182,14 @@ class RegionMeasurement(Measurement):
         """Where along its normals the contour of the body is."""
         of, s = self.of, self.of.regions
         rim = self.rim(scene)
-        step = max(round(reach / of.settings.near), 1)
+        step = max(min(round(reach / of.settings.near), math.ceil(self.reach / s.half)), 1)
         told = self.lines(scene, rim, step)
         contour = np.array(rim.outline)
         mean, var = told[0], told[1]
         if s.newton and step == 1:
             mean = np.clip(told[2] * var, -4.0, 4.0)
         contour[:2] += mean * contour[2:]
-        w = self.drawn(scene)
-        spacing = max(1.0 / w[3], self._rim_count / max(len(rim), 1))
-        share = min(spacing / s.alike, 1.0)
+        share = min(self._spacing / self.drawn(scene)[3] / s.alike, 1.0)
         weight = share / (var + of.sigma**2)
         weight[told[4] < s.tells] = 0.0
         return RegionMatched(self, rim, contour, weight, geman_mcclure(s.loss * np.sqrt(share)))
@@ -183,25 +199,20 @@ class RegionMeasurement(Measurement):
         of, s = self.of, self.of.search
         if not of.settings.search:
             return ()
-        camera = scene.placed(of.camera)
-        x = scene.pose.vertices @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-        if x[:, 2].min() < NEAR:
-            return ()
-        size = float(np.ptp(x[:, :2], axis=0).max())
-        spread = np.full(6, 1.0)
+        camera, seeker = scene.placed(of.camera), of.seeker(scene)
+        R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+        size, spread = seeker.size, np.full(6, np.inf)
+        x = seeker.posed(scene.pose.vertices)
         if information is not None:
-            covariance = inverse(information)[:6, :6]
-            R = camera.T_camera_world[:3, :3]
-            middle = scene.pose.vertices.mean(axis=0) - scene.state.T_world_root[:3, 3]
-            arm = np.array([[0, middle[2], -middle[1]], [-middle[2], 0, middle[0]], [middle[1], -middle[0], 0]])
+            arm = se3.hat(scene.state.T_world_root[:3, 3] - x.mean(axis=0))
             J = np.block([[R, R @ arm], [np.zeros((3, 3)), R]])
-            spread = np.sqrt(np.diag(J @ covariance @ J.T))
-        spread = np.clip(spread, [0.05 * size] * 3 + [0.05] * 3, [2.0 * size] * 3 + [1.0] * 3)
+            spread = np.sqrt(np.diag(J @ inverse(information)[:6, :6] @ J.T))
         rough = spread[:3].max() > 0.3 * size or spread[3:].max() > 0.25
-        if not (rough or told.lost.any() or told.quality.min() < 0.8):
+        x = x @ R.T + t
+        if not (rough or told.lost.any() or told.quality.min() < 0.8) or x[:, 2].min() < NEAR:
             return ()
-        seeker = of.seeker(scene)
-        focal, depth = camera.matrix[0, 0], float(np.median(x[:, 2]))
+        spread = np.clip(spread, [0.05 * size] * 3 + [0.05] * 3, [2.0 * size] * 3 + [1.0] * 3)
+        focal, depth = camera.matrix[0, 0], float(x[:, 2].mean())
         step = max(round(size * focal / depth / s.side), 1)
         uv = camera.project(scene.pose.vertices)
         reach = (3.0 * spread[:2].max() * focal / depth) + 0.25 * size * focal / depth
@@ -211,12 +222,12 @@ class RegionMeasurement(Measurement):
         cells = np.empty((int(shape[1]), int(shape[0])))
         kernels.ratio_map(self.image, of.bins, self.ratios[0], int(low[0]), int(low[1]), step, cells)
         lens = lens_of(camera.matrix, int(low[0]), int(low[1]), step)
-        motions, _ = seek(seeker, seeker.posed(x), cells, lens, spread, s)
+        motions, _ = seek(seeker, x, cells, lens, spread, s)
         return [moved(scene.state, camera.T_camera_world, m) for m in motions]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas = self.rim(scene, stale=0.0), scene.surface.areas
+        rim, areas = self.rim(scene), scene.surface.areas
         told = self.lines(scene, rim, 2)
         tells, here = told[4] > _TELLS, told[5] < _WORSE
         agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))

@@ -23,6 +23,7 @@ from kinefit.readers.take.entries import (
     KeypointsEntry,
     LinesEntry,
     MarkersEntry,
+    RegionEntry,
     SessionEntry,
     SilhouetteEntry,
     StartEntry,
@@ -39,6 +40,7 @@ __all__ = [
     "KeypointsEntry",
     "LinesEntry",
     "MarkersEntry",
+    "RegionEntry",
     "SessionEntry",
     "SilhouetteEntry",
     "StartEntry",
@@ -59,13 +61,14 @@ class _File(_Entry, frozen=True, kw_only=True):
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
     silhouette: tuple[SilhouetteEntry, ...] = ()
+    region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
-    "silhouette": SilhouetteEntry, "lines": LinesEntry,
+    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
@@ -102,7 +105,7 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, skin, lines : tuples of entries
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples of entries
         `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
@@ -121,6 +124,7 @@ class Take:
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
     silhouettes: tuple[SilhouetteEntry, ...] = ()
+    regions: tuple[RegionEntry, ...] = ()
     start: Path | None = None
     pose: StartEntry | None = None
     size: bool | None = None
@@ -167,7 +171,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
         keypoints=tuple(k for k in content.keypoints if k.format != "skin"), markers=content.markers,
         depth=content.depth, stereo=content.stereo,
-        silhouettes=content.silhouette,
+        silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
         pose=content.start, size=head.size, session=content.session,
     )  # fmt: skip
