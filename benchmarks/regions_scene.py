@@ -1,7 +1,7 @@
 """Rendered sequences of rigid objects in the manner of RBOT: real clutter behind, moving light, noise, an occluder.
 
 They are not that benchmark's sequences, and their numbers are not its numbers. An object of coloured parts with a grain
-turns and moves before a photograph; the camera's image has noise, a blur of half a pixel, and soft edges.
+turns and moves before a photograph; the camera's image has noise, is blurred by lens and motion, and has soft edges.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ RATE = 30.0  # [Hz]
 KINDS = ("regular", "light", "noise", "occlusion")
 TUNED = ("rabbit", "lamp", "box", "figure")  # objects on which settings were chosen ...
 TOLD = ("duck", "can", "car", "drill")  # ... and those of which figures are told
+_BLUR = 0.8  # [px] of the lens and of the sensor's colour filter
+_SHUTTER = 0.2  # of the time between two images: what moves by 25 px is blurred over 5, as in the real recording
 _FAR = 0.75  # [m] of an object that is 0.2 m long
 
 
@@ -218,6 +220,11 @@ def drawn(what: Thing, T: NDArray, light: NDArray, canvas: Canvas, cam: Camera) 
     return colour, cover
 
 
+def _part(T: NDArray, share: float) -> NDArray:
+    """A share of a small motion (4, 4)."""
+    return np.asarray(se3.exp(share * se3.log(T)))
+
+
 def rendered(name: str, kind: str, seed: int, frames: int) -> Sequence:
     """A sequence of one of `KINDS`."""
     random = np.random.default_rng((seed, sorted((*TUNED, *TOLD)).index(name), KINDS.index(kind)))
@@ -236,18 +243,21 @@ def rendered(name: str, kind: str, seed: int, frames: int) -> Sequence:
             light = se3.exp_so3(axis / np.linalg.norm(axis) * 2 * np.pi * k / 90) @ light
         y, x = np.clip(corner + k * drift, 0, room).astype(int)
         image = plate[y : y + SIZE[1], x : x + SIZE[0]].astype(np.float32)
-        layers = [(what, truth[k])]
+        ahead = truth[min(k + 1, frames - 1)] @ np.linalg.inv(truth[k])  # while the shutter is open
+        blurred = [truth[k]] + [_part(ahead, share) @ truth[k] for share in (-_SHUTTER / 2, _SHUTTER / 2)]
+        layers = [(what, blurred)]
         if kind == "occlusion":
             T = np.array(truth[k])
             T[:3, :3] = se3.exp_so3(np.array([0.02 * k, 0.5, 0.03 * k]))
             T[:3, 3] *= 0.85
             T[:3, 3] += [0.12 * np.sin(2 * np.pi * k / 45), 0.08 * np.cos(2 * np.pi * k / 60), 0.0]
-            layers.append((replace(before, vertices=0.6 * before.vertices), T))
-        for one, T in layers:
-            colour, cover = drawn(one, T, light, canvas, cam)
+            layers.append((replace(before, vertices=0.6 * before.vertices), [T]))
+        for one, poses in layers:
+            seen = [drawn(one, T, light, canvas, cam) for T in poses]
+            colour, cover = (np.mean([s[n] for s in seen], axis=0, dtype=np.float32) for n in (0, 1))
             small = [cv2.resize(a, SIZE, interpolation=cv2.INTER_AREA) for a in (colour, cover)]
             image = image * (1.0 - small[1][..., None]) + small[0]
-        image = cv2.GaussianBlur(image, (0, 0), 0.5)
+        image = cv2.GaussianBlur(image, (0, 0), _BLUR)
         noise = 0.03 if kind == "noise" else 0.006
         image = image + noise * random.standard_normal(image.shape, np.float32)
         images.append(np.clip(255 * image, 0, 255).astype(np.uint8))

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 
+
 import numpy as np
 
 from kinefit._jit import jit
 from kinefit._kernels_rendering import rasterise
-
-_MOST = 64  # samples of one line, at most
 
 
 @jit
@@ -114,47 +113,45 @@ def profiles(image, bins, ratio, anchor, contour, face, left, top, scale, half, 
 
 
 @jit
-def places(lines, step, heat, width, near, out):
-    """Where along each line (N, 2 half) of log ratios the contour is: out (6, N).
+def places(lines, step, heat, out):
+    """Where along each line (N, 2 half) of log ratios the contour is: out (3, N).
 
     With the contour at boundary c the likelihood is exp(S(c)), S the sum of all log ratios inside of c; it is taken to
-    the power 1 / heat, as neighbouring pixels are alike. out: mean [px] and variance [px²] of the contour's offset,
-    the likelihood's slope and curvature at the offset 0 over a kernel of standard deviation `width` [px], how much better
-    the best place explains the line than no contour on it does, and how much better than the best place within `near`
-    [px] of the offset 0 (both in logarithms).
+    the power 1 / heat, as neighbouring pixels are alike. out: mean [px] and variance [px²] of the contour's offset, and
+    by how much (in logarithms) the best place explains the line better than no contour on it does.
     """
     n = lines.shape[1]
     half = n // 2
-    total = np.empty(_MOST + 1)
+    total = np.empty(n + 1)
     for p in range(lines.shape[0]):
         total[0], best = 0.0, 0.0
         for k in range(n):
             total[k + 1] = total[k] + lines[p, k]
             best = total[k + 1] if total[k + 1] > best else best
-        sum_, mean, square = 0.0, 0.0, 0.0
+        weight, mean, square = 0.0, 0.0, 0.0
         for k in range(n + 1):
-            w = math.exp((total[k] - best) / heat)
             x = (k - half) * step
-            sum_ += w
-            mean += w * x
-            square += w * x * x
-        mean /= sum_
+            if total[k] > best - 20.0 * heat:
+                w = math.exp((total[k] - best) / heat)
+                weight += w
+                mean += w * x
+                square += w * x * x
+        mean /= weight
         out[0, p] = mean
-        out[1, p] = square / sum_ - mean * mean + step * step / 12.0
-        slope, bend = 0.0, 0.0
-        for k in range(n):
-            x = (k + 0.5 - half) * step / width
-            g = math.exp(-0.5 * x * x) / (width * 2.5066282746310002)
-            slope += lines[p, k] * g
-            bend += lines[p, k] * g * x / width
-        out[2, p], out[3, p] = slope / heat, bend / heat
-        least = total[n] if total[n] > 0.0 else 0.0
-        out[4, p] = best - least
-        here = -math.inf
-        for k in range(n + 1):
-            if abs((k - half) * step) <= near and total[k] > here:
-                here = total[k]
-        out[5, p] = best - here
+        out[1, p] = square / weight - mean * mean + step * step / 12.0
+        out[2, p] = best - (total[n] if total[n] > 0.0 else 0.0)
+
+
+@jit
+def shifts(lines, step, out):
+    """The paper's rule on the same lines: out (2, N), a step outwards [px] where both pixels at the contour look like
+    the body, inwards where they do not, none where they tell nothing; and its variance, that of a step.
+    """
+    half = lines.shape[1] // 2
+    for p in range(lines.shape[0]):
+        here = lines[p, half - 1] + lines[p, half]
+        out[0, p] = step if here > 0.0 else -step if here < 0.0 else 0.0
+        out[1, p] = step * step
 
 
 @jit

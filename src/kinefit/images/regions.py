@@ -6,14 +6,44 @@ light may change. A pixel of colour c speaks for the body by log p₁(c) / p₂(
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_FLOOR = 0.02  # share of both densities that any colour may have: paint that was not seen yet, noise, reflections
+_FLOOR = 0.02  # share of both densities that is even over all colours: paint that was not seen yet, noise, reflections
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How a body is sought where it is not known well where to expect it; see `sensors.region_search`.
+
+    Parameters
+    ----------
+    side : float [cells] of the map of log ratios, length of the body in it
+    rotations : int, tried with all places
+    best : int, of these that are improved
+    rounds, draws : int, how often, and with how many poses each
+    starts : int, that are handed out
+    doubt : float, share of what the body could explain by which half a variance off the prediction is worse
+    far : float, in lengths of the body, and turn : float [rad]
+        Standard deviations of the prediction from which a body is sought in any case.
+    poor : float, share of the contour that agrees below which it is sought too
+    """
+
+    side: float = 28.0
+    rotations: int = 24
+    best: int = 4
+    rounds: int = 4
+    draws: int = 40
+    starts: int = 3
+    doubt: float = 0.004
+    far: float = 0.3
+    turn: float = 0.25
+    poor: float = 0.55
 
 
 @dataclass(frozen=True)
@@ -26,46 +56,52 @@ class RegionSettings:
     levels : int, bins along each of the three axes
     anchors : int
         Points of the surface near which colours are counted apart; 0 for one statistic of the whole body.
-    spread : float [pixels counted]
-        As many pixels of one anchor weigh as much as the whole body's statistics.
+    spread : float [pixels]
+        The whole body's statistics weigh as much as so many pixels counted near an anchor.
     rate, near_rate : float in 0..1
-        Share of a new image in the statistics of the body, and of what is around it.
+        Share of a new image in the statistics of the body, and of what is around it; the first images count alike.
     far : float in 0..1
         Share of the whole image in what is around the body; the rest is counted near it.
     most : float
         Largest logarithm of the ratio of two densities that a single pixel may have.
-    half : int, samples of a line to either side
-    fine : float [px] length of half a line in the last iteration, at most `half` samples of one pixel
+    rule : "likelihood" or "shift"
+        A line's place by the likelihood of all places along it; or the paper's rule: one step outwards where the
+        contour's own pixels look like the body, one step inwards where they do not (P3 2.4.2).
+    half : int, samples of a line to either side: of one pixel each in the last iterations, of several before
     heat : float
-        Number of pixels along a line that count as one, as neighbours are alike.
-    width : float [px] standard deviation of the edge's own blur
+        Number of neighbouring pixels that tell as much as one, as they are alike.
+    tells : float
+        Logarithm by which the best place must explain a line better than no contour on it does.
+    alike : float [px] of the contour along which errors are alike: as many measurements count as there are such pieces
     lines : int, contour points, about
+    loss : float [standard deviations] scale of the robust loss
+    search : SearchSettings
     """
 
-    space: str = "lab"
-    levels: int = 16
+    space: Literal["lab", "rgb"] = "lab"
+    levels: int = 24
     anchors: int = 40
     spread: float = 100.0
-    rate: float = 0.1
-    near_rate: float = 0.3
+    rate: float = 0.05
+    near_rate: float = 0.15
     far: float = 0.5
-    most: float = 3.0
+    most: float = 5.0
+    rule: Literal["likelihood", "shift"] = "likelihood"
     half: int = 12
-    fine: float = 8.0
-    heat: float = 3.0
-    width: float = 1.5
+    heat: float = 1.0
+    tells: float = 6.0
+    alike: float = 5.0
     lines: int = 200
-    alike: float = 10.0
-    newton: bool = False
-    tells: float = 3.0
-    loss: float = 3.0
+    loss: float = 2.0
+    search: SearchSettings = field(default_factory=SearchSettings)
 
 
 @lru_cache(maxsize=8)
 def colour_bins(space: str, levels: int) -> tuple[NDArray, int]:
-    """Bin (32768,) of every colour of five bits a channel, and how many bins there are.
+    """Bin (32768,) int32 of every colour of five bits a channel, and how many bins there are.
 
-    In CIELab a and b are binned over the range that sRGB has, so that a bin is about as wide along all three axes.
+    Along each axis bins are as wide as fits `levels` of them into the range that sRGB has there; those that no colour
+    falls into are left out.
     """
     c = np.arange(32768)
     rgb = np.stack([c >> 10, (c >> 5) & 31, c & 31], axis=1).astype(np.float32) * (8 / 255) + np.float32(4 / 255)
@@ -83,43 +119,46 @@ class RegionColours:
     Parameters
     ----------
     inside, near, far : (B,) of the body, of what is near it, of the whole image but the body
-    own : (2, A, B) pixels counted inside and outside near each anchor, older ones weighing less
+    own : (2, A, B) float32 pixels counted inside and outside near each anchor, older ones weighing less
+    images : int, how many went in
     """
 
     inside: NDArray
     near: NDArray
     far: NDArray
     own: NDArray
+    images: int = 1
 
     def blended(self, new: RegionColours, s: RegionSettings) -> RegionColours:
         """With the statistics of a new image."""
+        share = 1.0 / (self.images + 1)
+        body, around = max(s.rate, share), max(s.near_rate, share)
         own = np.empty_like(self.own)
-        for k, rate in enumerate((s.rate, s.near_rate)):
-            np.multiply(self.own[k], 1.0 - rate, out=own[k])
-            own[k] += rate * new.own[k]
+        for k, rate in enumerate((body, around)):
+            np.multiply(self.own[k], np.float32(1.0 - rate), out=own[k])
+            own[k] += np.float32(rate) * new.own[k]
         return RegionColours(
-            (1 - s.rate) * self.inside + s.rate * new.inside, (1 - s.near_rate) * self.near + s.near_rate * new.near,
-            (1 - s.near_rate) * self.far + s.near_rate * new.far, own,
+            (1 - body) * self.inside + body * new.inside, (1 - around) * self.near + around * new.near,
+            (1 - around) * self.far + around * new.far, own, self.images + 1,
         )  # fmt: skip
 
     def ratios(self, s: RegionSettings) -> tuple[NDArray, NDArray]:
         """Log ratios inside to outside: (B,) of the body as a whole, and (A, B) at each anchor, float32."""
-        n = len(self.inside)
         outside = s.far * self.far + (1 - s.far) * self.near
-        whole = _ratio(self.inside, outside, n, s.most)
-        if not len(self.own[0]):
+        whole = _ratio(self.inside, outside, s.most)
+        if not self.own.shape[1]:
             return whole, whole[None]
         parts = []
         for counted, general in zip(self.own, (self.inside, outside)):
-            total = counted.sum(axis=1, keepdims=True)
-            parts.append((counted + np.float32(s.spread) * general.astype(np.float32)) / (total + s.spread))
-        return whole, _ratio(*parts, n, s.most)
+            total = counted.sum(axis=1, keepdims=True) + np.float32(s.spread)
+            parts.append((counted + (s.spread * general).astype(np.float32)) / total)
+        return whole, _ratio(*parts, s.most)
 
 
-def _ratio(inside: NDArray, outside: NDArray, n: int, most: float) -> NDArray:
-    floor = np.float32(_FLOOR / n)
-    out = np.log((inside.astype(np.float32) + floor) / (outside.astype(np.float32) + floor))
-    return np.ascontiguousarray(np.clip(out, -most, most), np.float32)
+def _ratio(inside: NDArray, outside: NDArray, most: float) -> NDArray:
+    floor = np.float32(_FLOOR / inside.shape[-1])
+    out = (inside.astype(np.float32, copy=False) + floor) / (outside.astype(np.float32, copy=False) + floor)
+    return np.ascontiguousarray(np.clip(np.log(out, out=out), -most, most, out=out))
 
 
 def normalised(counts: NDArray) -> NDArray:

@@ -96,7 +96,7 @@ class TrackSettings:
     pixel: float = 4.0
     marker: float = 0.005
     silhouette: float = 4.0
-    region: float = 1.5
+    region: float = 0.5
     line: float = 2.0
     regions: RegionSettings = field(default_factory=RegionSettings)
     outline: int = 320
