@@ -32,13 +32,13 @@ class Window(NamedTuple):
 
     Parameters
     ----------
-    left, top : int [px] of the camera's image
+    left, top : float [px] of the camera's image
     size : (width, height) [px] of the window's own
     scale : float [px] of the window in one of the camera's
     """
 
-    left: int
-    top: int
+    left: float
+    top: float
     size: tuple[int, int]
     scale: float
 
@@ -52,7 +52,7 @@ class Window(NamedTuple):
         margin = math.ceil(_MARGIN / scale)
         wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
         size = math.ceil(wide / _CELL) * _CELL, math.ceil(high / _CELL) * _CELL
-        return cls(math.floor(left - margin), math.floor(top - margin), size, scale)
+        return cls(float(math.floor(left - margin)), float(math.floor(top - margin)), size, scale)
 
 
 class Triangles(Protocol):
@@ -123,6 +123,8 @@ class RimFinder:
         self._kind = np.empty(_ROOM, np.int8)
         self._canvases: dict[tuple[int, int], Canvas] = {}
         self._last: tuple[Camera, NDArray, Raster, Window] | None = None
+        #: the part of the image that was drawn last, moved with the body since then
+        self.window = Window(0.0, 0.0, (0, 0), 1.0)
 
     @cached_property
     def _edges(self) -> tuple[NDArray, NDArray]:
@@ -141,12 +143,6 @@ class RimFinder:
         return self._canvases[camera.size].face
 
     @property
-    def window(self) -> Window:
-        """The part of the image that was drawn last."""
-        assert self._last is not None
-        return self._last[3]
-
-    @property
     def face(self) -> NDArray:
         """(h, w) int32 triangle of every pixel of the window that was drawn last, -1 for none."""
         assert self._last is not None
@@ -162,17 +158,21 @@ class RimFinder:
         ----------
         inner : whether outlines of one part before another are wanted, which silhouettes do not show.
         stale : float [px]
-            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn.
+            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn;
+            with `close`, than all of them together.
         close : int [px], optional
             Only the part of the image that the body fills is drawn, so many pixels wide at most; see `window`.
         """
         x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
-        last = self._last
-        if last is not None and last[0] is camera and stale > 0.0 and kernels.shift(uv, last[1], stale) <= stale:
-            drawn, w = last[2:]
+        last, moved = self._last, np.inf
+        if last is not None and last[0] is camera and stale > 0.0:
+            du, dv, moved = kernels.shift(uv, last[1], close is not None)
+        if last is not None and moved <= stale:
+            drawn, w = last[2], last[3]._replace(left=last[3].left + du, top=last[3].top + dv)
+            self.window = w
         else:
-            w = Window(0, 0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
+            w = Window(0.0, 0.0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
             if w.size not in self._canvases:
                 self._canvases[w.size] = Canvas(w.size)
             canvas = self._canvases[w.size]
@@ -180,6 +180,7 @@ class RimFinder:
             cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
             drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
             self._last = camera, uv, drawn, w
+            self.window = w
         if close is not None:
             uv = (uv + (0.5 - w.left, 0.5 - w.top)) * w.scale - 0.5
         edges, sides = self._edges

@@ -115,8 +115,9 @@ class FrameFit:
         return self._settled(scene, held, measurements) if settled else self._renewed(scene, held, measurements)
 
     def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
-        """Where nearest points take part: one step under each match."""
-        s, reach, iterations = self.settings, self.settings.far, 0
+        """Where nearest points take part: one step under each match, within a distance that shrinks to `near`."""
+        s, iterations = self.settings, 0
+        reach = float(np.clip(max((m.within for m in measurements if not m.settled)), s.near, s.far))
         while iterations < s.iterations:
             iterations += 1
             matched = _match(scene, measurements, reach)
@@ -177,7 +178,8 @@ class FrameFit:
         parts = rows_of(scene, matched, self.settings, without=without)
         if held is not None:
             parts.append(belief(scene.state, *held))
-        parts.append(prior_rows(self.body, scene.state))
+        if len(scene.state.angles):
+            parts.append(prior_rows(self.body, scene.state))
         return [*parts, *self.apart(scene)] if apart else parts
 
     def apart(self, scene: Scene) -> list[AnyRows]:

@@ -150,11 +150,13 @@ class Measurement(ABC):
     time : float [s]
     settled : whether a match depends on the state only in what is discrete (labels, sides), so that the fit may go to
         its minimum under one match. False for nearest points, which are sought anew at every step.
+    within : float [m] how far at most the body is from where it is expected, as far as the sensor knows
     """
 
     sensor: str
     time: float
     settled: bool = True
+    within: float = np.inf
 
     @abstractmethod
     def match(self, scene: Scene, reach: float) -> Matched:

@@ -33,7 +33,7 @@ class Coloured:
     ratio: NDArray
 
     def profiles(
-        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, int, int, float], half: int, step: int,
+        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
         guard: float,
     ) -> NDArray:  # fmt: skip
         """(N, 2 half) log ratios along the normals of a contour (4, N); see `kernels.profiles`."""
@@ -66,7 +66,7 @@ class Kept(Coloured):
         return out
 
     def profiles(
-        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, int, int, float], half: int, step: int,
+        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
         guard: float,
     ) -> NDArray:  # fmt: skip
         """As of the image, within the band; beyond it nothing is told."""

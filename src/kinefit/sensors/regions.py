@@ -137,7 +137,9 @@ class RegionMeasurement(Measurement):
         self.seen: Coloured | None = None
         self.whole: NDArray | None = None
         self.reach, self._spacing = of.reach, 0.0
-        self._expected = self._few(scene)
+        camera = scene.placed(of.camera)
+        self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
+        self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
 
     def _few(self, scene: Scene) -> NDArray:
@@ -162,7 +164,7 @@ class RegionMeasurement(Measurement):
             self._last = vertices, camera, rim
         return self._last[2]
 
-    def _drawn(self, scene: Scene) -> tuple[NDArray, int, int, float]:
+    def _drawn(self, scene: Scene) -> tuple[NDArray, float, float, float]:
         """The body as it was drawn last: its faces, and where they are in the image; see `kernels.count`."""
         finder = scene.surface.rims(scene.placed(self.of.camera))
         w = finder.window
