@@ -14,6 +14,8 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit._kernels_rendering import rasterise
 
+UNKNOWN = 1e6  # in a table of log ratios
+
 
 @jit
 def _colour(image, j, i):
@@ -23,19 +25,19 @@ def _colour(image, j, i):
 
 @jit
 def count(image, bins, face, left, top, scale, box, inside, near, far):
-    """Add pixels of an image (H, W, 3) uint8 to the histograms (B,) of inside, near and far outside: one in four.
+    """Add pixels of an image (H, W, 3) uint8 to the histograms (B,) of inside, near and far outside: one in nine.
 
     face (h, w) is the body as drawn in a window of the image, -1 where it is not: pixel (x, y) of the image lies at
     ((x - left + 0.5) scale, (y - top + 0.5) scale). Pixels at its edge count for neither. box: left, top, right, bottom
-    [px] of what is near; of what is far one pixel in sixteen is looked at.
+    [px] of what is near; of what is far one pixel in 36 is looked at.
     """
     height, width = image.shape[:2]
-    for y in range(0, height, 4):
-        for x in range(0, width, 4):
+    for y in range(0, height, 6):
+        for x in range(0, width, 6):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
                 far[bins[_colour(image, y, x)]] += 1.0
-    for y in range(max(box[1], 0), min(box[3], height), 2):
-        for x in range(max(box[0], 0), min(box[2], width), 2):
+    for y in range(max(box[1], 0), min(box[3], height), 3):
+        for x in range(max(box[0], 0), min(box[2], width), 3):
             here = _drawn(face, x, y, left, top, scale)
             if (
                 _drawn(face, x - 2, y, left, top, scale) == here and _drawn(face, x + 2, y, left, top, scale) == here
@@ -48,15 +50,15 @@ def count(image, bins, face, left, top, scale, box, inside, near, far):
 
 
 @jit
-def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, inside, outside):
-    """Add the pixels along the normals of a contour (4, N) to the histograms (A, B) of its points' anchors (N,).
+def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, weight, own):
+    """Add the pixels along the normals of a contour (4, N) to the histograms own (2, A, B) of its points' anchors (N,).
 
-    reach [px] to either side; the pixel next to the contour counts for neither. face, left, top, scale as of `count`.
+    weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for neither. face, left, top, scale as of `count`.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
         u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
-        own = anchor[p]
+        a_ = anchor[p]
         for side in range(2):
             sign = 1.0 if side else -1.0
             for k in range(2, reach + 2):
@@ -67,10 +69,7 @@ def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, ins
                 if _drawn(face, x, y, left, top, scale) == (side == 1):
                     break
                 bin_ = bins[_colour(image, j, i)]
-                if side:
-                    outside[own, bin_] += 1.0
-                else:
-                    inside[own, bin_] += 1.0
+                own[side, a_, bin_] += weight[side]
 
 
 @jit
@@ -81,22 +80,40 @@ def _drawn(face, x, y, left, top, scale):
 
 
 @jit
-def profiles(image, bins, ratio, anchor, contour, face, left, top, scale, half, step, guard, out):
+def look_up(image, bins, table, own, total, general, floor, most, anchor, contour, reach):
+    """Find the log ratios of all colours within `reach` [px] of a contour that are UNKNOWN yet; see `profiles`."""
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, x, y, a = contour[0, p], contour[1, p], contour[2, p], contour[3, p], anchor[p]
+        for k in range(-reach, reach):
+            i, j = math.floor(u + (k + 0.5) * x + 0.5), math.floor(v + (k + 0.5) * y + 0.5)
+            if not (0 <= i < width and 0 <= j < height):
+                continue
+            b = bins[_colour(image, j, i)]
+            if table[a, b] == UNKNOWN:
+                inside = (own[0, a, b] + general[0, b]) / total[0, a] + floor
+                told = math.log(inside / ((own[1, a, b] + general[1, b]) / total[1, a] + floor))
+                table[a, b] = most if told > most else -most if told < -most else told
+
+
+@jit
+def profiles(image, bins, table, anchor, contour, face, left, top, scale, half, step, guard, out):
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 
-    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. ratio (A, B), of which a
-    point has the row of its anchor (N,). face (h, w) is the body as drawn, see `count`: where a line has left the body
+    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log ratios,
+    of which a point has the row of its anchor (N,); `look_up` finds them from own (2, A, B) pixels counted near each
+    anchor, together with general (2, B), both divided by total (2, A), a floor added, between -most and most. face (h, w) is the body as drawn, see `count`: where a line has left the body
     on its other side, or met it again, it tells nothing any more (0); `guard` [px] about the contour always tell.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
         u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
-        own = anchor[p]
+        a_ = anchor[p]
         for side in range(2):
             ended = False
             for q in range(half):
                 k = half + q if side else half - 1 - q
-                total = 0.0
+                told = 0.0
                 if not ended:
                     for r in range(step):
                         s = (k - half) * step + r + 0.5
@@ -108,8 +125,8 @@ def profiles(image, bins, ratio, anchor, contour, face, left, top, scale, half, 
                         if abs(s) > guard and _drawn(face, x, y, left, top, scale) == (side == 1):
                             ended = True
                             break
-                        total += ratio[own, bins[_colour(image, j, i)]]
-                out[p, k] = total
+                        told += table[a_, bins[_colour(image, j, i)]]
+                out[p, k] = told
 
 
 @jit

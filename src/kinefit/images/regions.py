@@ -6,6 +6,7 @@ light may change. A pixel of colour c speaks for the body by log p₁(c) / p₂(
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
@@ -13,6 +14,8 @@ from typing import Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from kinefit.images._kernels_regions import UNKNOWN
 
 _FLOOR = 0.02  # share of both densities that is even over all colours: paint that was not seen yet, noise, reflections
 
@@ -90,7 +93,7 @@ class RegionSettings:
     half: int = 12
     heat: float = 1.0
     tells: float = 6.0
-    alike: float = 5.0
+    alike: float = 20.0
     lines: int = 200
     loss: float = 2.0
     search: SearchSettings = field(default_factory=SearchSettings)
@@ -129,39 +132,76 @@ class RegionColours:
     own: NDArray
     images: int = 1
 
-    def blended(self, new: RegionColours, s: RegionSettings) -> RegionColours:
-        """With the statistics of a new image."""
+    def blended(self, inside: NDArray, near: NDArray, far: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
+        """With the pixels (B,) counted in a new image, and those that `lines` counts near the anchors."""
         share = 1.0 / (self.images + 1)
-        body, around = max(s.rate, share), max(s.near_rate, share)
-        own = np.empty_like(self.own)
-        for k, rate in enumerate((body, around)):
-            np.multiply(self.own[k], np.float32(1.0 - rate), out=own[k])
-            own[k] += np.float32(rate) * new.own[k]
-        return RegionColours(
-            (1 - body) * self.inside + body * new.inside, (1 - around) * self.near + around * new.near,
-            (1 - around) * self.far + around * new.far, own, self.images + 1,
-        )  # fmt: skip
+        rates = np.maximum(np.array([s.rate, s.near_rate]), share)
+        own = self.own * (1.0 - rates).astype(np.float32)[:, None, None]
+        if own.shape[1]:
+            lines(rates, own)
+        old, new = (self.inside, self.near, self.far), (inside, near, far)
+        each = [(1 - r) * a + r * _density(b) for r, a, b in zip(rates[[0, 1, 1]], old, new)]
+        return RegionColours(*each, own, self.images + 1)
 
-    def ratios(self, s: RegionSettings) -> tuple[NDArray, NDArray]:
-        """Log ratios inside to outside: (B,) of the body as a whole, and (A, B) at each anchor, float32."""
-        outside = s.far * self.far + (1 - s.far) * self.near
-        whole = _ratio(self.inside, outside, s.most)
-        if not self.own.shape[1]:
-            return whole, whole[None]
-        parts = []
-        for counted, general in zip(self.own, (self.inside, outside)):
-            total = counted.sum(axis=1, keepdims=True) + np.float32(s.spread)
-            parts.append((counted + (s.spread * general).astype(np.float32)) / total)
-        return whole, _ratio(*parts, s.most)
+    @classmethod
+    def none(cls, bins: int, s: RegionSettings) -> RegionColours:
+        """Before the first image."""
+        return cls(*np.zeros((3, bins)), np.zeros((2, s.anchors, bins), np.float32), 0)
 
-
-def _ratio(inside: NDArray, outside: NDArray, most: float) -> NDArray:
-    floor = np.float32(_FLOOR / inside.shape[-1])
-    out = (inside.astype(np.float32, copy=False) + floor) / (outside.astype(np.float32, copy=False) + floor)
-    return np.ascontiguousarray(np.clip(np.log(out, out=out), -most, most, out=out))
+    def ratios(self, s: RegionSettings) -> Ratios:
+        """Log ratios inside to outside."""
+        n, outside = len(self.inside), s.far * self.far + (1 - s.far) * self.near
+        floor, general = _FLOOR / n, np.stack([self.inside, outside])
+        told = np.log((general[0] + floor) / (general[1] + floor))
+        whole = np.ascontiguousarray(np.clip(told, -s.most, s.most), np.float32)
+        if not s.anchors:
+            return Ratios(whole, whole[None], np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), general, floor, s.most)
+        table = np.full(self.own.shape[1:], UNKNOWN, np.float32)
+        total = self.own.sum(axis=2).astype(float) + s.spread
+        return Ratios(whole, table, self.own, total, s.spread * general, floor, s.most)
 
 
-def normalised(counts: NDArray) -> NDArray:
+CountLines = Callable[[NDArray, NDArray], None]
+"""(2,) weights of a pixel inside and outside, (2, A, B) histograms that it is added to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ratios:
+    """Log ratios of the densities inside and outside, each found when it is first looked up; see `kernels.profiles`.
+
+    Parameters
+    ----------
+    whole : (B,) float32 of the body as a whole
+    table : (A, B) float32 at each anchor, UNKNOWN where it was not asked for yet
+    own, total, general, floor, most : what they are found from
+    """
+
+    whole: NDArray
+    table: NDArray
+    own: NDArray
+    total: NDArray
+    general: NDArray
+    floor: float
+    most: float
+
+    @property
+    def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, float, float]:
+        """As kernels take them."""
+        return self.table, self.own, self.total, self.general, self.floor, self.most
+
+    def at(self, anchor: NDArray, bins: NDArray) -> NDArray:
+        """(N,) of bins (N,) at anchors (N,)."""
+        inside, outside = ((self.own[k, anchor, bins] + self.general[k, bins]) / self.total[k, anchor] for k in (0, 1))
+        return np.clip(np.log((inside + self.floor) / (outside + self.floor)), -self.most, self.most)
+
+    @classmethod
+    def of_table(cls, table: NDArray) -> Ratios:
+        """Of a table (1, B) in which all is known."""
+        none = np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), np.zeros((2, table.shape[1]))
+        return cls(table[0], table, *none, 0.0, 0.0)
+
+
+def _density(counts: NDArray) -> NDArray:
     """Counts (B,) as a density; even where nothing was counted."""
     total = counts.sum()
     return counts / total if total > 0 else np.full(len(counts), 1.0 / len(counts))

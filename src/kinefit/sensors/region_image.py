@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images import _kernels_regions as kernels
+from kinefit.images.regions import Ratios
 
 _LEVELS = 127  # of a log ratio that is kept, to either side of 0
 # A map that is kept is drawn as an image whose colours are numbers of levels, so that one kernel looks at both.
@@ -25,12 +26,12 @@ class Coloured:
     ----------
     image : (H, W, 3) uint8 RGB
     bins : (32768,) int32, see `colour_bins`
-    ratio : (A, B) float32
+    ratios : Ratios
     """
 
     image: NDArray
     bins: NDArray
-    ratio: NDArray
+    ratios: Ratios
 
     def profiles(
         self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
@@ -38,7 +39,8 @@ class Coloured:
     ) -> NDArray:  # fmt: skip
         """(N, 2 half) log ratios along the normals of a contour (4, N); see `kernels.profiles`."""
         out = np.empty((outline.shape[1], 2 * half))
-        kernels.profiles(self.image, self.bins, self.ratio, anchor, outline, *drawn, half, step, guard, out)
+        kernels.look_up(self.image, self.bins, *self.ratios.packed, anchor, outline, half * step)
+        kernels.profiles(self.image, self.bins, self.ratios.table, anchor, outline, *drawn, half, step, guard, out)
         return out
 
 
@@ -74,7 +76,7 @@ class Kept(Coloured):
         moved = np.array(outline)
         moved[:2] -= np.array([[self.left], [self.top]])
         kernels.profiles(
-            self._painted, self.bins, self.ratio, np.zeros_like(anchor), moved, face, left - self.left,
+            self._painted, self.bins, self.ratios.table, np.zeros_like(anchor), moved, face, left - self.left,
             top - self.top, scale, half, step, guard, out,
         )  # fmt: skip
         return out
@@ -91,7 +93,7 @@ def kept(seen: Coloured, outline: NDArray, anchor: NDArray, reach: int, most: fl
     height, width = seen.image.shape[:2]
     uv = np.rint(outline[:2]).astype(np.int64)
     inside = (uv[0] >= 0) & (uv[0] < width) & (uv[1] >= 0) & (uv[1] < height)
-    levels = ((np.arange(256) - _LEVELS) * (most / _LEVELS)).astype(np.float32)[None]
+    levels = Ratios.of_table(((np.arange(256) - _LEVELS) * (most / _LEVELS)).astype(np.float32)[None])
     none = np.zeros((1, 1, 3), np.uint8)
     if not inside.any():
         return Kept(none, _PALETTE, levels, zlib.compress(bytes([_LEVELS])), (1, 1), 0, 0)
@@ -104,6 +106,8 @@ def kept(seen: Coloured, outline: NDArray, anchor: NDArray, reach: int, most: fl
     of = np.zeros(int(label.max()) + 1, np.int64)
     of[label[v - top, u - left]] = anchor
     colour = ((crop[..., 0] >> 3) << 10) | ((crop[..., 1] >> 3) << 5) | (crop[..., 2] >> 3)
-    value = np.where(distance <= reach, seen.ratio[of[label], seen.bins[colour]], 0.0)
+    value = np.zeros(crop.shape[:2])
+    j, i = np.nonzero(distance <= reach)
+    value[j, i] = seen.ratios.at(of[label[j, i]], seen.bins[colour[j, i]])
     packed = np.rint(value * (_LEVELS / most) + _LEVELS).astype(np.uint8)
     return Kept(none, _PALETTE, levels, zlib.compress(packed.tobytes(), 1), packed.shape, left, top)

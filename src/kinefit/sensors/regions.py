@@ -23,7 +23,7 @@ from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
-from kinefit.images.regions import RegionColours, colour_bins, normalised
+from kinefit.images.regions import Ratios, RegionColours, colour_bins
 from kinefit.losses import Loss, geman_mcclure
 from kinefit.observations import ColourFrame
 from kinefit.rows import AnyRows, Rows
@@ -34,7 +34,7 @@ from kinefit.sensors.region_search import Seeker, region_starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
-_ANYWHERE = 1e4  # [px]
+_WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
 _GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a state may be off its drawing
@@ -59,9 +59,9 @@ class RegionSensor(Sensor):
         self.name, self.camera, self.sigma = f"region {camera.name}", camera, sigma
         self.settings, self.regions = settings, settings.regions
         self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
-        self.colours: RegionColours | None = None
-        self.ratios: tuple[NDArray, NDArray] | None = None
-        self.reach = _ANYWHERE  # [px] how far from where it is expected the contour may be
+        self.colours = RegionColours.none(self.count, self.regions)
+        self.ratios: Ratios | None = None
+        self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._anchors: NDArray | None = None
         self._seeker: Seeker | None = None
 
@@ -92,25 +92,26 @@ class RegionSensor(Sensor):
             problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
             raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
         m = RegionMeasurement(self, frame, scene)
-        if self.colours is None:
-            self._know(m.counted(scene))
+        if self.ratios is None:
+            self._know(m, scene)
         assert self.ratios is not None
-        m.whole, m.seen = self.ratios[0], Coloured(frame.image, self.bins, self.ratios[1])
+        m.seen = Coloured(frame.image, self.bins, self.ratios)
         return m
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
         """Blend in the colours of a step in which the body was found; and how far it was from where it was expected."""
-        if not isinstance(measurement, RegionMeasurement) or self.colours is None:
+        if not isinstance(measurement, RegionMeasurement):
             return
         if not sure:
-            self.reach = _ANYWHERE
+            self.reach = _WIDE
             return
         off = 2.0 * measurement.off(scene)
-        self.reach = off if self.reach >= _ANYWHERE else max(off, 0.7 * self.reach)
-        self._know(self.colours.blended(measurement.counted(scene), self.regions))
+        self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
+        self._know(measurement, scene)
 
-    def _know(self, colours: RegionColours) -> None:
-        self.colours, self.ratios = colours, colours.ratios(self.regions)
+    def _know(self, measurement: RegionMeasurement, scene: Scene) -> None:
+        self.colours = measurement.counted(scene, self.colours)
+        self.ratios = self.colours.ratios(self.regions)
 
 
 class RegionMeasurement(Measurement):
@@ -126,7 +127,6 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
-    whole : (B,) log ratios of the body as a whole
     """
 
     settled = False
@@ -135,7 +135,6 @@ class RegionMeasurement(Measurement):
         self.sensor, self.time, self.of = of.name, frame.time, of
         self.image: NDArray | None = frame.image
         self.seen: Coloured | None = None
-        self.whole: NDArray | None = None
         self.reach, self._spacing = of.reach, 0.0
         camera = scene.placed(of.camera)
         self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
@@ -176,18 +175,22 @@ class RegionMeasurement(Measurement):
             return np.zeros(len(rim), np.int64)
         return self.of.anchors(scene)[rim.vertices[:, 0]]
 
-    def counted(self, scene: Scene) -> RegionColours:
-        """The colours of this image with the body where a scene has it."""
-        of, s, rim = self.of, self.of.regions, self.rim(scene)
-        counts, own = np.zeros((3, of.count)), np.zeros((2, s.anchors, of.count), np.float32)
-        if len(rim) and self.image is not None:
-            low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
-            margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
-            box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
-            kernels.count(self.image, of.bins, *drawn, box, *counts)
-            if s.anchors:
-                kernels.count_lines(self.image, of.bins, rim.outline, self._anchor(scene, rim), s.half, *drawn, *own)
-        return RegionColours(*(normalised(c) for c in counts), own)
+    def counted(self, scene: Scene, before: RegionColours) -> RegionColours:
+        """What is known of colours, with those of this image, the body being where a scene has it."""
+        of, s, rim, image = self.of, self.of.regions, self.rim(scene), self.image
+        if not len(rim) or image is None:
+            return before
+        low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
+        margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
+        box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
+        counts = np.zeros((3, of.count))
+        kernels.count(image, of.bins, *drawn, box, *counts)
+
+        def lines(weight: NDArray, own: NDArray) -> None:
+            anchor = self._anchor(scene, rim)
+            kernels.count_lines(image, of.bins, rim.outline, anchor, s.half, *drawn, weight, own)
+
+        return before.blended(*counts, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
         """(N, 2 half) log ratios along the normals of a contour, in samples of `step` pixels."""
@@ -213,10 +216,10 @@ class RegionMeasurement(Measurement):
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
         """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
-        if self.image is None or self.whole is None or not self.of.settings.search:
+        if self.image is None or self.seen is None or not self.of.settings.search:
             return ()
         return region_starts(
-            scene, scene.placed(self.of.camera), self.of.seeker(scene), self.image, self.of.bins, self.whole,
+            scene, scene.placed(self.of.camera), self.of.seeker(scene), self.image, self.of.bins, self.seen.ratios.whole,
             information, told, self.of.regions.search,
         )  # fmt: skip
 
@@ -243,7 +246,7 @@ class RegionMeasurement(Measurement):
             if self.of.regions.anchors and self.of._anchors is not None:
                 anchor = self.of._anchors[rim.vertices[:, 0]]
             out.seen = kept(self.seen, rim.outline, anchor, _JUDGED * self.of.regions.half, self.of.regions.most)
-        out.image, out.whole, out._last = None, None, None
+        out.image, out._last = None, None
         return out
 
     def __getstate__(self) -> dict[str, Any]:
