@@ -13,11 +13,13 @@ from kinefit.observations import ColourFrame
 from kinefit.tracking.tracker import Tracker
 
 SEED = 2
-FRAMES = amount(60, 9)
+FRAMES = amount(40, 9)
 GOALS = {1: ">= 95", 2: ">= 92", 3: ">= 88", 4: ">= 83"}
 
 
-def follow(seq: Sequence, every: int, *, resets: bool = True) -> tuple[list[bool], list[tuple[float, float]], list[bool]]:
+def follow(
+    seq: Sequence, every: int, *, resets: bool = True
+) -> tuple[list[bool], list[tuple[float, float]], list[bool]]:
     """Of every so many images: whether it is right, how far it is off [mm], [deg], whether it is said to be lost."""
     tracker = Tracker(seq.body, seq.rig, rate=RATE / every)
     tracker.start_at(state_of(seq.truth[0]))
@@ -55,9 +57,8 @@ def run() -> None:
         right = np.concatenate([r for _, r, _ in told[every]])
         off = np.concatenate([o for _, _, o in told[every]])
         figure(f"rendered objects, step {every}: right, reset after a loss", 100 * float(right.mean()), "%", goal)
-        kinds = ", ".join(
-            f"{kind} {100 * np.mean(np.concatenate([r for k, r, _ in told[every] if k == kind])):.0f} %" for kind in KINDS
-        )
-        print(f"  {kinds}; median {np.median(off[:, 0]):.1f} mm, {np.median(off[:, 1]):.2f} deg of {len(right)} images")
-    print(f"# step 4 without resets: {wrong} images are wrong by 5 cm or 15 degrees, {unsaid} of them are not said to be "
-          f"lost; of {count} right ones {alarms} are")  # fmt: skip
+        shares = {kind: np.mean(np.concatenate([r for k, r, _ in told[every] if k == kind])) for kind in KINDS}
+        print("  " + ", ".join(f"{kind} {100 * share:.0f} %" for kind, share in shares.items()))
+        print(f"  median {np.median(off[:, 0]):.1f} mm, {np.median(off[:, 1]):.2f} deg of {len(right)} images")
+    print(f"# step 4, no resets: {wrong} images are wrong by 5 cm or 15 degrees, {unsaid} of these not said to be lost")
+    print(f"  of {count} right ones {alarms} are said to be lost")

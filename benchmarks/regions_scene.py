@@ -62,10 +62,11 @@ def rigid(name: str, vertices: NDArray, faces: NDArray) -> Body:
     tree = KinematicTree((name,), np.array([-1]), np.zeros((1, 3)), (), none, np.zeros((0, 3)), none, none, none, none,
                          none)  # fmt: skip
     points = PointSet(("middle",), np.zeros(1, int), np.zeros((1, 3)))
-    return Body(name, tree, ("free",), ("whole",), np.zeros(1, int), points, surfaces=(MeshSurface(0, vertices, faces),))
+    surface = MeshSurface(0, vertices, faces)
+    return Body(name, tree, ("free",), ("whole",), np.zeros(1, int), points, surfaces=(surface,))
 
 
-def _ball(at: NDArray, half: NDArray, turn: NDArray = np.zeros(3), power: float = 1.0) -> tuple[NDArray, NDArray]:
+def _ball(at: NDArray, half: NDArray, turn: NDArray, power: float) -> tuple[NDArray, NDArray]:
     """A closed superquadric about a place: half axes [m], rotation vector, power 1 for an ellipsoid, less for a box."""
     a, b = np.linspace(-np.pi / 2, np.pi / 2, 17)[1:-1], np.linspace(0, 2 * np.pi, 28, endpoint=False)
 
@@ -146,7 +147,8 @@ def thing(name: str) -> Thing:
     x, f, c = np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3))
     for at, half, turn, power, colour in parts:
         v, t = _ball(np.array(at), np.array(half), np.array(turn), power)
-        x, f, c = np.concatenate([x, v]), np.concatenate([f, t + len(x)]), np.concatenate([c, np.tile(colour, (len(t), 1))])
+        x, f = np.concatenate([x, v]), np.concatenate([f, t + len(x)])
+        c = np.concatenate([c, np.tile(colour, (len(t), 1))])
     x = x - x.mean(axis=0)
     return Thing(rigid(name, x, f), x, f, c, grain)
 
@@ -162,7 +164,7 @@ def motion(frames: int, random: np.random.Generator) -> NDArray:
     out[:, :3, 3] = (0.0, 0.0, _FAR)
     R0 = se3.exp_so3(random.uniform(-1.5, 1.5, 3))
     turn, shift = np.zeros((frames, 3)), np.zeros((frames, 3))
-    for k in range(4):
+    for _ in range(4):
         period, phase = random.uniform(25, 90, 6), random.uniform(0, 2 * np.pi, 6)
         waves = np.sin(2 * np.pi * t[:, None] / period + phase) * period / (2 * np.pi)
         turn += waves[:, :3] * random.normal(0, 1, 3)
@@ -178,7 +180,7 @@ def motion(frames: int, random: np.random.Generator) -> NDArray:
 
 @cache
 def plates() -> tuple[NDArray, ...]:
-    """Photographs of real clutter (H, W, 3) in 0..1, each larger than an image; patches of colour where there are none."""
+    """Photographs of real clutter (H, W, 3) in 0..1, larger than an image; patches of colour where there are none."""
     out = []
     folder = data("region_cat")
     if folder is not None:

@@ -117,7 +117,7 @@ class FrameFit:
     def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
         """Where nearest points take part: one step under each match, within a distance that shrinks to `near`."""
         s, iterations = self.settings, 0
-        reach = float(np.clip(max((m.within for m in measurements if not m.settled)), s.near, s.far))
+        reach = float(np.clip(max(m.within for m in measurements if not m.settled), s.near, s.far))
         while iterations < s.iterations:
             iterations += 1
             matched = _match(scene, measurements, reach)

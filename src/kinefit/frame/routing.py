@@ -43,7 +43,8 @@ class Sensors:
     rig : Rig
     rate : float [Hz] of the frames
     sigma : {sensor: standard deviation}
-        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes and regions as "silhouette CAMERA" and "region CAMERA".
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA",
+        of regions as "region CAMERA".
     settings : TrackSettings
     own : sensors of one's own
     on_body : depth cameras whose images show nothing but the body: no background is learnt

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-
 import numpy as np
 
 from kinefit._jit import jit
@@ -39,21 +38,22 @@ def count(image, bins, face, left, top, scale, box, inside, near, far):
     for y in range(max(box[1], 0), min(box[3], height), 3):
         for x in range(max(box[0], 0), min(box[2], width), 3):
             here = _drawn(face, x, y, left, top, scale)
-            if (
-                _drawn(face, x - 2, y, left, top, scale) == here and _drawn(face, x + 2, y, left, top, scale) == here
-                and _drawn(face, x, y - 2, left, top, scale) == here and _drawn(face, x, y + 2, left, top, scale) == here
-            ):  # fmt: skip
-                if here:
-                    inside[bins[_colour(image, y, x)]] += 1.0
-                else:
-                    near[bins[_colour(image, y, x)]] += 1.0
+            if _drawn(face, x - 2, y, left, top, scale) != here or _drawn(face, x + 2, y, left, top, scale) != here:
+                continue
+            if _drawn(face, x, y - 2, left, top, scale) != here or _drawn(face, x, y + 2, left, top, scale) != here:
+                continue
+            if here:
+                inside[bins[_colour(image, y, x)]] += 1.0
+            else:
+                near[bins[_colour(image, y, x)]] += 1.0
 
 
 @jit
 def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, weight, own):
     """Add the pixels along the normals of a contour (4, N) to the histograms own (2, A, B) of its points' anchors (N,).
 
-    weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for neither. face, left, top, scale as of `count`.
+    weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for
+    neither. face, left, top, scale as of `count`.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -81,7 +81,11 @@ def _drawn(face, x, y, left, top, scale):
 
 @jit
 def look_up(image, bins, table, own, total, general, floor, most, anchor, contour, reach):
-    """Find the log ratios of all colours within `reach` [px] of a contour that are UNKNOWN yet; see `profiles`."""
+    """Find the log ratios of all colours within `reach` [px] of a contour (4, N) that are UNKNOWN in a table (A, B).
+
+    own (2, A, B) pixels counted inside and outside near each anchor, general (2, B) of the body as a whole, both
+    divided by total (2, A); to both densities `floor` is added; ratios lie between -most and most.
+    """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
         u, v, x, y, a = contour[0, p], contour[1, p], contour[2, p], contour[3, p], anchor[p]
@@ -100,10 +104,10 @@ def look_up(image, bins, table, own, total, general, floor, most, anchor, contou
 def profiles(image, bins, table, anchor, contour, face, left, top, scale, half, step, guard, out):
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 
-    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log ratios,
-    of which a point has the row of its anchor (N,); `look_up` finds them from own (2, A, B) pixels counted near each
-    anchor, together with general (2, B), both divided by total (2, A), a floor added, between -most and most. face (h, w) is the body as drawn, see `count`: where a line has left the body
-    on its other side, or met it again, it tells nothing any more (0); `guard` [px] about the contour always tell.
+    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log
+    ratios, of which a point has the row of its anchor (N,); `look_up` must have found them. face (h, w) is the body as
+    drawn, see `count`: where a line has left the body on its other side, or met it again, it tells nothing any more
+    (0); `guard` [px] about the contour always tell.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -161,8 +165,10 @@ def places(lines, step, heat, out):
 
 @jit
 def shifts(lines, step, out):
-    """The paper's rule on the same lines: out (2, N), a step outwards [px] where both pixels at the contour look like
-    the body, inwards where they do not, none where they tell nothing; and its variance, that of a step.
+    """The paper's rule on the same lines: out (2, N), by how much a point of the contour is shifted, and the variance.
+
+    One step [px] outwards where the samples on both sides of it together look like the body, inwards where they do not,
+    none where they tell nothing; the variance is that of a step.
     """
     half = lines.shape[1] // 2
     for p in range(lines.shape[0]):

@@ -132,21 +132,22 @@ class RegionColours:
     own: NDArray
     images: int = 1
 
-    def blended(self, inside: NDArray, near: NDArray, far: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
-        """With the pixels (B,) counted in a new image, and those that `lines` counts near the anchors."""
+    def blended(self, counts: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
+        """With the pixels (3, B) counted in a new image, and those that `lines` counts near the anchors."""
         share = 1.0 / (self.images + 1)
         rates = np.maximum(np.array([s.rate, s.near_rate]), share)
         own = self.own * (1.0 - rates).astype(np.float32)[:, None, None]
         if own.shape[1]:
             lines(rates, own)
-        old, new = (self.inside, self.near, self.far), (inside, near, far)
-        each = [(1 - r) * a + r * _density(b) for r, a, b in zip(rates[[0, 1, 1]], old, new)]
-        return RegionColours(*each, own, self.images + 1)
+        old = self.inside, self.near, self.far
+        body, near, far = ((1 - r) * a + r * _density(b) for r, a, b in zip(rates[[0, 1, 1]], old, counts))
+        return RegionColours(body, near, far, own, self.images + 1)
 
     @classmethod
     def none(cls, bins: int, s: RegionSettings) -> RegionColours:
         """Before the first image."""
-        return cls(*np.zeros((3, bins)), np.zeros((2, s.anchors, bins), np.float32), 0)
+        none = np.zeros(bins)
+        return cls(none, none, none, np.zeros((2, s.anchors, bins), np.float32), 0)
 
     def ratios(self, s: RegionSettings) -> Ratios:
         """Log ratios inside to outside."""

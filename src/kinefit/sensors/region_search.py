@@ -7,6 +7,7 @@ with the map; the best of them are improved by drawing poses at random around th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import cv2
@@ -160,7 +161,9 @@ def seek(
     return np.asarray(poses(np.array([p for p, _ in ends[: s.starts]])) @ back)
 
 
-def _improved(value, p: NDArray, best: float, width: NDArray, s: SearchSettings) -> tuple[NDArray, float]:
+def _improved(
+    value: Callable[[NDArray], NDArray], p: NDArray, best: float, width: NDArray, s: SearchSettings
+) -> tuple[NDArray, float]:
     """The best of some poses drawn around one (6,), closer and closer, and its worth."""
     draws = _draws(s.draws, 6)
     for _ in range(s.rounds):

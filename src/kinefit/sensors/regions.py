@@ -190,7 +190,7 @@ class RegionMeasurement(Measurement):
             anchor = self._anchor(scene, rim)
             kernels.count_lines(image, of.bins, rim.outline, anchor, s.half, *drawn, weight, own)
 
-        return before.blended(*counts, lines, s)
+        return before.blended(counts, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
         """(N, 2 half) log ratios along the normals of a contour, in samples of `step` pixels."""
@@ -216,11 +216,12 @@ class RegionMeasurement(Measurement):
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
         """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
-        if self.image is None or self.seen is None or not self.of.settings.search:
+        of, seen = self.of, self.seen
+        if self.image is None or seen is None or not of.settings.search:
             return ()
         return region_starts(
-            scene, scene.placed(self.of.camera), self.of.seeker(scene), self.image, self.of.bins, self.seen.ratios.whole,
-            information, told, self.of.regions.search,
+            scene, scene.placed(of.camera), of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
+            of.regions.search,
         )  # fmt: skip
 
     def evidence(self, scene: Scene) -> Evidence:
