@@ -96,7 +96,7 @@ class Rim:
         s = self.share[:, None]
         return np.asarray((1.0 - s) * vertices[self.vertices[:, 0]] + s * vertices[self.vertices[:, 1]])
 
-    def chosen(self, which: NDArray | slice) -> Rim:
+    def chosen(self, which: NDArray) -> Rim:
         """Some of the points."""
         return Rim(
             np.ascontiguousarray(self.outline[:, which]), self.vertices[which], self.share[which], self.segment[which],
