@@ -82,7 +82,7 @@ class RegionSettings:
     """
 
     space: Literal["lab", "rgb"] = "lab"
-    levels: int = 24
+    levels: int = 20
     anchors: int = 40
     spread: float = 100.0
     rate: float = 0.05
@@ -93,7 +93,7 @@ class RegionSettings:
     half: int = 12
     heat: float = 1.0
     tells: float = 6.0
-    alike: float = 20.0
+    alike: float = 10.0
     lines: int = 200
     loss: float = 2.0
     search: SearchSettings = field(default_factory=SearchSettings)

@@ -159,7 +159,8 @@ class RegionMeasurement(Measurement):
             )  # fmt: skip
             if not self._spacing:  # the first look tells how long the contour is
                 self._spacing = max(len(rim) / self.of.regions.lines, 1.0)
-                rim = rim.chosen(np.arange(0.0, len(rim), self._spacing).astype(np.int64))
+                count = int(len(rim) / self._spacing)
+                rim = rim.chosen((np.arange(count) * self._spacing).astype(np.int64))
             self._last = vertices, camera, rim
         return self._last[2]
 
