@@ -93,7 +93,7 @@ class RegionSettings:
     half: int = 12
     heat: float = 1.0
     tells: float = 6.0
-    alike: float = 10.0
+    alike: float = 15.0
     lines: int = 200
     loss: float = 2.0
     search: SearchSettings = field(default_factory=SearchSettings)
