@@ -88,7 +88,8 @@ def test_profiles_are_sums_of_log_ratios_along_the_normals():
                     x, y = lines[0, p] + s * lines[2, p], lines[1, p] + s * lines[3, p]
                     i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
                     outside = not (0 <= i < 80 and 0 <= j < 60)
-                    ended = ended or outside or (abs(s) > guard and bool(drawn(np.array(x), np.array(y))) == (side == 1))
+                    other = abs(s) > guard and bool(drawn(np.array(x), np.array(y))) == (side == 1)
+                    ended = ended or outside or other
                     if not ended:
                         expected[p, k] += table[anchor[p], bins[number(IMAGE)[j, i]]]
     np.testing.assert_allclose(out, expected, atol=1e-5)

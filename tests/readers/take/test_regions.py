@@ -23,7 +23,8 @@ def written(folder, *, region='[[region]]\ncamera = "cam"\n', start=True, scale=
         picture = cv2.resize(image(one, seed=k), None, fx=scale, fy=scale)
         cv2.imwrite(str(folder / "img" / f"{k:03d}.png"), picture[..., ::-1])
     mesh = thing().surfaces[0]
-    lines = [f"v {' '.join(map(str, v))}" for v in mesh.vertices] + [f"f {' '.join(map(str, f + 1))}" for f in mesh.faces]
+    lines = [f"v {' '.join(map(str, v))}" for v in mesh.vertices]
+    lines += [f"f {' '.join(map(str, f + 1))}" for f in mesh.faces]
     (folder / "thing.obj").write_text("\n".join(lines))
     (folder / "thing.toml").write_text(
         '[body]\nname = "thing"\n[[segment]]\nname = "thing"\njoint = { name = "free", type = "free" }\n'
