@@ -1,5 +1,7 @@
 """Lasting errors go through to the pose as the closed form says: against fits with such errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,11 @@ from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.smoothing.uncertainty import lasting
+from kinefit.smoothing.uncertainty import Known, lasting
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.subject.keypoints import fit_subject
-from kinefit.subject.matched_frames import point_moves
+from kinefit.subject.parameters import World
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 
 MOTION = squat_and_wave(rate=20.0, duration=3.0)
 RIG = studio_rig(MOTION)
@@ -37,17 +40,17 @@ def fit(body, channels, uv, weight, start):
     sigma = 1.0 / np.sqrt(np.where(weight > 0, weight, 1.0))
 
     def rows(state):
-        return [pixel_rows(body, state, each, RIG, channels.camera, uv, sigma=sigma), prior_rows(body, state)]
+        return [pixel_rows(body, state, each, channels.rig, channels.camera, uv, sigma=sigma), prior_rows(body, state)]
 
     return levenberg_marquardt(body, start, rows, tolerance=1e-12, max_iterations=60).state
 
 
-def covariance(scene, noise, Sigma=None):
+def covariance(scene, noise, Sigma=None, cameras=None):
     subject, channels, weight, state = scene
-    moves, layout = point_moves(subject.fit), Layout(channels, subject.body)
-    Sigma = np.zeros((len(subject.fit.mean),) * 2) if Sigma is None else Sigma
+    known, layout = Known.of(subject, channels, cameras), Layout(channels, subject.body)
+    known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
-    return lasting(moves, Sigma, layout, state, weight, noise, none, none)
+    return lasting(known, layout, state, weight, noise, none, none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -102,6 +105,22 @@ def test_another_shape_moves_joints_as_refitting_does(scene):
     told = np.sqrt(covariance(scene, noise_of(channels), Sigma).joints)
     np.testing.assert_allclose(told, np.abs(after - before), atol=1.2e-3)
     assert told.max() > 2e-3
+
+
+@pytest.mark.parametrize(("axis", "by"), [(0, 0.005), (2, 0.01), (4, 0.002), (5, 0.003)])
+def test_a_camera_that_stands_elsewhere_moves_the_pose_as_refitting_does(scene, axis, by):
+    subject, channels, weight, state = scene
+    cameras, twist = CameraExtrinsics(RIG, None), np.zeros(6 * len(RIG))
+    twist[6 + axis] = by  # of the second camera
+    elsewhere = replace(channels, rig=cameras.apply(World(subject.body, RIG), twist).rig)
+    moved = state.difference(fit(subject.body, elsewhere, channels.uv[20], weight, state))
+    count = len(subject.fit.mean)
+    Sigma = np.zeros((count + len(twist),) * 2)
+    Sigma[count:, count:] = np.outer(twist, twist)
+    told = np.sqrt(np.diag(covariance(scene, noise_of(channels), Sigma, (0.003, 0.002)).dofs))
+    sure = (told < 0.1) & (told > 1e-4)
+    np.testing.assert_allclose(np.abs(moved)[sure], told[sure], rtol=0.25, atol=2e-3)
+    assert told[:6].max() > 1e-3
 
 
 def test_nothing_seen_leaves_finite_bars(scene):

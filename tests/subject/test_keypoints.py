@@ -14,6 +14,8 @@ from kinefit.sensors.channels import make_channels
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
 from kinefit.solvers.shape import mirror_points
 from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.parameters import World
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.tracking.take import track_take, trial_of
 
 BODY = load_body("humanoid")
@@ -55,6 +57,28 @@ def test_a_trial_of_the_same_person_helps_a_take_that_tells_little():
     alone, helped = fit_subject(BODY, short), fit_subject(BODY, short, trial=trial)
     assert np.abs(helped.scales - SCALES).mean() < 0.8 * np.abs(alone.scales - SCALES).mean()
     assert np.median(spread(helped) / spread(alone)) < 0.7
+
+
+def test_cameras_are_found_along_as_near_to_their_calibration_as_it_is_sure():
+    random = np.random.default_rng(5)
+    errors = CameraExtrinsics(RIG, None)
+    twist = np.concatenate([random.normal(0.0, (0.01,) * 3 + (0.005,) * 3) for _ in RIG])
+    off = errors.apply(World(BODY, RIG), twist).rig
+    channels = replace(channels_of(MOTION, 1.0), rig=off)
+    exact, moved = fit_subject(BODY, channels), fit_subject(BODY, channels, cameras=(0.01, 0.005))
+    held = fit_subject(BODY, channels, cameras=(1e-6, 1e-6))
+    assert exact.fit.rig is off and len(held.fit.mean) == len(exact.fit.mean) + 24
+
+    def apart(rig):  # between cameras: all together may stand elsewhere
+        T = [a.T_camera_world @ np.linalg.inv(rig.cameras[0].T_camera_world) for a in rig]
+        T0 = [a.T_camera_world @ np.linalg.inv(RIG.cameras[0].T_camera_world) for a in RIG]
+        return np.mean([np.linalg.norm(a[:3, :3] - b[:3, :3]) for a, b in zip(T[1:], T0[1:])])
+
+    assert apart(moved.fit.rig) < 0.5 * apart(off)
+    np.testing.assert_allclose(apart(held.fit.rig), apart(off), rtol=1e-3)
+    std = np.sqrt(np.diag(moved.covariance))[-24:]
+    assert np.all(std < np.tile(np.repeat((0.0101, 0.00505), 3), 4)) and np.median(std[3:6]) < 0.004
+    assert np.all(spread(moved) < 1.5 * spread(exact))
 
 
 def people(scales, noise, count=20, shifts=None, unseen=()):

@@ -7,7 +7,8 @@ import pytest
 from tests.subject import measured
 from tests.subject.measured import ARM, HUMANOID, RIG
 
-from kinefit.bodies import PointSet
+from kinefit.bodies import BodyState, PointSet
+from kinefit.correspondences import pixel_rows
 from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
@@ -106,6 +107,27 @@ def test_cameras_move_but_the_one_that_is_held():
     assert np.allclose(rig.cameras[2].T_camera_world, expected)
     with pytest.raises(CalibrationError, match="no camera 'roof'"):
         CameraExtrinsics(RIG, "roof")
+
+
+def test_points_move_with_the_cameras_that_see_them_as_differences_say():
+    cameras = CameraExtrinsics(RIG, None, cameras=RIG.names[1:3])
+    assert cameras.free == RIG.names[1:3]
+    state = BodyState(np.eye(4), ARM.tree.usual)
+    points, camera = ARM.markers("worn"), np.arange(len(ARM.markers("worn"))) % len(RIG)
+    uv = np.zeros((len(points), 2))
+
+    def rows(values):
+        return pixel_rows(ARM, state, points, cameras.apply(World(ARM, RIG), values).rig, camera, uv, sigma=2.0)
+
+    here = rows(cameras.mean)
+    told = cameras.columns(here, RIG, camera[here.group])
+    for k in range(12):
+        step = 1e-5 * np.eye(12)[k]
+        ends = [np.sqrt(r.weight) * r.residual for r in (rows(step), rows(-step))]
+        np.testing.assert_allclose(told[:, k], (ends[1] - ends[0]) / 2e-5, rtol=1e-3, atol=1e-3 * np.abs(told).max())
+    twist = np.linspace(-0.01, 0.02, 12)
+    np.testing.assert_allclose(cameras.values_of(cameras.apply(World(ARM, RIG), twist).rig), twist, atol=1e-12)
+    assert not cameras.columns(here, RIG, np.zeros(0, int)).any()
 
 
 def test_what_a_sensor_does_not_know_of_itself_goes_into_the_world_beside_what_it_does():

@@ -4,16 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.oracle import rig_around
 
-from kinefit import Markers, load_body
+from kinefit import Keypoints, Markers, load_body
 from kinefit.geometry.camera import Rig
-from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
+from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Subject
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.unknowns import of_all, of_points
 
 BODY = load_body("humanoid")
+CALIBRATED = rig_around(4)
 SET = next(iter(BODY.marker_sets))
 SCALES = np.full(len(BODY.scale_groups), 1.04)
 SIZED = Subject(BODY.scaled(SCALES), SCALES)
@@ -23,6 +26,22 @@ def a_recording(marker_set=SET, std=None):
     names = BODY.markers(SET).names
     markers = Markers(names, 10.0, np.zeros((4, len(names), 3)), up="z", unit="m")
     return Recording(0.1 * np.arange(4), 10.0, Rig(()), markers=(markers,), marker_sets=((marker_set, std),))
+
+
+def test_cameras_are_sought_from_their_calibration_and_begin_where_they_were_found():
+    prior = CameraExtrinsics(CALIBRATED, None, (0.003, 0.002))
+    twist = np.linspace(-0.004, 0.004, 24)
+    moved = prior.apply(World(BODY, CALIBRATED), twist).rig
+    seen = tuple(
+        Keypoints(name, "MEDIAPIPE_33", ("nose",), 10.0, np.zeros((4, 1, 1, 2)), np.ones((4, 1, 1)))
+        for name in CALIBRATED.names[:3]
+    )  # fmt: skip
+    recording = replace(a_recording(), rig=moved, keypoints=seen, people=(np.zeros(4, int),) * 3)
+    unknown = of_points(recording, BODY, SIZED, None, None, calibrated=CALIBRATED, cameras=(0.003, 0.002))
+    assert kinds(unknown) == [SegmentScales, PointOffsets, CameraExtrinsics]
+    assert unknown.world.rig is CALIBRATED and unknown.parameters[2].free == CALIBRATED.names[:3]
+    np.testing.assert_allclose(unknown.start[-18:], twist[:18], atol=1e-9)
+    assert kinds(of_points(recording, BODY, SIZED, None, None)) == [SegmentScales, PointOffsets]
 
 
 def kinds(unknown):

@@ -93,8 +93,9 @@ def run(
     from kinefit.preparing.take import prepared
     from kinefit.readers.take.checks import check_enough
     from kinefit.readers.take.file import read_take
+    from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
-    from kinefit.tracking.take import track_take
+    from kinefit.tracking.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     take = read_take(path)
@@ -115,6 +116,7 @@ def run(
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
                 notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])
+                notes.extend(cameras.sentences(motion.provenance, settings_of(take).camera_std))
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
             motion = replace(motion, provenance=provenance(take, **motion.provenance))

@@ -101,6 +101,7 @@ class Matched(ABC):
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
     places : (M,) set and name of the body's points that its `Rows` number by group, "" for landmarks, where every row
         says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
+    cameras : (M,) number in the rig of the camera that sees each of these points; empty where none does.
     """
 
     sensor: str = ""
@@ -109,6 +110,7 @@ class Matched(ABC):
     shows_surface: bool = False
     lasts: float = 0.0
     places: Sequence[tuple[str, str]] | None = None
+    cameras: NDArray | None = None
 
     @property
     def key(self) -> bytes:

@@ -223,6 +223,11 @@ class KeypointMatched(Matched):
         return None if self.hidden else self.measurement.layout.places
 
     @property
+    def cameras(self) -> NDArray | None:  # type: ignore[override]
+        """Of every channel; None where other rows than those of pixels take part."""
+        return None if self.hidden else self.measurement.layout.channels.camera
+
+    @property
     def key(self) -> bytes:
         """The same for matches that make the same rows."""
         return self.swapped.tobytes() + b"".join(h.key for h in self.hidden)

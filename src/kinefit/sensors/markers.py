@@ -101,6 +101,8 @@ class MarkerMatched(Matched):
         """Name of the marker system."""
         return self.measurement.sensor
 
+    cameras = np.zeros(0, np.int64)
+
     @property
     def places(self) -> Sequence[tuple[str, str]]:  # type: ignore[override]
         """Of every marker."""

@@ -18,10 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
+from kinefit.bodies import BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
+from kinefit.rows import Rows
+from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
@@ -30,6 +32,7 @@ from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, prod
 from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.matched_frames import point_moves
 from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Subject
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
@@ -57,7 +60,8 @@ class Lasting:
 
 def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
-    others: OtherNoise | None = None, answers: Sequence[Answers] = (),
+    others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
+    cameras: tuple[float, float] | None = None,
 ) -> tuple[list[FrameResult], DetectorNoise]:  # fmt: skip
     """The same results with the standard deviations that lasting errors and the shape add; and the detectors' noise.
 
@@ -69,6 +73,7 @@ def with_lasting_errors(
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors
     answers : what shapes add that were found from several kinds of sensors together
+    cameras : (2,) standard deviations [m], [rad] of the cameras' poses, where neither the subject nor the answers know
     """
     body, channels = subject.body, take.channels
     fitted = take.fitted(take.roots, take.angles)
@@ -76,9 +81,7 @@ def with_lasting_errors(
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
-    moves, Sigma = None, np.zeros((0, 0))
-    if subject.fit is not None and subject.covariance is not None:
-        moves, Sigma = point_moves(subject.fit), subject.covariance
+    known = Known.of(subject, channels, cameras)
     layout = Layout(channels.with_points(body), body)
     half, n = round(_TIED * rate), body.tree.n_dofs
     weights = pooled(weight, half)
@@ -87,7 +90,7 @@ def with_lasting_errors(
     added, alone = [], []
     for f, result in enumerate(results):
         more = nothing if others is None else others.pooled(f, half)
-        one = lasting(moves, Sigma, layout, result.state, weights[f], noise, *more)
+        one = lasting(known, layout, result.state, weights[f], noise, *more)
         added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
         if f in sampled:
             alone.append(one.alone)
@@ -111,15 +114,65 @@ def pooled(values: NDArray, half: int) -> NDArray:
     return np.maximum((total[high] - total[low]) / (high - low)[:, None], 0.0)
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What keypoints rest on, and how sure it is.
+
+    Parameters
+    ----------
+    moves : how points move with the shape; None for one that is exact.
+    cameras : parameters of cameras' poses, which come last; None for exact ones.
+    covariance : (p, p) of both
+    """
+
+    moves: PointMoves | None
+    cameras: CameraExtrinsics | None
+    covariance: NDArray
+
+    @classmethod
+    def of(cls, subject: Subject, channels: Channels, std: tuple[float, float] | None) -> Known:
+        """Of a subject; cameras that its fit did not seek are as sure as their calibration, where that is stated."""
+        if subject.fit is not None and subject.covariance is not None:
+            cameras = next((p for p in subject.fit.parameters if isinstance(p, CameraExtrinsics)), None)
+            moves, covariance = point_moves(subject.fit), subject.covariance
+            if cameras is not None:
+                stay = np.zeros(len(covariance))  # where they were found, and the motion was not
+                stay[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
+                return cls(moves, cameras, covariance + np.outer(stay, stay))
+            if std is None:
+                return cls(moves, None, covariance)
+        else:
+            moves, covariance = None, np.zeros((0, 0))
+        if std is None or not len(channels.camera):
+            return cls(moves, None, covariance)
+        used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
+        cameras = CameraExtrinsics(channels.rig, None, std, used)
+        return cls(moves, cameras, block_diagonal(covariance, np.linalg.inv(cameras.information)))
+
+    def columns(self, layout: Layout, rows: Rows, tree: KinematicTree, frames: NDArray) -> tuple[NDArray, NDArray]:
+        """(N, p) how far points of rows move along their directions, whitened, and (S, 3, p) how joints do."""
+        by, joints = np.zeros((len(rows), len(self.covariance))), np.zeros((len(frames), 3, len(self.covariance)))
+        if self.moves is not None:
+            moved, told = self.moves.joints(tree, frames), self.moves.columns(layout.places, rows, tree, frames)
+            joints[:, :, : moved.shape[2]] = moved
+            if told is not None:
+                by[:, : told.shape[1]] = told
+        if self.cameras is not None:
+            channels = layout.channels
+            seen = self.cameras.columns(rows, channels.rig, channels.camera[rows.group])
+            by[:, by.shape[1] - seen.shape[1] :] = seen
+        return by, joints
+
+
 def lasting(
-    moves: PointMoves | None, Sigma_shape: NDArray, layout: Layout, state: BodyState, weight: NDArray,
+    known: Known, layout: Layout, state: BodyState, weight: NDArray,
     noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
 ) -> Lasting:  # fmt: skip
     """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
     Parameters
     ----------
-    moves : how points move with the shape, None for one that is exact; Sigma_shape (p, p) the shape's covariance.
+    known : what the keypoints rest on
     weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
     other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
@@ -130,11 +183,8 @@ def lasting(
         np.zeros((len(weight), 2)), np.ascontiguousarray(weight),
     )  # fmt: skip
     frames, _ = tree.forward(state.T_world_root, state.angles)
-    by_pose, by_shape = columns(rows, Pose.of(body, state)), np.zeros((len(rows), len(Sigma_shape)))
-    stretch = np.zeros((len(tree.segments), 3, len(Sigma_shape)))
-    if moves is not None:
-        told = moves.columns(layout.places, rows, tree, frames)
-        by_shape, stretch = by_shape if told is None else told, moves.joints(tree, frames)
+    by_pose, Sigma = columns(rows, Pose.of(body, state)), known.covariance
+    by_shape, stretch = known.columns(layout, rows, tree, frames)
     prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
@@ -148,6 +198,6 @@ def lasting(
     dofs = product(product(alone, meat), alone)
     moved = joint_moves(body, state)
     whole = product(moved, answer) + stretch
-    joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma_shape) * whole, axis=-1)
-    shape = product(product(answer, Sigma_shape), answer.T)
+    joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)
+    shape = product(product(answer, Sigma), answer.T)
     return Lasting(dofs + shape, np.maximum(joints, 0.0), alone)

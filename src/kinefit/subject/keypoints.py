@@ -19,7 +19,8 @@ from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
@@ -37,6 +38,7 @@ def fit_subject(
     frames: int = 25,
     height: float | None = None,
     trial: Subject | None = None,
+    cameras: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Subject:
     """Bone lengths and the places of the detectors' points on a body, with no pose given.
@@ -47,6 +49,9 @@ def fit_subject(
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
+
+    cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
+        default: the calibration is exact.
 
     Raises
     ------
@@ -80,7 +85,7 @@ def fit_subject(
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
-    found, covariance = _fitted(body, channels, steps, list(states.values()), lengths, scales)
+    found, covariance = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
@@ -89,27 +94,38 @@ def fit_subject(
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray,
+    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
 ) -> tuple[SubjectFit, NDArray]:  # fmt: skip
-    """Lengths and points, with as much freedom for a detector's points as this take asks for; and their covariance.
+    """Lengths, points and cameras, with as much freedom for points as this take asks for; and their covariance.
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
-    one centimetre, which counts as much as `_BELIEF` points seen along one axis.
+    one centimetre, which counts as much as `_BELIEF` points seen along one axis. What a detector errs by lasts, and
+    would move cameras: their calibration counts for more by the excess of the round before.
     """
-    spread, start = _SHIFT, None
+    spread, excess_of, start = _SHIFT, 1.0, None
+    used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     for _ in range(_ROUNDS):
-        points = [PointOffsets(body, name, spread) for name in channels.sets if name]
+        parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
+        of_body = sum(len(one.names) for one in parameters)
+        if std is not None:
+            held = np.array(std) / np.sqrt(excess_of)
+            parameters.append(CameraExtrinsics(channels.rig, None, (float(held[0]), float(held[1])), used))
         if start is None:
-            start = np.concatenate([np.log(scales), *(one.mean for one in points)])
+            start = np.concatenate([np.log(scales), *(one.mean for one in parameters[1:])])
         found = joint.fit_subject(
-            body, channels.rig, steps, states, [lengths, *points], start=start, rounds=1, looks=len(steps)
+            body, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
         )
-        start, states = found.mean, found.states
-        covariance = inverse(found.prior.information + found.information / _excess(found, steps))
-        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(found.prior.information), spread**-2)
+        start, states, prior = found.mean, found.states, found.prior.information.copy()
+        prior[of_body:, of_body:] /= excess_of
+        excess_of = _excess(found, steps)
+        covariance = inverse(prior + found.information / excess_of)
+        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
+        open_to[of_body:] = False
         told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
-    return found, _UNTOLD * covariance
+        excess_of = max(excess_of, 1.0)
+    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
+    return found, wider[:, None] * covariance * wider
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:

@@ -16,6 +16,7 @@ from kinefit.solvers.border_frames import Part, apart
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import SubjectFit
 
 _KEPT = 64  # worlds that are remembered
@@ -61,10 +62,16 @@ class Worlds:
         told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
         return np.concatenate(told)
 
+    @property
+    def cameras(self) -> list[tuple[CameraExtrinsics, slice]]:
+        """Parameters of cameras, and where they stand among all."""
+        return [(one, own) for one, own in self._parameters if isinstance(one, CameraExtrinsics)]
+
     def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
         """How points move with some parameters, all of which move nothing else; by central differences."""
         worlds = self
-        if self.of_points.all():  # surfaces would be stretched for nothing
+        others = [one for one, _ in self._parameters if not isinstance(one, CameraExtrinsics)]
+        if all(getattr(one, "of_points", False) for one in others):  # surfaces would be stretched for nothing
             if self._bare is None:
                 bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
                 self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
@@ -121,7 +128,7 @@ class MatchedFrames:
         return out
 
     def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
-        """(N, p) of every frame, as `border_frames.differences`: of points, NaN where other worlds must tell."""
+        """(N, p) of every frame, as `border_frames.differences`: of points and of cameras, else NaN."""
         world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
         some = len(moving) and any(m.places is not None for several in self._matched for m in several)
         moves = self._worlds.moves(theta, steps, moving) if some else None
@@ -131,6 +138,10 @@ class MatchedFrames:
             for i, matched in enumerate(self._matched[f]):
                 for rows in self._rows((f, i), matched.sensor, matched, scene, world):
                     blocks.append(np.full((len(rows), len(theta)), np.nan))
+                    if matched.cameras is not None and isinstance(rows, Rows):
+                        seen_by = matched.cameras[rows.group] if len(matched.cameras) else matched.cameras
+                        for one, own in self._worlds.cameras:
+                            blocks[-1][:, own] = one.columns(rows, world.rig, seen_by)
                     if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
                         continue
                     there = scene.at_time(matched.time)
@@ -176,9 +187,9 @@ class MatchedFrames:
 
 
 def point_moves(found: SubjectFit) -> PointMoves:
-    """How points and joints move with the parameters of a fit, all of which move nothing else."""
+    """How points and joints move with those parameters of a fit that move nothing else."""
     worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
-    return worlds.moves(found.mean, step, np.arange(len(step)))
+    return worlds.moves(found.mean, step, np.flatnonzero(worlds.of_points))
 
 
 def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.subject.parameters import World
@@ -30,22 +31,25 @@ class CameraExtrinsics:
     rig : Rig, the prior mean.
     held : name of the camera that stays; None where other sensors hold the world.
     std : (2,) standard deviations of v [m] and ω [rad].
+    cameras : names of those that move, besides the one that is held; default: all.
     """
 
     rig: Rig
     held: str | None
     std: tuple[float, float] = (0.02, 0.01)
+    cameras: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
-        if self.held is not None:
-            self.rig.index(self.held)
+        for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
+            self.rig.index(name)
         if not min(self.std) > 0:
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
 
     @property
     def free(self) -> tuple[str, ...]:
         """Names of the cameras that move."""
-        return tuple(name for name in self.rig.names if name != self.held)
+        moving = self.rig.names if self.cameras is None else self.cameras
+        return tuple(name for name in moving if name != self.held)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,6 +76,28 @@ class CameraExtrinsics:
         twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
         cameras = tuple(_moved(c, twist[c.name]) if c.name in twist else c for c in world.rig)
         return replace(world, rig=Rig(cameras))
+
+    def values_of(self, rig: Rig) -> NDArray:
+        """(6 C,) with which the cameras stand as in another rig."""
+        there = [rig[name].T_camera_world @ se3.inverse(self.rig[name].T_camera_world) for name in self.free]
+        return np.concatenate([np.zeros(0), *(se3.log(T) for T in there)])
+
+    def columns(self, rows: Rows, rig: Rig, camera: NDArray) -> NDArray:
+        """(N, 6 C) how far the points of rows move along their directions with the cameras that see them, whitened.
+
+        Parameters
+        ----------
+        rig : Rig, near the prior's
+        camera : (N,) number in the rig of the camera that sees each row's point; none for no rows through cameras
+        """
+        out = np.zeros((len(rows), 6 * len(self.free)))
+        for k, name in enumerate(self.free if len(camera) else ()):
+            mine = np.flatnonzero(camera == rig.index(name))
+            T = rig[name].T_camera_world
+            x, d = rows.point[mine] @ T[:3, :3].T + T[:3, 3], rows.direction[mine] @ T[:3, :3].T
+            moved = np.concatenate([d, np.cross(x, d)], axis=1)
+            out[mine, 6 * k : 6 * k + 6] = np.sqrt(rows.weight[mine])[:, None] * moved
+        return out
 
 
 def _moved(camera: Camera, twist: NDArray) -> Camera:

@@ -30,6 +30,7 @@ from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, contradictions
+from kinefit.tracking.cameras import CAMERAS, as_told, of_cameras
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
 
@@ -122,7 +123,13 @@ def motion_of(
         )
         provenance["sensor noise"] = noise_of_others.as_told()
     answers = [partial(shape_errors, one, settings, seen) for one in found]
-    results, detectors = with_lasting_errors(results, subject, take, weight, rate, noise_of_others, answers)
+    if cameras := as_told(found):
+        provenance[CAMERAS] = cameras
+    elsewhere = any(of_cameras(one) is not None for one in found)
+    results, detectors = with_lasting_errors(
+        results, subject, take, weight, rate, noise_of_others, answers,
+        cameras=None if elsewhere else settings.camera_std,
+    )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)
     provenance["length_std_m"] = subject.length_std

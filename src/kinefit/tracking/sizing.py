@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
+from kinefit.geometry.camera import Rig
 from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
@@ -22,6 +23,7 @@ from kinefit.subject import fit as joint
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
+from kinefit.tracking.cameras import of_cameras
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
@@ -48,6 +50,7 @@ class Person:
     values : {sensor: {name: value}} of the sensors' own unknowns
     told : what there is to report of it, for `Motion.provenance`
     joint : what fits of several kinds of sensors together found, in their order
+    calibrated : Rig as its calibration has it
     """
 
     recording: Recording
@@ -57,6 +60,7 @@ class Person:
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
     joint: tuple[SubjectFit, ...] = ()
+    calibrated: Rig = field(default_factory=lambda: Rig(()))
 
 
 def fitted_to_person(
@@ -92,13 +96,17 @@ def fitted_to_person(
         if given is not None and cameras < 2 and given is not height:
             problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
             raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
-    person = Person(recording, Subject(body, np.ones(len(body.scale_groups))), channels, recording.start)
+    subject_as_is = Subject(body, np.ones(len(body.scale_groups)))
+    person = Person(recording, subject_as_is, channels, recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        found = fit_subject(body, channels, frames=frames or 25, height=height, trial=trial, progress=progress)
+        found = fit_subject(
+            body, channels, frames=frames or 25, height=height, trial=trial, cameras=settings.camera_std,
+            progress=progress,
+        )  # fmt: skip
         person = _wearing(person, found)
     elif recording.markers and recording.marker_sets[0][0]:
         person = _by_markers(person, height, progress)
@@ -119,6 +127,15 @@ def _others(recording: Recording) -> bool:
 def _wearing(person: Person, subject: Subject, **told: Any) -> Person:
     channels = person.channels.with_points(subject.body)
     return replace(person, subject=subject, channels=channels, told={**person.told, **told})
+
+
+def _seen_by(person: Person, rig: Rig) -> Person:
+    """With cameras where a fit found them."""
+    if rig is person.recording.rig:
+        return person
+    return replace(
+        person, recording=replace(person.recording, rig=rig), channels=replace(person.channels, rig=rig)
+    )  # fmt: skip
 
 
 def _by_markers(person: Person, height: float | None, progress: Progress | None) -> Person:
@@ -190,17 +207,22 @@ def _by_all(
     times, velocities = [tracked.results[k].time for k in chosen], [_velocity(tracked.results, k) for k in chosen]
 
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
+        world = unknown.world
         return joint.fit_subject(
-            unknown.world.body, r.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
+            world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
             times=times, velocities=velocities, rounds=_MATCHES,
         )  # fmt: skip
 
-    points = of_points(r, generic, person.subject, height, trial) if size else None
+    points = None
+    if size:
+        points = of_points(
+            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_std
+        )  # fmt: skip
     if points is not None:
         found = fit(points, [[m for m in several if m.settled] for several in steps], states)
         person, states = _by_joint(person, found), found.states
     lengths = points is None and person.subject.fit is None and not person.joint
-    left = of_all(r, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
+    left = of_all(person.recording, person.subject.body, size=size, lengths=lengths, surfaces=surfaces)
     if left is not None:
         found = fit(left, steps, states)
         person, states = _by_joint(person, found), found.states
@@ -218,6 +240,8 @@ def _by_joint(person: Person, found: SubjectFit) -> Person:
         )  # fmt: skip
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     person = _wearing(person, replace(subject, body=found.body), shape={**person.told.get("shape", {}), **shape})
+    if of_cameras(found) is not None:
+        person = _seen_by(person, found.rig)
     values = {**person.values, **found.values}
     return replace(person, values=values, joint=(*person.joint, found))
 

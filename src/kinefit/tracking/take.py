@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
+
+import numpy as np
 
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError, command
@@ -19,6 +22,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
+from kinefit.tracking.cameras import as_found
 from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
@@ -33,7 +37,8 @@ def track_take(
     """Track the person of a take file in all that its sensors saw; `smooth`, `contacts`, `lag`, `noise` as in `track`.
 
     Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
-    videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays).
+    videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays), with
+    cameras where the fit found them.
 
     Raises
     ------
@@ -67,13 +72,22 @@ def track_take(
             file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
         )  # fmt: skip
     recording, body = recording_of(take, seen, body)
+    settings = settings_of(take, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings)
     motion = track(
         recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
         size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings, progress=progress,
     )  # fmt: skip
-    return motion, seen
+    return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
+
+
+def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:
+    """With what the take states of its calibration."""
+    settings, entry = settings or TrackSettings(), take.calibration
+    if entry is None or entry.position_sigma is None or entry.rotation_sigma is None:
+        return settings
+    return replace(settings, camera_shift=entry.position_sigma, camera_turn=float(np.radians(entry.rotation_sigma)))
 
 
 def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
@@ -100,6 +114,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
         )
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
-    accuracy = [entry.sigma for entry in trial.keypoints]
+    accuracy, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
     channels = make_channels(body, seen.rig, seen.keypoints, choose_people(seen.rig, seen.keypoints), accuracy)
-    return fit_subject(body, channels, frames=frames, height=trial.height or take.height)
+    return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.geometry.camera import Rig
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
-from kinefit.subject.sensor_parameters import OwnUnknowns
+from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 from kinefit.subject.subject import Subject
 from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording
@@ -35,9 +36,10 @@ class Unknowns:
 
 
 def of_points(
-    recording: Recording, generic: Body, subject: Subject, height: float | None, trial: Subject | None
-) -> Unknowns | None:
-    """Lengths, and places of keypoints and markers, where there are markers; without them the keypoints' fit is that.
+    recording: Recording, generic: Body, subject: Subject, height: float | None, trial: Subject | None, *,
+    calibrated: Rig | None = None, cameras: tuple[float, float] | None = None,
+) -> Unknowns | None:  # fmt: skip
+    """Lengths, places of keypoints, markers and cameras, where there are markers; else the keypoints' fit is that.
 
     They have the generic body's prior: the fit from one kind of sensors that came first says where to begin, and is not
     counted again.
@@ -47,6 +49,8 @@ def of_points(
     generic : the body before any fit
     subject : what the first fit found
     height, trial : as of `track`
+    calibrated : Rig of the calibration, from which the recording's may have been moved; default: it is the recording's
+    cameras : (2,) [m, rad] how sure it is; default: exact
     """
     sets = {name: std for name, std in recording.marker_sets if name}
     if not sets:
@@ -65,7 +69,13 @@ def of_points(
     for name in sets:
         offsets = PointOffsets(generic, name, stds[name])
         found.append((offsets, offsets.values_of(worn[name].points - scaled.markers(name).points)))
-    return _together(World(generic, recording.rig), found)
+    used = tuple(dict.fromkeys(k.camera for k in recording.keypoints))
+    rig = recording.rig
+    if cameras is not None and used:
+        poses = CameraExtrinsics(calibrated or rig, None, cameras, used)
+        found.append((poses, poses.values_of(rig)))
+        rig = poses.rig
+    return _together(World(generic, rig), found)
 
 
 def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:

@@ -12,7 +12,7 @@ from kinefit.errors import FileError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.markers import UNITS
-from kinefit.readers.take.entries import SKIN_SETS, StartEntry
+from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -83,6 +83,8 @@ def _values(take: Take) -> None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
         if take.size is False and key != "size" and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Leave one of both out.")
+    if take.calibration is not None:
+        _calibration(take, take.calibration, refuse)
     if take.pose is not None:
         _pose(take, take.pose, refuse)
     if take.frames is not None and not -_MOST < take.frames[0] < take.frames[1] < _MOST:
@@ -144,6 +146,21 @@ def _values(take: Take) -> None:
 def _is_size(size: tuple[int, int]) -> bool:
     """Whether an image may have a size [px]."""
     return 1 <= min(size) and max(size) < 100_000
+
+
+def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str, str], None]) -> None:
+    """Standard deviations of cameras' poses: both, and for keypoints."""
+    shift, turn = entry.position_sigma, entry.rotation_sigma
+    told, place = f"position_sigma {shift}, rotation_sigma {turn}", "[calibration]"
+    if shift is None and turn is None:
+        return
+    if shift is None or turn is None or (min(shift, turn) <= 0 and not shift == turn == 0):
+        refuse(told, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
+    elif not (shift < 1 and turn < 30):
+        refuse(told, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
+    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    if not take.keypoints and any(others):
+        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
 
 
 def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:

@@ -59,6 +59,8 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
 
     file: Path
     unit: str = "auto"  # of its translations, where the format does not state it
+    position_sigma: float | None = None  # [m] of each camera's position; with rotation_sigma, or neither
+    rotation_sigma: float | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
 
 
 class CameraEntry(_Entry, frozen=True, kw_only=True):
