@@ -60,6 +60,19 @@ def test_a_body_that_leapt_is_sought_and_found():
     assert off(found.state, there) < (0.01, 3.0) and not found.lost[0]
 
 
+def test_colours_are_not_learnt_where_the_body_is_not_seen():
+    """After forty images of nothing but a wall the thing is found again, by the colours that it had."""
+    t = tracker()
+    wall = ((100, 115, 110), (101, 116, 111))
+    before = t.sensors.of("region cam").colours
+    for k in range(1, 41):
+        assert not t.update([ColourFrame("cam", k / 30, image(state((5.0, 0, 0)), wall=wall, seed=k))]).quality > 0.5
+    assert t.sensors.of("region cam").colours.images <= before.images + 1
+    for k in range(41, 45):
+        found = t.update([frame(TRUTH, k / 30, seed=k)])
+    assert off(found.state, TRUTH) < (0.01, 3.0) and not found.lost[0]
+
+
 def test_light_may_change():
     t = tracker()
     for k in range(1, 9):

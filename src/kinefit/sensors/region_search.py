@@ -85,7 +85,8 @@ def region_starts(
         J = np.block([[R, R @ arm], [np.zeros((3, 3)), R]])
         spread = np.sqrt(np.diag(J @ inverse(information)[:6, :6] @ J.T))
     rough = spread[:3].max() > s.far * size or spread[3:].max() > s.turn
-    if not (rough or told.lost.any() or told.quality.min() < s.poor):
+    agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
+    if not rough and agreeing >= s.poor * (agreeing + contrary):
         return []
     x = x @ R.T + t
     if x[:, 2].min() < NEAR:

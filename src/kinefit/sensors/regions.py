@@ -95,17 +95,17 @@ class RegionSensor(Sensor):
             problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
             raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
         m = RegionMeasurement(self, frame, scene)
-        if self.ratios is None:
+        if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
         m.seen = Coloured(frame.image, self.bins, self.ratios)
         return m
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
-        """Blend in the colours of a step in which the body was found; and how far it was from where it was expected."""
+        """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
         if not isinstance(measurement, RegionMeasurement):
             return
-        if not sure:
+        if not sure or measurement.hidden:
             self.reach = _WIDE
             return
         off = 2.0 * measurement.off(scene)
@@ -130,6 +130,7 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
+    hidden : whether nothing of the body was seen in the state that was judged last: its colours are not learnt there
     """
 
     settled = False
@@ -138,6 +139,7 @@ class RegionMeasurement(Measurement):
         self.sensor, self.time, self.of = of.name, frame.time, of
         self.image: NDArray | None = frame.image
         self.seen: Coloured | None = None
+        self.hidden = False
         self.reach, self._spacing = of.reach, 0.0
         camera = scene.placed(of.camera)
         self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
@@ -243,7 +245,9 @@ class RegionMeasurement(Measurement):
         depth = max(float(np.median(scene.pose.vertices[::_FEW] @ T[2, :3])) + T[2, 3], 0.1)
         spacing = self._spacing / self._drawn(scene)[3]
         whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
-        return Evidence(agreeing / whole, _AGAINST * contrary / whole)
+        out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
+        self.hidden = bool(out.hidden.all())
+        return out
 
     def compact(self) -> RegionMeasurement:
         """Without the image: log ratios about the contour as it was drawn last."""
