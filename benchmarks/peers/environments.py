@@ -50,6 +50,7 @@ PEERS: dict[str, Peer] = {
     "mink": Peer(*_MUJOCO, "mujoco_mink", ("mink",)),
     "opensim": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_ik"),
     "opensim_takes": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_takes"),
+    "pyvale": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_dic"),
     "momentum": Peer(*_MOMENTUM, ("markers",), **_MOMENTUM_FILES),
     "momentum_planes": Peer(*_MOMENTUM, ("planes",), **_MOMENTUM_FILES),
 }

@@ -5,6 +5,7 @@ import pytest
 from tests.subject import measured
 from tests.subject.measured import ARM, RIG
 
+from kinefit.frame.fit import weaker
 from kinefit.rows import ParameterRows
 from kinefit.sensors.base import matched_by, rows_at
 from kinefit.sensors.settings import TrackSettings
@@ -32,9 +33,13 @@ def prior_rows(state):
     return ParameterRows(6 + np.arange(count), -state.angles, np.full(count, PRIOR**-2))
 
 
-def refitted(scene, matched, start):
+def rows_of(scene, matched, scale):
+    return [*(weaker(rows, scale) for rows in rows_at(matched, scene)), prior_rows(scene.state)]
+
+
+def refitted(scene, matched, start, scale):
     """The pose that a world's rows give."""
-    rows = lambda state: [*rows_at(matched, scene.at(state)), prior_rows(state)]
+    rows = lambda state: rows_of(scene.at(state), matched, scale)
     return levenberg_marquardt(scene.body, start, rows, max_iterations=50, tolerance=1e-12).state
 
 
@@ -42,32 +47,34 @@ def centres(body, state):
     return body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, :, :3, 3]
 
 
-def test_answers_are_those_of_poses_fitted_anew(found):
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_answers_are_those_of_poses_fitted_anew(found, scale):
     subject, steps = found
     worlds = Worlds(subject.prior_world, subject.parameters)
     world = worlds.at(subject.mean)
     frame = 4
     scene = worlds.scene(world, subject.states[frame])
     matched = matched_by(steps[frame][0], scene, 0.05)
-    state = refitted(scene, matched, subject.states[frame])
+    state = refitted(scene, matched, subject.states[frame], scale)
     scene = scene.at(state)
-    H = normal_equations(world.body, state, [*rows_at(matched, scene), prior_rows(state)]).matrix
+    H = normal_equations(world.body, state, rows_of(scene, matched, scale)).matrix
     alone = np.zeros_like(H)
     alone[6:, 6:] = inverse(H[6:, 6:])  # the arm's root is fixed
-    errors = shape_errors(subject, TrackSettings(), lambda f: (scene, [matched]), [frame], [alone])
+    scales = {matched.sensor: scale}
+    errors = shape_errors(subject, TrackSettings(), lambda f: (scene, [matched]), [frame], [alone], scales)
     roots = np.linalg.cholesky(subject.covariance)
     dofs, joints = np.zeros(len(H)), np.zeros((len(world.body.tree.segments), 3))
     for direction in roots.T:
         moved = []
         for sign in (-0.5, 0.5):
             other = worlds.at(subject.mean + sign * direction)
-            moved.append((other.body, refitted(worlds.scene(other, state), matched, state)))
+            moved.append((other.body, refitted(worlds.scene(other, state), matched, state, scale)))
         (a, before), (b, after) = moved
         dofs += np.square(before.difference(after))
         joints += np.square(centres(b, after) - centres(a, before))
     assert joints.max() > 0.001**2
     np.testing.assert_allclose(np.sqrt(errors.joints[0]), np.sqrt(joints), rtol=0.05, atol=1e-4)
-    np.testing.assert_allclose(np.sqrt(errors.dofs[0]), np.sqrt(dofs), rtol=0.05, atol=1e-3)
+    np.testing.assert_allclose(np.sqrt(errors.dofs[0]), np.sqrt(dofs), rtol=0.1, atol=1e-3)
 
 
 def test_between_frames_variances_are_interpolated():

@@ -17,8 +17,8 @@ from kinefit.cli import _screen
 from kinefit.errors import KinefitError
 
 COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "markers", "view", "export", "retarget", "simulate",
-    "evaluate", "warmup",
+    "demo", "init", "calibrate", "detect", "check", "track", "markers", "surface", "view", "export", "retarget",
+    "simulate", "evaluate", "warmup",
 )  # fmt: skip
 
 _EPILOG = """\b
@@ -28,6 +28,7 @@ Examples:
   kinefit check my_take/take.toml       what is wrong with it, and what would fix it
   kinefit track my_take/take.toml       angles, figures, videos and a report
   kinefit markers --help                points without names: labelled takes, joint angles
+  kinefit surface --help                photographs of a textured surface: points, strain
   kinefit export motion.npz --to bvh    a result in another format
   kinefit COMMAND --help                what a command takes, with examples
 

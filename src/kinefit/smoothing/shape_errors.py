@@ -8,14 +8,14 @@ Parameters that touch surfaces alone (girths) are left out: what a surface is of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.frame.fit import rows_of, rows_of_points
+from kinefit.frame.fit import rows_of, rows_of_points, weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -59,7 +59,7 @@ class ShapeErrors:
 
 def shape_errors(
     found: SubjectFit, settings: TrackSettings, seen: Callable[[int], tuple[Scene, Sequence[Matched]]],
-    frames: Sequence[int], alone: Sequence[NDArray],
+    frames: Sequence[int], alone: Sequence[NDArray], scale: Mapping[str, float] | None = None,
 ) -> ShapeErrors:  # fmt: skip
     """Of some frames.
 
@@ -67,9 +67,10 @@ def shape_errors(
     ----------
     found : with its parameters and their covariance
     settings : those of the fit
-    seen : of a frame its scene and all that was matched in it
+    seen : of a frame its scene and all that was matched in it, keypoints with the weights that the covariances have
     frames : K numbers of frames
     alone : K (n, n) covariances of each frame on its own, prior included
+    scale : {sensor: factor} on the standard deviations of other sensors' rows in these covariances
     """
     kept = np.concatenate([
         np.full(len(p.names), not isinstance(p, CylinderShape | Girths)) for p in found.parameters
@@ -80,7 +81,7 @@ def shape_errors(
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
         scene, matched = seen(frame)
-        one = _Frame(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]))
+        one = _Frame(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]), scale or {})
         pushed = one.points(step) + one.surfaces(step, settings)
         answer = P @ pushed
         moves = joint_moves(scene.body, scene.state)
@@ -103,6 +104,7 @@ class _Frame:
     theta: NDArray
     kept: NDArray
     wide: NDArray
+    scale: Mapping[str, float]
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
@@ -116,7 +118,10 @@ class _Frame:
     def parts(self, values: NDArray, frame: int, state: BodyState) -> list[Part]:
         """Rows of points."""
         scene = self._scene(values)
-        return [(m.sensor, rows) for m in self.matched if m.of_points for rows in rows_at(m, scene)]
+        return [
+            (m.sensor, weaker(rows, self.scale.get(m.sensor, 1.0)))
+            for m in self.matched if m.of_points for rows in rows_at(m, scene)
+        ]  # fmt: skip
 
     def points(self, step: NDArray) -> NDArray:
         """(n, q) ∂g/∂θ of all points."""
@@ -136,7 +141,7 @@ class _Frame:
 
         def gradient(values: NDArray) -> NDArray:
             scene = self._scene(values)
-            rows = [r for r in rows_of(scene, shown, settings, points=beside) if len(r)]
+            rows = [r for r in rows_of(scene, shown, settings, self.scale, points=beside) if len(r)]
             return normal_equations(scene.body, scene.state, rows).gradient if rows else np.zeros(n)
 
         for k in self.wide:

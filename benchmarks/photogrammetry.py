@@ -1,0 +1,15 @@
+"""Every figure of matching and surfaces: `python -m benchmarks.photogrammetry`; only some parts: `... dic lsm`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "dic": "speckle images with known displacement and strain, beside pyvale",
+    "lsm": "sub-pixel shifts and affinities of drawn texture, beside OpenCV",
+    "stereo_cylinder": "a speckled cylinder before two cameras, in three positions",
+    "surface_arm": "a bare arm before two cameras, tracked",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)

@@ -1,0 +1,152 @@
+"""Measured surfaces as tables (CSV), meshes (VTK, for ParaView) and pictures with a scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import write_bytes, write_text
+from kinefit.photogrammetry.strain import Strain
+from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.trajectories import Trajectories
+
+_LARGEST = 1400  # [px] of a picture's longer side
+_BAR = 90  # [px] of the scale beside it
+
+
+def point_columns(
+    surface: Surface, reference: Surface | None = None, strain: Strain | None = None
+) -> dict[str, NDArray]:
+    """Named columns (N,) of all points: places [m], standard deviations [m], quality, displacement [m] and strain."""
+    out = {}
+    for axis, name in enumerate("xyz"):
+        out[f"std_{name}_m"] = surface.std[:, axis]
+    out["correlation"], out["parallax_px"] = surface.correlation, surface.parallax
+    if reference is not None:
+        moved = surface.x_world - reference.x_world
+        out |= {f"d{name}_m": moved[:, axis] for axis, name in enumerate("xyz")}
+    if strain is not None:
+        out |= {f"strain_{name}": getattr(strain, name) for name in ("xx", "yy", "xy", "first", "second")}
+        out |= {f"std_strain_{name}": getattr(strain, f"std_{name}") for name in ("xx", "yy", "xy")}
+        out["strain_angle_rad"] = strain.angle
+    return out
+
+
+def write_points_csv(surface: Surface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
+    """Write the measured points: row and column of the grid, pixels in the first camera, metres, and more columns.
+
+    Raises
+    ------
+    ExportError
+        Where it cannot be written.
+    """
+    index = np.flatnonzero(surface.measured)
+    row, column = np.divmod(index, surface.grid.columns)
+    more = [value[index] for value in columns.values()]
+    table = np.column_stack([surface.uv[index, 0], surface.x_world[index], *more])
+    lines = [",".join(["row", "column", "u_px", "v_px", "x_m", "y_m", "z_m", *columns])]
+    for r, c, values in zip(row, column, table):
+        lines.append(f"{r},{c}," + ",".join("" if not np.isfinite(v) else f"{v:.9g}" for v in values))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_surface_vtk(surface: Surface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
+    """Write the mesh with a scalar for each column, in the legacy VTK format that ParaView opens; metres.
+
+    Displacements dx_m, dy_m, dz_m become a vector as well. Errors as of `write_points_csv`.
+    """
+    index = np.flatnonzero(surface.measured)
+    place = np.full(len(surface.x_world), -1)
+    place[index] = np.arange(len(index))
+    faces = place[surface.triangles]
+    parts = [b"# vtk DataFile Version 3.0\nkinefit surface, metres\nBINARY\nDATASET POLYDATA\n"]
+    parts += [f"POINTS {len(index)} double\n".encode(), surface.x_world[index].astype(">f8").tobytes()]
+    cells = np.column_stack([np.full(len(faces), 3), faces]).astype(">i4")
+    parts += [f"\nPOLYGONS {len(faces)} {cells.size}\n".encode(), cells.tobytes()]
+    parts += [f"\nPOINT_DATA {len(index)}\n".encode()]
+    for name, value in columns.items():
+        parts += [f"SCALARS {name} double 1\nLOOKUP_TABLE default\n".encode()]
+        parts += [value[index].astype(">f8").tobytes(), b"\n"]
+    if "dx_m" in columns:
+        moved = np.column_stack([columns[f"d{axis}_m"][index] for axis in "xyz"]).astype(">f8")
+        parts += [b"VECTORS displacement double\n", moved.tobytes(), b"\n"]
+    write_bytes(path, b"".join(parts))
+
+
+def write_field_picture(
+    surface: Surface, image: NDArray, values: NDArray, path: str | PathLike[str], *, title: str, unit: str
+) -> None:
+    """Paint a field over the first camera's image of the state, with a scale: PNG.
+
+    Parameters
+    ----------
+    image : (H, W) grey values of the first camera
+    values : (N,), one for each point; the scale runs from their 1st to their 99th percentile
+    title, unit : written beside the scale
+    """
+    shown = surface.measured & np.isfinite(values)
+    if not shown.any():
+        raise ExportError("nothing measured to paint", file=path, remedy="Look at the correlations in the CSV file.")
+    scale = min(1.0, _LARGEST / max(image.shape))
+    low, high = np.percentile(image, (0.5, 99.5))
+    grey = np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    bottom, top = np.percentile(values[shown], (1, 99))
+    span = max(top - bottom, 1e-12)
+    level = np.clip((values - bottom) / span, 0, 1)
+    level = np.where(shown, level, 0.0)
+    codes = cv2.applyColorMap((255 * level).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)[:, 0]
+    painted = picture.copy()
+    uv = (surface.uv[:, 0] + 0.5) * scale - 0.5
+    for triangle in surface.triangles:
+        if shown[triangle].all():
+            colour = tuple(int(c) for c in codes[triangle].mean(axis=0))
+            cv2.fillConvexPoly(painted, np.rint(uv[triangle] * 8).astype(np.int32), colour, shift=3)
+    picture = cv2.addWeighted(painted, 0.75, picture, 0.25, 0)
+    data = cv2.imencode(".png", np.hstack([picture, _scale(picture.shape[0], bottom, top, title, unit)]))[1]
+    write_bytes(Path(path), data.tobytes())
+
+
+def write_paths_csv(paths: Trajectories, path: str | PathLike[str]) -> None:
+    """Write a row for each point and time: metres, seconds, m/s and m/s². Errors as of `write_points_csv`."""
+    velocity, acceleration = paths.velocity, paths.acceleration
+    names = [*"xyz", *(f"std_{a}" for a in "xyz"), *(f"v{a}" for a in "xyz"), *(f"a{a}" for a in "xyz")]
+    lines = [",".join(["time_s", "point", *names])]
+    for k, time in enumerate(paths.times):
+        index = np.flatnonzero(paths.live[k])
+        table = np.hstack([paths.x_world[k, index], paths.std[k, index], velocity[k, index], acceleration[k, index]])
+        for p, row in zip(index, table):
+            lines.append(f"{time:.6f},{p}," + ",".join(f"{v:.6g}" if np.isfinite(v) else "" for v in row))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_point_picture(uv: NDArray, image: NDArray, path: str | PathLike[str]) -> None:
+    """Draw points (M, 2) [px] on an image (H, W): PNG."""
+    picture = cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    for place in np.rint(uv * 8).astype(int):
+        cv2.circle(picture, (int(place[0]), int(place[1])), 12, (0, 200, 255), -1, cv2.LINE_AA, 3)
+    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _scale(height: int, bottom: float, top: float, title: str, unit: str) -> NDArray:
+    """A bar of colours (height, 2 * _BAR, 3) with its ends and its middle."""
+    out = np.full((height, 2 * _BAR, 3), 255, np.uint8)
+    first, last = min(50, height // 3), height - min(20, height // 5)
+    ramp = np.linspace(255, 0, last - first).astype(np.uint8).reshape(-1, 1)
+    out[first:last, 10:30] = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)
+    for text, y in ((title, 18), (f"[{unit}]", 38)):
+        cv2.putText(out, text, (8, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        y = int(last - 1 - share * (last - first - 1))
+        cv2.putText(
+            out, f"{bottom + share * (top - bottom):.4g}", (36, y + 4), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1,
+            cv2.LINE_AA,
+        )  # fmt: skip
+    return out

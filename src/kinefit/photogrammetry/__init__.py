@@ -1,0 +1,1 @@
+"""Surfaces from images: least-squares matching, region growing, forward intersection, strain, tracking."""

@@ -1,0 +1,100 @@
+"""Compiled strain: planes fitted to positions and displacements over a gauge length, on a grid of points."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+
+# Row of results: E_xx, E_yy, E_xy, their variances, F - 1 (2x2, in the tangent plane), rotation [rad], points.
+COLUMNS = 12
+
+
+@jit
+def strains(x, d, columns, reach, overlap, filled, out):
+    """Green-Lagrange strain of points (N, 3) that moved by d (N, 3), on a grid of `columns` a row.
+
+    Positions and displacements within `reach` rows and columns are each fitted by a plane over the indices i, j; the
+    change of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with a NaN are
+    left out.
+    overlap : factor of the variance for windows of neighbours that share pixels.
+    filled : least part of the (2 reach + 1)² points that must be there. NaN in out (N, 12) where fewer are.
+    """
+    count, height = x.shape[0], x.shape[0] // columns
+    sums, right, a, b, c, e = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    second = np.empty(3)
+    for k in range(count):
+        for i in range(COLUMNS):
+            out[k, i] = math.nan
+        if not abs(x[k, 0]) + abs(d[k, 0]) < math.inf:
+            continue
+        row, column = k // columns, k % columns
+        sums[:] = 0.0
+        right[:] = 0.0
+        square = 0.0
+        for j in range(max(0, row - reach), min(height, row + reach + 1)):
+            for i in range(max(0, column - reach), min(columns, column + reach + 1)):
+                n = j * columns + i
+                if not abs(x[n, 0]) + abs(d[n, 0]) < math.inf:
+                    continue
+                s, t = float(i - column), float(j - row)
+                sums[0], sums[1], sums[2] = sums[0] + 1.0, sums[1] + s, sums[2] + t
+                sums[3], sums[4], sums[5] = sums[3] + s * s, sums[4] + s * t, sums[5] + t * t
+                for axis in range(3):
+                    p, q = x[n, axis] - x[k, axis], d[n, axis] - d[k, axis]
+                    right[0, axis] += p
+                    right[1, axis] += s * p
+                    right[2, axis] += t * p
+                    right[3, axis] += q
+                    right[4, axis] += s * q
+                    right[5, axis] += t * q
+                    square += q * q
+        total = sums[0]
+        if total < filled * (2 * reach + 1) ** 2 or total < 6.0:
+            continue
+        ss, st, tt = (
+            sums[3] - sums[1] * sums[1] / total,
+            sums[4] - sums[1] * sums[2] / total,
+            sums[5] - sums[2] * sums[2] / total,
+        )
+        det = ss * tt - st * st
+        if not det > 1e-6 * ss * tt:
+            continue
+        for axis in range(3):
+            p = right[1, axis] - sums[1] * right[0, axis] / total
+            q = right[2, axis] - sums[2] * right[0, axis] / total
+            a[axis], b[axis] = (tt * p - st * q) / det, (ss * q - st * p) / det
+            p = right[4, axis] - sums[1] * right[3, axis] / total
+            q = right[5, axis] - sums[2] * right[3, axis] / total
+            c[axis], e[axis] = (tt * p - st * q) / det, (ss * q - st * p) / det
+            square -= right[3, axis] ** 2 / total + c[axis] * p + e[axis] * q
+        aa = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+        ab = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / aa
+        for axis in range(3):
+            second[axis] = b[axis] - ab * a[axis] / aa
+        bb = math.sqrt(second[0] ** 2 + second[1] ** 2 + second[2] ** 2)
+        if not (aa > 0.0 and bb > 1e-6 * aa):
+            continue
+        # derivatives along the tangent axes: d/d1 = (d/di) / aa, d/d2 = (d/dj - ab / aa d/di) / bb
+        g11 = g22 = g12 = 0.0
+        f11 = f12 = f21 = f22 = 0.0
+        for axis in range(3):
+            one, two = a[axis] / aa, second[axis] / bb
+            p = c[axis] / aa
+            q = (e[axis] - ab * p) / bb
+            g11 += (one + p) * (one + p)
+            g22 += (two + q) * (two + q)
+            g12 += (one + p) * (two + q)
+            f11, f12, f21, f22 = f11 + one * p, f12 + one * q, f21 + two * p, f22 + two * q
+        out[k, 0], out[k, 1], out[k, 2] = 0.5 * (g11 - 1.0), 0.5 * (g22 - 1.0), 0.5 * g12
+        noise = overlap * (square if square > 0.0 else 0.0) / (3.0 * (total - 3.0))
+        v11 = noise * tt / det / (aa * aa)
+        cross = noise * -st / det
+        v22 = (noise * ss / det - 2.0 * ab / aa * cross + ab * ab * v11) / (bb * bb)
+        v12 = (cross / aa - ab * v11) / bb
+        out[k, 3], out[k, 4], out[k, 5] = g11 * v11, g22 * v22, 0.25 * (g22 * v11 + g11 * v22 + 2.0 * g12 * v12)
+        out[k, 6], out[k, 7], out[k, 8], out[k, 9] = f11, f12, f21, f22
+        out[k, 10] = math.atan2(f21 - f12, 2.0 + f11 + f22)
+        out[k, 11] = total

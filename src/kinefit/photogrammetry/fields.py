@@ -1,0 +1,40 @@
+"""Interlaced video: its odd or even lines alone, which were taken at one instant, and cameras that see them so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError
+from kinefit.geometry.camera import Camera
+
+Field = Literal["odd", "even"]
+
+
+def field_of(image: NDArray, field: Field) -> NDArray:
+    """Lines of a field: "odd" are the first, third and so on, as the paper counts; half as high."""
+    return np.ascontiguousarray(image[_first(field) :: 2])
+
+
+def field_camera(camera: Camera, field: Field) -> Camera:
+    """Camera whose image are the lines of a field of another's: same rays, half the pixels down.
+
+    Raises
+    ------
+    CalibrationError
+        An image of a single line.
+    """
+    width, height = camera.size
+    if height < 2:
+        raise CalibrationError("an image of one line", place=f"camera {camera.name}", remedy="It has no fields.")
+    matrix, start = camera.matrix.copy(), _first(field)
+    matrix[1, 1] *= 0.5
+    matrix[1, 2] = 0.5 * (matrix[1, 2] - start)
+    return replace(camera, size=(width, (height - start + 1) // 2), matrix=matrix)
+
+
+def _first(field: Field) -> int:
+    return 0 if field == "odd" else 1

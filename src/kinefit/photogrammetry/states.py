@@ -1,0 +1,117 @@
+"""A surface in several states, before and after a load: matched against the first, or one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
+from kinefit.photogrammetry.seeds import sift_seeds
+from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.strain import Strain, grid_step, strain
+from kinefit.photogrammetry.surface import Surface, check_images, from_matches, measure
+
+_UNMOVED = 25  # places of the grid that are tried where they were, if no feature is found again
+
+Progress = Callable[[str, int, int], None]
+
+
+def measure_states(
+    rig: Rig,
+    states: Sequence[Sequence[SplineImage]],
+    grid: Grid,
+    *,
+    seeds: Sequence[Seeds] | None = None,
+    window: int | ArrayLike = WINDOW,
+    least: float = LEAST_CORRELATION,
+    constrained: bool | None = None,
+    incremental: bool = False,
+    progress: Progress | None = None,
+) -> list[Surface]:
+    """Measure the same points of a surface in each of several states.
+
+    Parameters
+    ----------
+    states : of each the images of all cameras, in the rig's order
+    grid, seeds, window, least, constrained : as in `measure`, of the first state
+    incremental : False: every image is matched with the first one of the first camera, so that errors do not add up.
+        True: with the state before, for motions so large that the first image is not recognised any more
+    progress : called with what is done, and how many states of how many
+
+    Returns
+    -------
+    list of Surface
+        Points of one row are the same material points; NaN where one is lost.
+    """
+    if not states:
+        raise ObservationError("no state", remedy="Give the images of one time, or more.")
+    for images in states:
+        check_images(rig, images)
+    out = [measure(rig, states[0], grid, seeds=seeds, window=window, least=least, constrained=constrained)]
+    template, places = states[0][0], grid
+    for k, images in enumerate(states[1:], 1):
+        if progress is not None:
+            progress("states", k, len(states))
+        own = _found_again(template, images[0], places, window, least)
+        here = replace(places, points=own.uv)
+        source, base = (images[0], here) if incremental else (template, places)
+        others = [_found_again(source, image, base, window, least) for image in images[1:]]
+        out.append(from_matches(rig, grid, own, others))
+        if incremental:
+            template, places = images[0], here
+    if progress is not None:
+        progress("states", len(states), len(states))
+    return out
+
+
+def _found_again(
+    first: SplineImage, second: SplineImage, grid: Grid, window: int | ArrayLike, least: float
+) -> Matches:
+    """A grid of one image in another, from features of both; from where it was, if they share none."""
+    seeds = sift_seeds(first, second)
+    if not len(seeds.first):
+        spots = grid.points[grid.inside]
+        if not len(spots):
+            raise ObservationError("the surface is lost", remedy="Take more images between, or leave this one out.")
+        spots = spots[:: max(1, len(spots) // _UNMOVED)]
+        seeds = Seeds.of(spots, spots)
+    return grow(first, second, grid, seeds, window=window, least=least)
+
+
+def surface_strain(reference: Surface, state: Surface, gauge: float, window: int = 0) -> Strain:
+    """Strain from one state of a surface to another.
+
+    Parameters
+    ----------
+    gauge : [m] length over which it is taken
+    window : [px] side of the matching windows
+    """
+    step = grid_step(reference.x_world, reference.grid.columns)
+    side = window * step / reference.grid.step if np.isfinite(step) else 0.0
+    moved = state.x_world - reference.x_world
+    return strain(reference.x_world, moved, reference.grid.columns, gauge=gauge, window=side)
+
+
+def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
+    """Rigid motion of points (N, 3) [m] by least squares, and what it leaves over.
+
+    Returns
+    -------
+    T_state_reference : (4, 4)
+    residual : (N, 3) [m]; NaN where a point is missing
+    """
+    seen = np.isfinite(reference).all(axis=1) & np.isfinite(state).all(axis=1)
+    if seen.sum() < 3:
+        raise ObservationError(f"{seen.sum()} points in both states", remedy="Three are needed.")
+    a, b = reference[seen], state[seen]
+    U, _, V = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
+    T[:3, 3] = b.mean(axis=0) - T[:3, :3] @ a.mean(axis=0)
+    return T, state - (reference @ T[:3, :3].T + T[:3, 3])

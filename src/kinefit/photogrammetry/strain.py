@@ -1,0 +1,107 @@
+"""Strain of a measured surface or image: how the distances on it changed, over a stated gauge length."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.photogrammetry import _kernels_strain as kernels
+
+_FILLED = 0.5  # part of a gauge's points without which a derivative would be of one side only
+
+
+@dataclass(frozen=True, eq=False)
+class Strain:
+    """Green-Lagrange strain on a grid, in tangent planes whose first axis runs along the grid's rows.
+
+    Parameters
+    ----------
+    xx, yy, xy : (N,) E = (F'F - 1) / 2; NaN where less than half of the gauge is measured
+    std_xx, std_yy, std_xy : (N,) standard deviations, from how the displacements scatter about the planes
+    first, second : (N,) principal strains, first >= second
+    angle : (N,) [rad] of the first principal direction from the grid's rows
+    rotation : (N,) [rad] in the tangent plane
+    gradient : (N, 2, 2) of the displacement in the tangent plane, F - 1
+    gauge : length over which each is measured: from the first to the last point of a row, in `unit`
+    unit : "m" or "px"
+    """
+
+    xx: NDArray
+    yy: NDArray
+    xy: NDArray
+    std_xx: NDArray
+    std_yy: NDArray
+    std_xy: NDArray
+    first: NDArray
+    second: NDArray
+    angle: NDArray
+    rotation: NDArray
+    gradient: NDArray
+    gauge: float
+    unit: str
+
+    def rms(self) -> dict[str, float]:
+        """RMS of the components: of a still pair, the noise floor."""
+        return {name: float(np.sqrt(np.nanmean(getattr(self, name) ** 2))) for name in ("xx", "yy", "xy")}
+
+
+def strain(
+    reference: ArrayLike, displacement: ArrayLike, columns: int, *, gauge: float, window: float = 0.0, unit: str = "m"
+) -> Strain:
+    """Strain of a grid of points that moved.
+
+    Parameters
+    ----------
+    reference : (N, 2) [px] or (N, 3) [m], a grid of `columns` points a row, of the state that the strain is told
+        against
+    displacement : (N, 2 or 3) from there
+    gauge : length over which derivatives are taken, in the unit of `reference`: the planes reach over the points within
+        half of it on either side
+    window : side of the matching windows, in the same unit: where it is more than the grid's step, neighbours share
+        pixels and err alike, and the standard deviations grow accordingly
+
+    Raises
+    ------
+    ObservationError
+        Shapes that do not fit, or a gauge of less than two steps of the grid.
+    """
+    x, d = np.asarray(reference, float), np.asarray(displacement, float)
+    if x.ndim != 2 or x.shape != d.shape or x.shape[1] not in (2, 3) or columns < 2 or len(x) % columns:
+        problem = f"points {x.shape}, displacements {d.shape}, {columns} a row"
+        raise ObservationError(problem, remedy="Give a whole grid, (N, 2) or (N, 3), and as many displacements.")
+    if x.shape[1] == 2:
+        x, d = (np.concatenate([a, np.zeros((len(a), 1))], axis=1) for a in (x, d))
+        d[~np.isfinite(d).all(axis=1)] = np.nan
+    step = grid_step(x, columns)
+    reach = int(gauge / (2 * step) + 1e-6)
+    if not (np.isfinite(step) and reach >= 1):
+        problem = f"a gauge of {gauge:g} {unit} on a grid of step {step:g} {unit}"
+        raise ObservationError(problem, remedy="Take a gauge of two steps or more, or a finer grid.")
+    out = np.empty((len(x), kernels.COLUMNS))
+    missing = ~(np.isfinite(x).all(axis=1) & np.isfinite(d).all(axis=1))
+    x, d = np.where(missing[:, None], np.nan, x), np.where(missing[:, None], np.nan, d)
+    kernels.strains(x, d, columns, reach, _overlap(window / step) ** 2, _FILLED, out)
+    xx, yy, xy = out[:, 0], out[:, 1], out[:, 2]
+    mean, radius = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    std = np.sqrt(out[:, 3:6])
+    return Strain(
+        xx, yy, xy, std[:, 0], std[:, 1], std[:, 2], mean + radius, mean - radius, 0.5 * np.arctan2(2 * xy, xx - yy),
+        out[:, 10], out[:, 6:10].reshape(-1, 2, 2), 2 * reach * step, unit,
+    )  # fmt: skip
+
+
+def grid_step(points: NDArray, columns: int) -> float:
+    """Median distance of neighbours on a grid (N, 3), NaN where there are none."""
+    grid = points.reshape(-1, columns, points.shape[1])
+    gaps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
+    gaps = gaps[np.isfinite(gaps)]
+    return float(np.median(gaps)) if len(gaps) else np.nan
+
+
+def _overlap(ratio: float) -> float:
+    """Factor of a mean's variance, along one axis, where windows are `ratio` times as long as their step."""
+    lags = np.arange(1, int(np.ceil(ratio)) + 1)
+    return float(1.0 + 2.0 * np.maximum(0.0, 1.0 - lags / ratio).sum()) if ratio > 1.0 else 1.0

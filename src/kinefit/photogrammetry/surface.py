@@ -1,0 +1,234 @@
+"""A surface from images of one time: matched, intersected, with standard deviations and a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import CalibrationError, ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.photogrammetry.correlation import search_box
+from kinefit.photogrammetry.intersection import intersect
+from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
+from kinefit.photogrammetry.multi_image import match_along_rays
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
+from kinefit.photogrammetry.seeds import sift_seeds
+from kinefit.photogrammetry.spline_image import SplineImage
+
+_EXACT = 1e-6  # [px²] of the template's own place, which defines the point
+_FEWEST = 3  # points of a surface
+_ALIKE = 0.95  # of the best correlation; of random texture the runner-up has 0.6 to 0.8 of it
+_OUTLYING = 6.0  # robust deviations of the parallax beyond which a match is a wrong one
+_LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration leaves as much
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A measured surface.
+
+    Parameters
+    ----------
+    grid : of the first camera's image in which the points were chosen
+    cameras : names
+    x_world : (N, 3) [m], one for each place of the grid; NaN where not measured
+    covariance : (N, 3, 3) [m²] by the matches
+    uv : (N, C, 2) [px] in each camera; NaN where not matched
+    correlation : (N,) the lowest of the matches
+    parallax : (N,) [px] by which the rays miss each other in the images
+    deformation : (N, C - 1, 2, 2) of an offset in the first image to each other one
+    """
+
+    grid: Grid
+    cameras: tuple[str, ...]
+    x_world: NDArray
+    covariance: NDArray
+    uv: NDArray
+    correlation: NDArray
+    parallax: NDArray
+    deformation: NDArray
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(N,) which points there are."""
+        return np.isfinite(self.x_world).all(axis=1)
+
+    @property
+    def std(self) -> NDArray:
+        """(N, 3) [m] standard deviations along the world's axes."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def triangles(self) -> NDArray[np.int64]:
+        """(M, 3) of the mesh, whose front faces the first camera."""
+        return self.grid.triangles(self.measured)
+
+
+def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
+    """Refuse images that are not those of the cameras.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than two, or another number than cameras.
+    CalibrationError
+        An image of another size than its camera's calibration.
+    """
+    if len(images) != len(rig) or len(rig) < 2:
+        raise ObservationError(f"{len(images)} images for {len(rig)} cameras", remedy="Give one of each, two or more.")
+    for camera, image in zip(rig, images):
+        if camera.size != image.size:
+            has, was = ("x".join(map(str, size)) for size in (image.size, camera.size))
+            problem = f"its image has {has} px, its calibration {was}"
+            remedy = "Give images as they were calibrated, or calibrate the camera at this size."
+            raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
+
+
+def measure(
+    rig: Rig,
+    images: Sequence[SplineImage],
+    grid: Grid,
+    *,
+    seeds: Sequence[Seeds] | None = None,
+    window: int | ArrayLike = WINDOW,
+    least: float = LEAST_CORRELATION,
+    constrained: bool | None = None,
+) -> Surface:
+    """Measure a surface that two or more cameras see at one time.
+
+    Parameters
+    ----------
+    rig, images : C cameras, and the image of each; the first holds the grid
+    seeds : from the first image to each other one, C - 1 of them; default: SIFT features that agree with the cameras
+    window : odd side [px] of all windows, or of each place of the grid
+    least : correlation of a match
+    constrained : match all images at once, along the cameras' rays (`match_along_rays`), after each was grown alone.
+        Default: with three cameras or more, where it gains; it trusts the calibration to a fraction of a pixel
+
+    Raises
+    ------
+    ObservationError, CalibrationError
+        As `check_images`; no texture, nothing in common; rays that are all but parallel.
+    """
+    check_images(rig, images)
+    first = images[0]
+    halves_of(window, len(grid.points))
+    started = seeds if seeds is not None else [
+        sift_seeds(first, image, (rig.cameras[0], camera)) for image, camera in zip(images[1:], rig.cameras[1:])
+    ]  # fmt: skip
+    if len(started) != len(rig) - 1:
+        raise ObservationError(f"seeds of {len(started)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
+    found = []
+    for camera, image, start in zip(rig.cameras[1:], images[1:], started):
+        if not len(start.first):
+            _refuse(first, camera.name)
+        found.append(grow(first, image, grid, start, window=window, least=least))
+        if found[-1].found.sum() < _FEWEST:
+            _refuse(first, camera.name)
+        if seeds is None:
+            _refuse_repeated(first, image, found[-1], camera.name)
+    surface = from_matches(rig, grid, None, found)
+    if constrained if constrained is not None else len(rig) > 2:
+        surface = match_rays(rig, images, surface, found, window=window, least=least)
+    return surface
+
+
+def _refuse(first: SplineImage, camera: str) -> None:
+    """Say why nothing was matched."""
+    contrast = float(np.std(first.grey))
+    if contrast < 3.0 * first.noise:
+        problem = f"no texture coarser than noise: grey values scatter by {contrast:.1f}, noise by {first.noise:.1f}"
+        raise ObservationError(problem, place="first camera", remedy="Put texture on the surface, or light it better.")
+    problem = "nothing of the first image is found in it"
+    remedy = "Give seeds by hand, a larger window, or a mask; texture that repeats is found nowhere for sure."
+    raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
+
+
+def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, camera: str) -> None:
+    """Refuse texture that looks the same again nearby, where nobody said which place is meant.
+
+    Of 50 points windows of 13 px are sought about their matches; texture repeats where most are as well found
+    elsewhere.
+    """
+    index = np.flatnonzero(found.found)
+    index = index[np.linspace(0, len(index) - 1, min(len(index), 50)).astype(int)]
+    told = search_box(first, second, found.points[index], found.uv[index], reach=3 * WINDOW)
+    seen = np.isfinite(told.best)
+    if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
+        problem = "texture that repeats: most points are found as well elsewhere, so their distance is not known"
+        raise ObservationError(problem, place=f"camera {camera}", remedy="Give seeds by hand: they say where.")
+
+
+def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> Surface:
+    """Intersect matches of a grid; those whose parallax is far from the others' are left out.
+
+    Parameters
+    ----------
+    own : in the first camera, where the grid is another time's; None: the grid's places themselves
+    others : in each other camera
+    """
+    inside = grid.inside[:, None, None]
+    place = np.where(grid.inside[:, None], grid.points, np.nan) if own is None else own.uv
+    exact = np.where(inside, _EXACT * np.eye(2), np.nan) if own is None else own.covariance
+    uv = np.stack([place, *(m.uv for m in others)], axis=1)
+    covariance = np.stack([exact, *(m.covariance for m in others)], axis=1)
+    told = intersect(rig, uv, covariance)
+    seen = [m.correlation for m in (*others, *([own] if own else []))]
+    correlation = np.min([np.where(np.isfinite(c), c, 1.0) for c in seen], axis=0)
+    gap = told.parallax
+    good = gap <= largest_parallax(gap)
+    keep = good[:, None, None]
+    return Surface(
+        grid, rig.names, np.where(keep[..., 0], told.x_world, np.nan), np.where(keep, told.covariance, np.nan),
+        np.where(keep, uv, np.nan), np.where(good, correlation, np.nan), np.where(good, gap, np.nan),
+        np.stack([m.deformation for m in others], axis=1),
+    )  # fmt: skip
+
+
+def largest_parallax(gaps: NDArray) -> float:
+    """[px] by which rays may miss each other, by what most (N,) do: more is a wrong match, not the calibration."""
+    told = gaps[np.isfinite(gaps)]
+    if not len(told):
+        return _LEAST_PARALLAX
+    middle = np.median(told)
+    return max(_LEAST_PARALLAX, float(middle + _OUTLYING * 1.4826 * np.median(np.abs(told - middle))))
+
+
+def match_rays(
+    rig: Rig,
+    images: Sequence[SplineImage],
+    surface: Surface,
+    found: Sequence[Matches],
+    *,
+    window: int | ArrayLike = WINDOW,
+    least: float = LEAST_CORRELATION,
+) -> Surface:
+    """Match all images of a surface at once along the first camera's rays, from where it was measured.
+
+    Parameters
+    ----------
+    found : matches in the other cameras, whose deformations are the starts
+    """
+    at = surface.grid.points
+    distance = np.linalg.norm(surface.x_world - rig.cameras[0].centre_world, axis=1)
+    maps = np.stack([m.deformation for m in found], axis=1)
+    told = match_along_rays(rig, images, at, distance, maps, window=window)
+    good = told.found & (told.correlation >= least)
+    covariance = np.einsum("n,ni,nj->nij", told.variance, told.rays, told.rays)
+    across = _across(rig, told.rays, told.distance)
+    uv = np.stack([at, *(camera.project(told.x_world) for camera in rig.cameras[1:])], axis=1)
+    uv[:, 1:][~told.used] = np.nan
+    keep = good[:, None]
+    return Surface(
+        surface.grid, rig.names, np.where(keep, told.x_world, np.nan),
+        np.where(keep[..., None], covariance + across, np.nan), np.where(keep[..., None], uv, np.nan),
+        np.where(good, told.correlation, np.nan), np.where(good, told.parallax, np.nan), surface.deformation,
+    )  # fmt: skip
+
+
+def _across(rig: Rig, rays: NDArray, distance: NDArray) -> NDArray:
+    """(N, 3, 3) [m²] of the template's place across its ray, so that a covariance can be inverted."""
+    focal = rig.cameras[0].matrix[0, 0]
+    return np.einsum("n,nij->nij", _EXACT * (distance / focal) ** 2, np.eye(3) - np.einsum("ni,nj->nij", rays, rays))

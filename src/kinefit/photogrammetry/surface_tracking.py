@@ -1,0 +1,226 @@
+"""Points of a surface followed through videos: temporal matching in each view, spatial matching as the check.
+
+N. D'Apuzzo, R. Plänkers, P. Fua, A. Gruen and D. Thalmann, Modeling human bodies from video sequences (1999), section
+2.4: linear prediction, a search box scanned by cross-correlation, least-squares matching to the next image in every
+view, and between the views where the points ended up; a point is kept if both agree. Lost points are regenerated, and
+new ones made as they become visible, from the neighbours that are there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError, TrackingError
+from kinefit.geometry.camera import Rig
+from kinefit.photogrammetry.correlation import search_box
+from kinefit.photogrammetry.intersection import intersect
+from kinefit.photogrammetry.least_squares_matching import WINDOW, match
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.surface import check_images, largest_parallax, measure
+from kinefit.photogrammetry.trajectories import Trajectories
+
+_BEYOND = 3.0  # standard deviations by which temporal and spatial matches may differ beyond the stated agreement
+
+
+@dataclass(frozen=True)
+class SurfaceTracking:
+    """How a surface is followed.
+
+    Parameters
+    ----------
+    window : odd side [px] of the windows
+    step : [px] of the grid on which points are made and made again
+    reach : [px] from where a point is predicted to the sides of its search box
+    least : correlation of a match
+    agreement : [px] by which spatial and temporal match may differ
+    regenerate : whether places of the grid that lost their point get a new one
+    """
+
+    window: int = WINDOW
+    step: int = 8
+    reach: int = 8
+    least: float = LEAST_CORRELATION
+    agreement: float = 0.5
+    regenerate: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of a surface at one time.
+
+    Parameters
+    ----------
+    ids : (M,) int; the same for the same point of the surface at all times
+    x_world : (M, 3) [m]
+    covariance : (M, 3, 3) [m²]
+    uv : (M, C, 2) [px]
+    deformation : (M, C - 1, 2, 2) from the first image to each other one
+    """
+
+    ids: NDArray[np.int64]
+    x_world: NDArray
+    covariance: NDArray
+    uv: NDArray
+    deformation: NDArray
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def only(self, keep: NDArray) -> SurfacePoints:
+        """Some of them, by index or mask."""
+        return SurfacePoints(*(value[keep] for value in vars(self).values()))
+
+
+@dataclass(eq=False)
+class SurfaceTracker:
+    """Follows a surface through images of synchronised cameras; `update` once a frame, `trajectories` at the end.
+
+    Parameters
+    ----------
+    rig : two cameras or more; points are chosen in the first one's image
+    rate : [Hz]
+    settings : SurfaceTracking
+    mask : (H, W) bool, where in the first camera's first image the surface is; regenerated points need live neighbours,
+        and so stay with it
+    seeds : as of `measure`, for the first frame
+    """
+
+    rig: Rig
+    rate: float
+    settings: SurfaceTracking = SurfaceTracking()
+    mask: NDArray | None = None
+    seeds: Sequence[Seeds] | None = None
+    _frames: list[SurfacePoints] = field(default_factory=list)
+    _images: Sequence[SplineImage] = ()
+    _velocity: NDArray = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    _next: int = 0
+
+    def update(self, images: Sequence[SplineImage]) -> SurfacePoints:
+        """Follow the surface into the next images, one of each camera.
+
+        Raises
+        ------
+        ObservationError, CalibrationError
+            As `measure`, of the first images; images of other sizes.
+        TrackingError
+            No point is left.
+        """
+        check_images(self.rig, images)
+        if not self._frames:
+            now, velocity = self._started(images), None
+        else:
+            now, velocity = self._followed(images)
+        if len(now) == 0:
+            problem = f"no point of the surface is left in frame {len(self._frames)}"
+            raise TrackingError(problem, remedy="A larger reach or window, more light, or a shorter exposure may help.")
+        self._velocity = np.zeros_like(now.uv) if velocity is None else velocity
+        if velocity is not None and self.settings.regenerate:
+            more = self._regenerated(images, now)
+            shift = _of_nearest(now.uv[:, 0], self._velocity, more.uv[:, 0])
+            self._velocity = np.concatenate([self._velocity, shift])
+            now = SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(now).values(), vars(more).values())))
+        self._images = images
+        self._frames.append(now)
+        return now
+
+    def trajectories(self) -> Trajectories:
+        """All points over all frames so far."""
+        if not self._frames:
+            raise ObservationError("no frame was given", remedy="Call `update` first.")
+        shape = (len(self._frames), self._next)
+        x, std = np.full((*shape, 3), np.nan), np.full((*shape, 3), np.nan)
+        uv = np.full((*shape, len(self.rig), 2), np.nan)
+        for k, points in enumerate(self._frames):
+            x[k, points.ids], uv[k, points.ids] = points.x_world, points.uv
+            std[k, points.ids] = np.sqrt(np.diagonal(points.covariance, axis1=1, axis2=2))
+        return Trajectories(np.arange(len(self._frames)) / self.rate, x, std, uv)
+
+    def _started(self, images: Sequence[SplineImage]) -> SurfacePoints:
+        settings = self.settings
+        grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
+        surface = measure(
+            self.rig, images, grid, seeds=self.seeds, window=settings.window, least=settings.least, constrained=False
+        )
+        index = np.flatnonzero(surface.measured)
+        kept = (surface.x_world, surface.covariance, surface.uv, surface.deformation)
+        return SurfacePoints(self._new(len(index)), *(value[index] for value in kept))
+
+    def _new(self, count: int) -> NDArray[np.int64]:
+        """Names of new points."""
+        self._next += count
+        return np.arange(self._next - count, self._next)
+
+    def _followed(self, images: Sequence[SplineImage]) -> tuple[SurfacePoints, NDArray]:
+        """Points of the last frame that are found in this one, and their motion in the images (M, C, 2) [px]."""
+        last, settings = self._frames[-1], self.settings
+        uv, covariance = np.empty_like(last.uv), np.empty((*last.uv.shape, 2))
+        good = np.ones(len(last), bool)
+        for c, (old, new) in enumerate(zip(self._images, images)):
+            predicted = last.uv[:, c] + self._velocity[:, c]
+            box = search_box(old, new, last.uv[:, c], predicted, reach=settings.reach, window=settings.window)
+            start = np.where(np.isfinite(box.uv), box.uv, predicted)
+            found = match(old, new, last.uv[:, c], start, window=settings.window)
+            uv[:, c], covariance[:, c] = found.uv, found.covariance
+            good &= found.found & (found.correlation >= settings.least)
+        kept, own = last.only(good), covariance[good]
+        uv = uv[good]
+        velocity, maps = uv - kept.uv, kept.deformation.copy()
+        agree = np.ones(len(uv), bool)
+        for c in range(1, len(images)):
+            told = match(images[0], images[c], uv[:, 0], uv[:, c], deformation=maps[:, c - 1], window=settings.window)
+            gap = np.linalg.norm(told.uv - uv[:, c], axis=1)
+            spread = np.sqrt(np.trace(told.covariance + own[:, c], axis1=1, axis2=2))
+            agree &= told.found & (told.correlation >= settings.least) & (gap <= settings.agreement + _BEYOND * spread)
+            uv[:, c], own[:, c], maps[:, c - 1] = told.uv, told.covariance, told.deformation
+        meet = intersect(self.rig, uv, own)
+        agree &= meet.parallax <= largest_parallax(meet.parallax[agree])
+        now = SurfacePoints(kept.ids, meet.x_world, meet.covariance, uv, maps).only(agree)
+        return now, velocity[agree]
+
+    def _regenerated(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
+        """New points where the grid has none, next to those that are there."""
+        grid = Grid.of(images[0].size, self.settings.step, margin=self.settings.window // 2 + 2)
+        cell = np.rint((now.uv[:, 0] - grid.points[0]) / grid.step).astype(int)
+        rows = len(grid.points) // grid.columns
+        taken = np.zeros((rows + 2, grid.columns + 2), bool)
+        taken[np.clip(cell[:, 1], -1, rows) + 1, np.clip(cell[:, 0], -1, grid.columns) + 1] = True
+        near = taken.copy()  # at most one cell from a live point: a surface grows by its step a frame
+        for axis in (0, 1):
+            near |= np.roll(near, 1, axis) | np.roll(near, -1, axis)
+        free = (near & ~taken)[1:-1, 1:-1].ravel()
+        if not free.any():
+            return now.only(np.zeros(0, int))
+        return self._beside(images, now, grid.points[free])
+
+    def _beside(self, images: Sequence[SplineImage], now: SurfacePoints, at: NDArray) -> SurfacePoints:
+        """Points at places (K, 2) [px] of the first image, started from the maps of the nearest live ones."""
+        settings, near = self.settings, _nearest(now.uv[:, 0], at)
+        uv = np.repeat(at[:, None], len(images), axis=1)
+        covariance = np.tile(1e-6 * np.eye(2), (len(at), len(images), 1, 1))
+        maps, good = now.deformation[near].copy(), np.ones(len(at), bool)
+        for c in range(1, len(images)):
+            start = now.uv[near, c] + np.einsum("nij,nj->ni", maps[:, c - 1], at - now.uv[near, 0])
+            told = match(images[0], images[c], at, start, deformation=maps[:, c - 1], window=settings.window)
+            close = np.linalg.norm(told.uv - start, axis=1) <= settings.step / 2
+            good &= told.found & (told.correlation >= settings.least) & close
+            uv[:, c], covariance[:, c], maps[:, c - 1] = told.uv, told.covariance, told.deformation
+        meet = intersect(self.rig, uv, covariance)
+        good &= meet.parallax <= largest_parallax(meet.parallax[good])
+        index = np.flatnonzero(good)
+        kept = (meet.x_world, meet.covariance, uv, maps)
+        return SurfacePoints(self._new(len(index)), *(value[index] for value in kept))
+
+
+def _nearest(points: NDArray, at: NDArray) -> NDArray[np.int64]:
+    """(K,) index of the nearest of points (M, 2) to each place (K, 2)."""
+    return np.array([np.argmin(((points - place) ** 2).sum(axis=1)) for place in at], np.int64)
+
+
+def _of_nearest(points: NDArray, values: NDArray, at: NDArray) -> NDArray:
+    """Values of the nearest points (M, 2) to places (K, 2)."""
+    return values[_nearest(points, at)] if len(at) else values[:0]

@@ -1,0 +1,115 @@
+"""Paths of surface points: velocity and acceleration, and filters that truncate what is no motion of a surface.
+
+The filters are those of D'Apuzzo et al. (1999), section 2.4.2: bounds on velocity and acceleration, and uniformity of
+the velocity in a small region of space and time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+_OUTLYING = 5.0  # robust deviations of a velocity from its surroundings
+_LEAST_NEIGHBOURS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Points of a surface over time.
+
+    Parameters
+    ----------
+    times : (F,) [s]
+    x_world : (F, P, 3) [m]; NaN where a point is not there
+    std : (F, P, 3) [m] standard deviations along the world's axes
+    uv : (F, P, C, 2) [px]
+    """
+
+    times: NDArray
+    x_world: NDArray
+    std: NDArray
+    uv: NDArray
+
+    @property
+    def live(self) -> NDArray[np.bool_]:
+        """(F, P) which points are there when."""
+        return np.isfinite(self.x_world).all(axis=2)
+
+    @property
+    def velocity(self) -> NDArray:
+        """(F, P, 3) [m/s] by central differences; one-sided at the ends of a path, NaN of single points."""
+        x, t = self.x_world, self.times[:, None, None]
+        step = np.full_like(x, np.nan)
+        step[:-1] = np.diff(x, axis=0) / np.diff(t, axis=0)
+        back = np.full_like(x, np.nan)
+        back[1:] = step[:-1]
+        step, back = np.where(np.isfinite(step), step, back), np.where(np.isfinite(back), back, step)
+        return 0.5 * (step + back)
+
+    @property
+    def acceleration(self) -> NDArray:
+        """(F, P, 3) [m/s²] by second differences; NaN at the ends of a path."""
+        x, t = self.x_world, self.times
+        out = np.full_like(x, np.nan)
+        if len(t) > 2:
+            step = np.diff(x, axis=0) / np.diff(t)[:, None, None]
+            out[1:-1] = np.diff(step, axis=0) / (0.5 * (t[2:] - t[:-2]))[:, None, None]
+        return out
+
+    def kept(self, keep: NDArray[np.bool_], shortest: int = 3) -> Trajectories:
+        """Paths cut at their first place that is not kept (F, P), and removed where fewer than `shortest` are left."""
+        live = self.live
+        good = live & ~np.logical_or.accumulate(live & ~keep, axis=0)
+        good &= good.sum(axis=0) >= shortest
+        cut = ~good
+        x, std, uv = self.x_world.copy(), self.std.copy(), self.uv.copy()
+        x[cut], std[cut], uv[cut] = np.nan, np.nan, np.nan
+        return replace(self, x_world=x, std=std, uv=uv)
+
+
+def within_bounds(paths: Trajectories, *, speed: float, acceleration: float) -> NDArray[np.bool_]:
+    """(F, P) where speed [m/s] and acceleration [m/s²] are within bounds: the first filter.
+
+    Raises
+    ------
+    ObservationError
+        A bound that is not positive.
+    """
+    if not (speed > 0 and acceleration > 0):
+        raise ObservationError(f"bounds {speed} m/s, {acceleration} m/s²", remedy="Give positive ones.")
+    fast = np.linalg.norm(paths.velocity, axis=2) > speed
+    harsh = np.linalg.norm(paths.acceleration, axis=2) > acceleration
+    return paths.live & ~fast & ~harsh
+
+
+def uniform(paths: Trajectories, *, radius: float, frames: int = 1, limit: float | None = None) -> NDArray[np.bool_]:
+    """(F, P) where the velocity is near the median of its surroundings in space and time: the second filter.
+
+    Parameters
+    ----------
+    radius : [m] of the surroundings; `frames` before and after belong to them
+    limit : [m/s] of the difference; default: five robust deviations of all differences
+    """
+    velocity, live = paths.velocity, paths.live
+    off = np.full(live.shape, np.nan)
+    for k in range(len(live)):
+        own = np.flatnonzero(live[k] & np.isfinite(velocity[k]).all(axis=1))
+        span = range(max(0, k - frames), min(len(live), k + frames + 1))
+        around = [(paths.x_world[j], velocity[j]) for j in span]
+        places = np.concatenate([x for x, _ in around])
+        speeds = np.concatenate([v for _, v in around])
+        names = np.tile(np.arange(live.shape[1]), len(around))
+        good = np.isfinite(speeds).all(axis=1)
+        places, speeds, names = places[good], speeds[good], names[good]
+        for p in own:
+            near = (np.abs(places - paths.x_world[k, p]).max(axis=1) <= radius) & (names != p)
+            if near.sum() >= _LEAST_NEIGHBOURS:
+                off[k, p] = np.linalg.norm(velocity[k, p] - np.median(speeds[near], axis=0))
+    if limit is None:
+        told = off[np.isfinite(off)]
+        limit = float(_OUTLYING * 1.4826 * np.median(told)) if len(told) else np.inf
+    return live & ~(off > limit)

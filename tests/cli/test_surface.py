@@ -1,0 +1,139 @@
+"""`kinefit surface`: photographs and videos of drawn planes, a real board, and input that cannot be."""
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.photogrammetry import scenes
+
+from kinefit.cli.surface import surface
+from kinefit.errors import CalibrationError, FileError, ObservationError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.readers.calibration.read import write_calibration
+
+TEXTURE = scenes.Texture(0.005, 3)
+
+
+def call(*words):
+    return CliRunner().invoke(surface, [str(word) for word in words], catch_exceptions=True)
+
+
+def pose(k):
+    return se3.transform(se3.exp_so3(np.array([0.0, 0.1, 0.02 * k])), np.array([0.003 * k, 0.0, 0.002 * k]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Photographs and videos of a plane that moves, by two cameras."""
+    root, rng = tmp_path_factory.mktemp("surface"), np.random.default_rng(0)
+    rig = Rig(scenes.three().cameras[:2])
+    write_calibration(rig, root / "calib.toml")
+    for view in rig:
+        (root / view.name).mkdir()
+        code = cv2.VideoWriter_fourcc(*"MJPG")
+        video = cv2.VideoWriter(str(root / f"{view.name}.avi"), code, 30.0, view.size)
+        video.set(cv2.VIDEOWRITER_PROP_QUALITY, 100)
+        for k in range(4):
+            grey = np.clip(scenes.plane_image(view, TEXTURE, pose(k), 1.0, rng).grey, 0, 255).astype(np.uint8)
+            if k < 3:
+                cv2.imwrite(str(root / view.name / f"{k}.png"), grey)
+            video.write(np.repeat(grey[..., None], 3, axis=2))
+        video.release()
+    return root
+
+
+def test_help_has_examples():
+    told = call("--help").output
+    assert "CAMERA=PATH" in told and "--gauge" in told and "folders: states" in told
+
+
+def test_photographs_of_states_become_tables_meshes_and_pictures(folder, tmp_path):
+    out = tmp_path / "out"
+    result = call(
+        folder / "calib.toml", f"a={folder / 'a'}", f"b={folder / 'b'}", "-o", out, "--step", 10, "--window", 17,
+        "--gauge", 100, "--still", 2,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "noise floor" in result.output and "state 2" in result.output
+    names = {path.name for path in out.iterdir()}
+    assert {"points_000.csv", "surface_002.vtk", "std_001.png", "displacement_002.png", "strain_xx_001.png"} <= names
+    with (out / "points_002.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    x = np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in rows])
+    assert len(x) > 100
+    assert np.abs(se3.apply(se3.inverse(pose(2)), x)[:, 2]).max() < 2e-3
+    strains = np.array([float(row["strain_xx"]) for row in rows if row["strain_xx"]])
+    assert len(strains) > 20 and np.abs(strains).max() < 0.02
+
+
+def test_videos_are_tracked(folder, tmp_path):
+    out = tmp_path / "out"
+    views = f"a={folder / 'a.avi'}", f"b={folder / 'b.avi'}"
+    result = call(folder / "calib.toml", *views, "-o", out, "--step", 15)
+    assert result.exit_code == 0, result.output
+    assert "4 frames" in result.output
+    with (out / "trajectories.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    last = [row for row in rows if float(row["time_s"]) == pytest.approx(0.1)]
+    assert len(last) > 30
+    told = call(folder / "calib.toml", *views, "-o", out, "--gauge", 3)
+    assert isinstance(told.exception, ObservationError) and "--gauge with videos" in str(told.exception)
+
+
+def test_a_real_board_from_seeds_by_hand_is_flat(data_dir, tmp_path):
+    pictures = data_dir("stereo_opencv_chessboard")
+    corners = []
+    for name in ("left01", "right01"):
+        grey = cv2.imread(str(pictures / f"{name}.jpg"), cv2.IMREAD_GRAYSCALE)
+        found = cv2.findChessboardCorners(grey, (9, 6))[1]
+        corners.append(cv2.cornerSubPix(grey, found, (4, 4), (-1, -1), (3, 30, 0.01)).reshape(-1, 2))
+    np.savetxt(tmp_path / "seeds.csv", np.hstack(corners), delimiter=",", header="u1,v1,u2,v2", comments="")
+    mask = np.zeros((480, 640), np.uint8)
+    cv2.fillConvexPoly(mask, np.rint(corners[0][[0, 8, 53, 45]]).astype(np.int32), 255)
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    result = call(
+        pictures, f"left={pictures / 'left01.jpg'}", f"right={pictures / 'right01.jpg'}", "--unit", 0.025,
+        "--window", 41, "--seeds", tmp_path / "seeds.csv", "--mask", tmp_path / "mask.png", "--step", 8,
+        "-o", tmp_path / "out",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    with (tmp_path / "out" / "points_000.csv").open() as file:
+        x = np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in csv.DictReader(file)])
+    assert len(x) > 300
+    normal = np.linalg.svd(x - x.mean(axis=0))[2][-1]
+    assert np.median(np.abs((x - x.mean(axis=0)) @ normal)) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("words", "error", "text"),
+    [
+        (["a={0}/a"], ObservationError, "1 views"),
+        (["a={0}/a", "{0}/b"], ObservationError, "CAMERA=PATH"),
+        (["a={0}/a", "b={0}/b/0.png"], ObservationError, "photographs: 3, 1"),
+        (["a={0}/a", "b={0}/b.avi"], ObservationError, "1 videos"),
+        (["a={0}/a", "nose={0}/b"], CalibrationError, "no camera 'nose'"),
+        (["a={0}/a", "b={0}/nothing*"], FileError, "no images"),
+        (["a={0}/a", "b={0}/b", "--window", "even"], ObservationError, "window of 'even'"),
+        (["a={0}/a", "b={0}/b", "--window", "14"], ObservationError, "odd number"),
+        (["a={0}/a", "b={0}/b", "--still", "7"], ObservationError, "state 7 of 3"),
+        (["a={0}/a", "b={0}/b", "--seeds", "{0}/calib.toml"], FileError, "cannot be read"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(folder, tmp_path, words, error, text):
+    result = call(folder / "calib.toml", *(word.format(folder) for word in words), "-o", tmp_path / "out")
+    assert isinstance(result.exception, error), result.output
+    assert text in str(result.exception)
+    assert not (tmp_path / "out").exists()
+
+
+def test_interlaced_photographs_and_seeds_of_too_few_columns(folder, tmp_path):
+    views = f"a={folder / 'a' / '0.png'}", f"b={folder / 'b' / '0.png'}"
+    result = call(folder / "calib.toml", *views, "--field", "odd", "-o", tmp_path / "out", "--step", 10)
+    assert result.exit_code == 0, result.output
+    assert "state 0" in result.output
+    (tmp_path / "seeds.csv").write_text("1,2,3\n")
+    told = call(folder / "calib.toml", *views, "--seeds", tmp_path / "seeds.csv", "-o", tmp_path / "out")
+    assert isinstance(told.exception, FileError) and "3 columns for 2 views" in str(told.exception)
