@@ -27,6 +27,9 @@ UP_AXES = {
 }
 
 
+_AT_ONCE = 2000  # frames of which all segments' poses are made at once
+
+
 def rotation_between_up(source: str, target: str) -> NDArray:
     """(3, 3) rotation that takes a world with vertical axis `source` to one with vertical axis `target`.
 
@@ -134,8 +137,16 @@ class Motion:
 
     def __post_init__(self) -> None:
         for name in ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"):
-            array = np.array(getattr(self, name), dtype=float)
-            array.flags.writeable = False
+            array = getattr(self, name)
+            mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
+            if not mine or array.flags.writeable:
+                try:
+                    array = np.array(array, dtype=float)  # nobody else's
+                except (TypeError, ValueError) as error:
+                    problem = f"{name} of a motion is a {type(array).__name__} that is no array of numbers"
+                    remedy = "Give arrays of as many frames as there are times."
+                    raise ObservationError(problem, remedy=remedy) from error
+                array.flags.writeable = False
             object.__setattr__(self, name, array)
         if self.up not in UP_AXES:
             raise ObservationError(choices("vertical axis", self.up, UP_AXES))
@@ -181,7 +192,10 @@ class Motion:
     @property
     def joint_centres(self) -> NDArray:
         """(F, S, 3) [m] joint centres in the world, in the order of `body.joints`; `joint_std` are their deviations."""
-        return self.segment_poses()[..., :3, 3]
+        starts = range(0, max(len(self), 1), _AT_ONCE)
+        poses = (self.body.tree.segment_poses(self.Ts_world_root[i : i + _AT_ONCE], self.angles[i : i + _AT_ONCE])
+                 for i in starts)  # fmt: skip
+        return np.concatenate([T[..., :3, 3].copy() for T in poses])
 
     def to_dataframe(self) -> Any:
         """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.

@@ -94,6 +94,22 @@ def run(*args):
     return told
 
 
+def test_only_the_take_s_frames_are_looked_through(take, networks, change):
+    change(take, "[take]\n", "[take]\nframes = [2, 5]\n")
+    ensure_detections(read_take(take))
+    first = networks.pictures
+    assert 4 * 5 <= first < 4 * 8  # one more at both ends; the first picture is looked at twice
+    found = read_detections(detections_file(take, "cam03"))
+    assert len(found) == 12 and np.flatnonzero(found.seen[:, 0]).tolist() == [1, 2, 3, 4, 5]
+    assert found.mask(5, 0).any() and found.mask(6, 0) is None and found.mask(0, 0) is None
+    change(take, "[2, 5]", "[3, 4]")
+    ensure_detections(read_take(take))
+    assert networks.pictures == first
+    change(take, "[3, 4]", "[3, 9]")
+    ensure_detections(read_take(take))
+    assert networks.pictures >= first + 4 * 8
+
+
 def test_every_video_of_a_take_is_looked_through_once(take, networks):
     told = run(take)
     assert told.exit_code == 0, told.output

@@ -246,8 +246,14 @@ ARGUMENTS = {
 }
 
 
-@pytest.mark.parametrize("name", ARGUMENTS)
-@pytest.mark.parametrize("kind", KINDS)
+def arguments():
+    long = ("depth", "size")  # a size from depth images alone
+    for kind in KINDS:
+        for name in ARGUMENTS:
+            yield pytest.param(kind, name, marks=pytest.mark.slow if (kind, name) == long else ())
+
+
+@pytest.mark.parametrize(("kind", "name"), list(arguments()))
 def test_an_argument_of_track_acts_or_is_refused(kind, name, folder):
     read = read_take(folder / kind / "take.toml")
     body = read_motion(read.start).body if read.start else load_body(read.body)
@@ -272,8 +278,9 @@ def test_an_argument_of_track_acts_or_is_refused(kind, name, folder):
 
 
 def test_every_argument_is_tried():
-    assert set(ARGUMENTS) | {"recording", "body", "progress"} == set(inspect.signature(track).parameters)
-    assert set(inspect.signature(track_take).parameters) <= {*ARGUMENTS, "take", "progress"}
+    others = {"progress", "checkpoint"}  # see test_progress_is_told, tests/tracking/test_checkpoint.py
+    assert set(ARGUMENTS) | {"recording", "body"} | others == set(inspect.signature(track).parameters)
+    assert set(inspect.signature(track_take).parameters) <= {*ARGUMENTS, "take"} | others
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -334,7 +341,7 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 OPTIONS = {
     "overlays": "--overlays", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
     "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
-    "out": None, "take": None,
+    "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
 }  # fmt: skip
 
 

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from kinefit.errors import ObservationError
+from kinefit.bodies import load_body
+from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import clean, to_points
 from kinefit.images.depth_noise import denoised
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
+from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
@@ -158,3 +160,15 @@ def test_real_people_are_counted(data_dir):
     video = read_depth(data_dir("depth_skeltrack_kinect1"), size=(640, 480))
     counts = [len(people(clean(video.frame(i).depth, cam, far=6.0), cam)) for i in range(len(video))]
     assert sorted(counts) == [1] * 10 + [2] * 2
+
+
+@pytest.mark.parametrize("far", [6.0, 20.0, 49.0, 400.0])
+def test_an_image_that_is_far_away_all_over_shows_nobody_at_little_cost(far):
+    camera = KINECT.camera(name="kinect")
+    noisy = far * (1.0 + 0.02 * np.random.default_rng(0).normal(size=(480, 640)))
+    for depth in (np.full((480, 640), far), noisy):
+        found = people(depth, camera)
+        assert len(found) <= 40  # each holds an image's mask
+        assert all(blob.mask.sum() >= 150 for blob in found)
+    with pytest.raises(TrackingError, match="nothing in the depth image"):
+        start_from_points(load_body("humanoid10"), None, camera, np.full((480, 640), far))

@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from tests.tracking.movements import BODY, RATE, SENSOR, a_motion, a_rig, images
 
 from kinefit import track
@@ -38,6 +39,7 @@ def recording():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_person_is_found_sized_and_followed_within_the_error_bars():
     motion, truth = track(recording(), BODY), a_motion()
     shift = motion.segment_poses()[:, :, :3, 3] - truth.segment_poses()[:FRAMES, :, :3, 3]

@@ -58,6 +58,7 @@ def test_every_step_holds_what_each_sensor_saw(folder):
     assert {f.sensor for f in recording.depth.values()} == {"tof"}
 
 
+@pytest.mark.slow
 def test_a_take_of_three_kinds_of_sensors_is_fused(folder, tmp_path):
     """Size and start are found from the depth images alone; what is tracked then is within centimetres."""
     out = tmp_path / "out"

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit._files import parse_toml
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.couplings import coupled
@@ -27,6 +28,7 @@ _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
 _CHOOSE = "Use one of these, or add it."
 
 
+@checked
 def load_body(name_or_file: str | Path) -> Body:
     """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
 

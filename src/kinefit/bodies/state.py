@@ -27,7 +27,11 @@ class BodyState:
 
     def __post_init__(self) -> None:
         for name in ("T_world_root", "angles"):
-            array = np.array(getattr(self, name), dtype=float, order="C")
+            try:
+                array = np.array(getattr(self, name), dtype=float, order="C")
+            except (TypeError, ValueError) as error:
+                problem = f"a state whose {name} is a {type(getattr(self, name)).__name__} that is no array of numbers"
+                raise BodyError(problem, remedy="Give a (4, 4) pose and one number for each coordinate.") from error
             if not math.isfinite(array.sum()):
                 raise BodyError(f"a state with {name} that are not finite", remedy="Leave out what is not known.")
             array.flags.writeable = False

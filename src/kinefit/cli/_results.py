@@ -103,8 +103,10 @@ def write_overlays(
 
     With `blur` faces are made unrecognisable.
     """
+    import numpy as np
+
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
-    from kinefit.exporters.pictures.overlay import nearest_frame
+    from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
     from kinefit.readers.video import Video
 
     if not (seen.videos or seen.depth) or seen.rig is None:
@@ -117,7 +119,7 @@ def write_overlays(
             shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
             at = nearest_frame(motion, shown / colour.rate + offset)
             pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
-            bar, count = f"overlay {name}", len(colour)
+            bar, count = f"overlay {name}", len(frames_of(motion, np.arange(len(colour)) / colour.rate + offset))
             step(bar, 0, count)
             write_overlay(
                 motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,
@@ -128,7 +130,7 @@ def write_overlays(
         camera, shown = seen.rig[video.sensor], video.nearest(float(middle))
         at = nearest_frame(motion, float(video.times[shown]))
         pictures[video.sensor] = depth_picture(video.frame(shown).depth, motion, at, camera, label=video.sensor)
-        bar, count = f"overlay {video.sensor}", len(video)
+        bar, count = f"overlay {video.sensor}", len(frames_of(motion, video.times))
         step(bar, 0, count)
         write_depth_overlay(
             motion, camera, video, folder / "overlays" / f"{video.sensor}.mp4",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,17 +50,19 @@ Examples:
     "--lag", type=float, metavar="SECONDS",
     help="Each frame from those before it and so many seconds after it, as a live session has it a little later.",
 )
+@click.option("--restart", is_flag=True, help="Begin anew where an earlier run was stopped; the default is to go on.")
 @_screen.verbose_option
 @click.pass_context
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
-    pictures: str, contacts: bool, realtime: bool, lag: float | None, verbose: bool,
+    pictures: str, contacts: bool, realtime: bool, lag: float | None, restart: bool, verbose: bool,
 ) -> None:
     """Track the person of a take file and write all results.
 
     TAKE is one TOML file that names calibration, cameras, videos and keypoints: `kinefit init` writes a first one,
     `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
-    the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done.
+    the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done; the same command
+    then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
     """
     from kinefit.readers.take.find import find_take
 
@@ -75,7 +78,7 @@ def track(
     out = out or take.with_name(f"{take.stem}-kinefit")
     code = run(
         take, out, overlays=overlays and pictures != "none", formats=formats, report=report, pictures=pictures,
-        smooth=not realtime, contacts=contacts, lag=lag, verbose=verbose, wanted=overlays and wanted,
+        smooth=not realtime, contacts=contacts, lag=lag, verbose=verbose, wanted=overlays and wanted, restart=restart,
     )  # fmt: skip
     ctx.exit(code)
 
@@ -83,7 +86,7 @@ def track(
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
     pictures: str = "full", contacts: bool = False, lag: float | None = None, verbose: bool = False,
-    wanted: bool = False,
+    wanted: bool = False, restart: bool = False,
 ) -> int:  # fmt: skip
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.cli._agreement import print_agreement
@@ -95,6 +98,7 @@ def run(
     from kinefit.readers.take.file import read_take
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
+    from kinefit.tracking.checkpoint import Checkpoint, key_of
     from kinefit.tracking.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
@@ -106,13 +110,19 @@ def run(
     files: dict[str, Path] = {}
     notes: list[str] = []
     total = 0
+    work = ExitStack()
     try:
-        with _screen.bars() as step:
+        with work, _screen.bars() as step:
             take = prepared(take, step, _screen.note)
+            unfinished = work.enter_context(Checkpoint(
+                out / "unfinished", key_of(take, smooth=smooth, contacts=contacts, lag=lag), restart=restart
+            ))  # fmt: skip
+            if unfinished.resumed:
+                _screen.note(f"going on with what an earlier run left in {unfinished.folder}; --restart begins anew")
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(
-                    take, smooth=smooth, contacts=contacts, lag=lag,
+                    take, smooth=smooth, contacts=contacts, lag=lag, checkpoint=unfinished,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
                 notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])
@@ -125,6 +135,8 @@ def run(
                 _results.write_overlays(motion, take, seen, out, step, files, blur=pictures == "blurred")
             if report:
                 write_track_report(motion, take, seen, out, step, files, pictures)
+            if not total:
+                unfinished.remove()
     except BaseException as error:
         if files:
             print_files(files)
@@ -138,6 +150,7 @@ def run(
     print_summary(motion, points=verbose)
     print_files(files)
     if total:
-        _screen.tell_interrupted(f"{len(motion)} of {total} frames are done and written; no video or report was begun.")
+        told = f"{len(motion)} of {total} frames are done and written; no video or report was begun."
+        _screen.tell_interrupted(f"{told} The same command goes on.")
         return _screen.INTERRUPTED
     return 0

@@ -9,7 +9,7 @@ import numpy as np
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
-from kinefit.exporters.report.angles import Curve, curves
+from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.motion import Motion
 

@@ -14,8 +14,9 @@ deviation "inf" means that nothing observed it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,12 @@ from numpy.typing import NDArray
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
-from kinefit.motion import Motion, Residuals
+from kinefit.motion import Motion
 from kinefit.motion_columns import angle_columns, joint_columns, place_columns
 
 Table = dict[str, NDArray]  # column -> (rows,)
+
+_ROWS, _FRAMES = 2000, 200  # of a piece that is written at once; the latter of the long form, some 100 rows each
 
 
 def write_csv(
@@ -52,7 +55,7 @@ def write_csv(
     ExportError
         Unknown unit, axis or names, or a file cannot be written.
     """
-    return _write(tables(motion, unit=unit, up=up, names=names), Path(folder), ".csv", _to_csv)
+    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".csv", _to_csv)
 
 
 def write_parquet(
@@ -74,11 +77,17 @@ def write_parquet(
         ) from error
     about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": up or motion.up}
 
-    def to_parquet(table: Table, file: Path) -> None:
-        content = pyarrow.table({name: pyarrow.array(column) for name, column in table.items()})
-        pyarrow.parquet.write_table(content.replace_schema_metadata(about), file)
+    def to_parquet(pieces: Iterator[Table], file: Path) -> None:
+        with ExitStack() as stack:
+            writer = None
+            for table in pieces:
+                content = pyarrow.table({name: pyarrow.array(column) for name, column in table.items()})
+                content = content.replace_schema_metadata(about)
+                if writer is None:
+                    writer = stack.enter_context(pyarrow.parquet.ParquetWriter(file, content.schema))
+                writer.write_table(content)
 
-    return _write(tables(motion, unit=unit, up=up, names=names), Path(folder), ".parquet", to_parquet)
+    return _write(_in_pieces(motion, unit, up, names), Path(folder), ".parquet", to_parquet)
 
 
 def tables(
@@ -101,26 +110,56 @@ def tables(
     ExportError
         Unknown unit, axis or names.
     """
+    whole = {name: list(pieces) for name, pieces in _in_pieces(motion, unit, up, names).items()}
+    return {
+        name: {column: np.concatenate([piece[column] for piece in pieces]) for column in pieces[0]}
+        for name, pieces in whole.items()
+    }
+
+
+def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> dict[str, Iterator[Table]]:
+    """The tables by name, each as one after the other of pieces of its rows, made when they are asked for."""
     place = f"tables of {motion.name}"
     factor, motion, body = length_factor(unit, UNITS, place), turned(motion, up or motion.up, place), motion.body
     segments = bone_names(body, names or "kinefit", place)
     bones = tuple(segments) if names else body.joints
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
-    quality = {name: motion.segment_quality[:, s] for s, name in enumerate(segments)}
-    residuals = [_residuals(motion, sensor, r, factor, unit, segments) for sensor, r in motion.residuals.items()]
+    stretches = [slice(row, row + _ROWS) for row in range(0, max(len(motion), 1), _ROWS)]
+
+    def angles() -> Iterator[Table]:
+        whole = angle_columns(motion, factor, unit)  # of a quaternion's two signs the nearer to the frame before
+        for some in stretches:
+            yield {name: column[some] for name, column in (start | whole).items()}
+
+    def of_parts(columns: Callable[[Motion], Table]) -> Iterator[Table]:
+        for some in stretches:
+            yield {name: column[some] for name, column in start.items()} | columns(_part(motion, some))
+
+    def landmarks(part: Motion) -> Table:
+        return place_columns(body.landmarks.names, factor * part.positions(), unit)
+
+    def quality(part: Motion) -> Table:
+        return {"quality": part.quality, **{name: part.segment_quality[:, s] for s, name in enumerate(segments)}}
+
+    residuals = _long(lambda sensor, frames: _residuals(motion, sensor, frames, factor, unit, segments), motion)
     return {
-        "angles": start | angle_columns(motion, factor, unit),
-        "joints": start | joint_columns(motion, bones, factor, unit),
-        "landmarks": start | place_columns(body.landmarks.names, factor * motion.positions(), unit),
-        "quality": start | {"quality": motion.quality} | quality,
-        "residuals": _long(residuals),
-    }
+        "angles": angles(), "joints": of_parts(lambda part: joint_columns(part, bones, factor, unit)),
+        "landmarks": of_parts(landmarks), "quality": of_parts(quality), "residuals": residuals,
+    }  # fmt: skip
+
+
+def _part(motion: Motion, some: slice) -> Motion:
+    fields = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
+    return replace(motion, residuals={}, **{name: getattr(motion, name)[some] for name in fields})
 
 
 def _residuals(
-    motion: Motion, sensor: str, r: Residuals, factor: float, unit: str, bones: list[str]
+    motion: Motion, sensor: str, some: slice, factor: float, unit: str, bones: list[str]
 ) -> Table:
-    frames, points = np.nonzero(np.isfinite(r.norms))
+    r = motion.residuals[sensor]
+    norms = np.linalg.norm(r.values[some], axis=-1)
+    frames, points = np.nonzero(np.isfinite(norms))
+    frames += some.start
     segments = np.array([bones[s] for s in r.segments], dtype=np.str_)
     pixels = r.unit == "px"
     factor, unit = (1.0, "px") if pixels else (factor, unit)
@@ -140,39 +179,39 @@ def _residuals(
         out[f"measured {axis} [{unit}]"] = factor * r.measured[frames, points, i]
         out[f"residual {axis} [{unit}]"] = factor * r.values[frames, points, i]
     return out | {
-        "residual": factor * r.norms[frames, points],
+        "residual": factor * norms[frames - some.start, points],
         "weight": np.asarray(r.weights, float)[frames, points],
         "left_right_swapped": np.asarray(r.swapped, bool)[frames],
     }
 
 
-def _long(parts: list[Table]) -> Table:
-    """One table below the other; a column that one of them lacks is NaN there."""
-    columns = dict.fromkeys(name for part in parts for name in part)
-
-    def column(part: Table, name: str) -> NDArray:
-        return part.get(name, np.full(len(part["frame"]), np.nan))
-
-    if not parts:
-        return {name: np.zeros(0) for name in ("frame", "time [s]", "sensor", "point", "residual", "weight")}
-    return {name: np.concatenate([column(part, name) for part in parts]) for name in columns}
+def _long(of: Callable[[str, slice], Table], motion: Motion) -> Iterator[Table]:
+    """The sensors' tables one below the other; a column that one of them lacks is NaN there."""
+    columns = dict.fromkeys(name for sensor in motion.residuals for name in of(sensor, slice(0, 0)))
+    if not motion.residuals:
+        yield {name: np.zeros(0) for name in ("frame", "time [s]", "sensor", "point", "residual", "weight")}
+    for sensor in motion.residuals:
+        for start in range(0, max(len(motion), 1), _FRAMES):
+            part = of(sensor, slice(start, start + _FRAMES))
+            yield {name: part.get(name, np.full(len(part["frame"]), np.nan)) for name in columns}
 
 
 def _write(
-    content: Mapping[str, Table], folder: Path, suffix: str, write: Callable[[Table, Path], Any]
+    content: Mapping[str, Iterator[Table]], folder: Path, suffix: str, write: Callable[[Iterator[Table], Path], Any]
 ) -> tuple[Path, ...]:
     files = []
     with ExitStack() as stack:  # every file takes its place only when all are complete
-        for name, table in content.items():
+        for name, pieces in content.items():
             files.append(folder / f"{name}{suffix}")
-            write(table, stack.enter_context(writing(files[-1])))
+            write(pieces, stack.enter_context(writing(files[-1])))
     return tuple(files)
 
 
-def _to_csv(table: Mapping[str, NDArray], file: Path) -> None:
-    columns = [_cells(column) for column in table.values()]
-    lines = [",".join(_quoted(name) for name in table), *(",".join(row) for row in zip(*columns))]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+def _to_csv(pieces: Iterator[Table], file: Path) -> None:
+    with open(file, "w", encoding="utf-8", newline="\n") as out:
+        for number, table in enumerate(pieces):
+            head = [] if number else [",".join(_quoted(name) for name in table)]
+            out.writelines(f"{line}\n" for line in (*head, *map(",".join, zip(*map(_cells, table.values())))))
 
 
 def _cells(column: NDArray) -> list[str]:

@@ -5,7 +5,7 @@ Pixels follow OpenCV: the centre of the first pixel is (0, 0). A camera looks al
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -201,7 +201,10 @@ class ImageFrame:
     T_image_calibration: NDArray
 
     def __post_init__(self) -> None:
-        T = _read_only(self.T_image_calibration)
+        try:
+            T = _read_only(self.T_image_calibration)
+        except (TypeError, ValueError):
+            raise CalibrationError("no map of images", remedy="Give an invertible affine (3, 3) of pixels.") from None
         if T.shape != (3, 3) or not np.isfinite(T).all() or abs(np.linalg.det(T)) < 1e-12 or np.any(T[2] != (0, 0, 1)):
             raise CalibrationError("no map of images", remedy="Give an invertible affine (3, 3) of pixels.")
         object.__setattr__(self, "T_image_calibration", T)
@@ -281,6 +284,9 @@ class Rig:
     cameras: tuple[Camera, ...]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Sequence) or not all(isinstance(one, Camera) for one in self.cameras):
+            problem = f"a rig of a {type(self.cameras).__name__} that holds other things than cameras"
+            raise CalibrationError(problem, remedy="Give a tuple of Camera; read_calibration reads some from a file.")
         object.__setattr__(self, "cameras", tuple(self.cameras))
         twice = [name for name in set(self.names) if self.names.count(name) > 1]
         if twice:

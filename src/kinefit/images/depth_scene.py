@@ -16,6 +16,8 @@ from kinefit.images.depth import _image, to_points
 # What a person shows to a sensor: head and shoulders alone are about 0.1 m² and 0.4 m tall, a standing adult 0.5 to
 # 0.8 m² and up to 2.1 m, 2.6 m with an arm stretched upwards.
 _AREA, _EXTENT = (0.06, 2.0), (0.3, 2.6)  # [m²], [m]
+_PIXELS = 150  # of a thing; a person 10 m from a camera of 160 x 124 pixels (43 degrees wide) has 200
+_CROWD = 40  # things: more are noise, as of an image that is far away all over
 _RIM = 0.01  # of the image, along its edges: there many sensors measure nothing
 _GAP = 0.12  # [m] parts farther apart than twice this are two things; shadows tear limbs off by some centimetres
 _FLOOR_BREADTH = 0.2  # [m] deviation along its narrow side: a metre of floor has 0.3, a slice through a person 0.1
@@ -196,6 +198,8 @@ def people(
         Taken away with all that lies lower than `clearance` [m] above it, soles included: feet connect everything.
     gap : float [m]
         Parts closer than this are one thing, those beyond 2√3 times it are two.
+
+    What shows fewer pixels than tell one posture from another is left out, and so is all but the largest of a crowd.
     """
     depth = _image(depth, camera)
     measured = (depth > 0.0) if mask is None else (depth > 0.0) & mask
@@ -207,7 +211,8 @@ def people(
     z = depth.ravel()[pixel].astype(float)
     area = np.bincount(label, z * z / (camera.matrix[0, 0] * camera.matrix[1, 1]))
     found, rim = [], [max(round(_RIM * n), 1) for n in depth.shape]
-    for number in np.flatnonzero((area > _AREA[0]) & (area < _AREA[1])):
+    likely = np.flatnonzero((area > _AREA[0]) & (area < _AREA[1]) & (np.bincount(label) >= _PIXELS))
+    for number in likely[np.argsort(-area[likely], kind="stable")[:_CROWD]]:
         mine = label == number
         low, high = np.percentile(x[mine], (0.5, 99.5), axis=0)
         extent = float((high - low).max())

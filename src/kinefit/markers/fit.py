@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
@@ -28,6 +29,7 @@ _OFF = 4.0  # times the take's median misfit from which a frame is tried anew, f
 _MOST_RUNS = 50  # of such frames
 
 
+@checked
 def fit_markers(
     body: Body,
     markers: Markers,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import bare, subject_of
 from kinefit.errors import ObservationError
 from kinefit.observations import Markers
@@ -12,6 +13,7 @@ FEWEST = 4
 """Labels that a person bears at least; fewer belong to a thing ("Sync:Sync")."""
 
 
+@checked
 def split_people(markers: Markers) -> dict[str, Markers]:
     """Markers of every person by name, labels without the name; one person without any is called "".
 

@@ -10,6 +10,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import Placement, find_placement
 from kinefit.errors import ObservationError, TrackingError
@@ -74,6 +75,7 @@ class MarkerSubject:
         return self.body.markers(self.marker_set)
 
 
+@checked
 def fit_marker_subject(
     body: Body,
     trials: Markers | Sequence[Markers],

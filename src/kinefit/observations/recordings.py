@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.observations.arrays import frozen
+from kinefit.observations.arrays import check_seen, frozen
 
 _MOST_PIXELS = 200_000_000  # of an image; beyond, a size is damaged
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
@@ -55,6 +55,7 @@ class Keypoints:
     source: str = ""
 
     def __post_init__(self) -> None:
+        check_seen(self.camera, self.rate, self.names)
         points, confidence = frozen(self.points), frozen(self.confidence)
         if points.ndim != 4 or points.shape[2:] != (len(self.names), 2) or confidence.shape != points.shape[:3]:
             raise ObservationError(
@@ -126,6 +127,16 @@ class Detections:
         object.__setattr__(self, "confidence", confidence)
         object.__setattr__(self, "mask_runs", runs)
         object.__setattr__(self, "mask_starts", starts)
+
+    def within(self, first: int, frames: int) -> Detections:
+        """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
+        after, people = frames - first - len(self), self.points.shape[1]
+        around = ((first, after), (0, 0), (0, 0))
+        return replace(
+            self, points=np.pad(self.points, (*around, (0, 0)), constant_values=np.nan),
+            confidence=np.pad(self.confidence, around),
+            mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)
@@ -224,6 +235,7 @@ class Markers:
     events: tuple[MarkerEvent, ...] = ()
 
     def __post_init__(self) -> None:
+        check_seen(self.source, self.rate, self.names)
         positions = frozen(self.positions)
         if positions.ndim != 3 or positions.shape[1:] != (len(self.names), 3):
             raise ObservationError(

@@ -14,11 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from kinefit.errors import TakeError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from kinefit.readers.take.entries import CameraEntry
     from kinefit.readers.take.file import Take
 
 PEOPLE = 3
@@ -46,12 +49,14 @@ class Job:
         Of the detections.
     rate : float [Hz], optional
         Of a video that is a folder of images.
+    seconds : (start, stop) [s] of the video that are looked through; default: all of it
     """
 
     camera: str
     video: Path
     file: Path
     rate: float | None = None
+    seconds: tuple[float, float] | None = None
 
 
 def jobs_of_take(take: Take) -> list[Job]:
@@ -59,13 +64,29 @@ def jobs_of_take(take: Take) -> list[Job]:
     from kinefit.readers.detections import detections_file
 
     found = [
-        Job(c.name, c.video, detections_file(take.path, c.name), take.rate) for c in take.cameras if c.video is not None
-    ]
+        Job(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c))
+        for c in take.cameras if c.video is not None
+    ]  # fmt: skip
     if not found:
         raise TakeError(
             "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
         )
     return found
+
+
+def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
+    """Of a camera's video that lie in the take's frames, a frame more at both ends."""
+    if take.frames is None:
+        return None
+    from kinefit.readers.video import Video
+
+    rate = take.rate
+    if rate is None and camera.video is not None:
+        with Video(camera.video) as video:
+            rate = video.rate
+    assert rate is not None
+    start, stop = take.frames
+    return (start - 1) / rate - camera.time_offset, (stop + 1) / rate - camera.time_offset
 
 
 def detect(
@@ -82,7 +103,7 @@ def detect(
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], people, masks)
-    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks)]
+    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks, job.seconds)]
     if not todo:
         return []
     folder = _networks(progress, tell)
@@ -97,7 +118,7 @@ def detect(
                 progress(camera, done, total)
 
     def work(job: Job) -> None:
-        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines)}", step)
+        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines, job.seconds)}", step)
 
     _hush(folder)
     with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
@@ -122,10 +143,10 @@ def _from_beside(job: Job, key: str, people: int | None, masks: bool | None) -> 
     from kinefit.exporters.atomic import writing
     from kinefit.readers.detections import detections_key
 
-    if _fits(detections_key(job.file), key, people, masks):
+    if _fits(detections_key(job.file), key, people, masks, job.seconds):
         return
     for other in sorted(job.file.parent.parent.glob(f"*-detect/{job.file.name}")):
-        if _fits(detections_key(other), key, people, masks):
+        if _fits(detections_key(other), key, people, masks, job.seconds):
             with writing(job.file) as temporary:
                 shutil.copyfile(other, temporary)
             return
@@ -145,17 +166,21 @@ def _look_through(
 
     models = Models(networks)
     with Video(job.video, rate=job.rate) as video:
+        first, last = 0, len(video)
+        if job.seconds is not None:
+            first, last = (int(np.clip(np.ceil(s * video.rate), 0, len(video))) for s in job.seconds)
 
         def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
             for number, image in enumerate(images):
-                tell(job.camera, number, len(video))
+                tell(job.camera, number, last - first)
                 yield image
-            tell(job.camera, len(video), len(video))
+            tell(job.camera, last - first, last - first)
 
         found = detect_people(
-            counted(video.frames()), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
+            counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
             source=str(job.video),
         )
+        found = found.within(first, len(video))
     write_detections(found, job.file, key=key)
 
 
@@ -200,16 +225,23 @@ def _video_key(job: Job) -> str:
     return f"{digest.hexdigest()[:32]} {size} {MODELS_PACKAGE} {_METHOD}"
 
 
-def _settings(people: int, masks: bool) -> str:
-    return f"people={people} masks={masks}"
+def _settings(people: int, masks: bool, seconds: tuple[float, float] | None) -> str:
+    part = "" if seconds is None else " seconds={}:{}".format(*seconds)
+    return f"people={people} masks={masks}{part}"
 
 
-def _fits(found: str | None, key: str, people: int | None, masks: bool | None) -> bool:
+def _fits(
+    found: str | None, key: str, people: int | None, masks: bool | None, seconds: tuple[float, float] | None
+) -> bool:
     """Whether what was found is of this video and of the settings that matter."""
     if found is None or not found.startswith(key + " "):
         return False
     settings = dict(part.split("=") for part in found[len(key) + 1 :].split())
     wanted = {"people": people, "masks": masks}
+    first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
+    start, stop = seconds or (-np.inf, np.inf)
+    if not first <= start <= stop <= last:
+        return False
     return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.observations import Detections
@@ -38,6 +39,7 @@ def detections_file(take: str | PathLike[str], camera: str) -> Path:
     return take.with_name(f"{take.stem}-detect") / f"{safe}.npz"
 
 
+@checked
 def read_detections(path: str | PathLike[str]) -> Detections:
     """Read what the built-in detector saw in one video.
 
@@ -47,9 +49,9 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         No such file, not one of the detector's, damaged, or of a later version.
     """
     file = Path(path)
-    again = f"Make it anew: {_anew(file, '--force')}"
     if not file.is_file():
         raise FileError("no such file of detections", file=file, remedy=f"Run: {_anew(file)}")
+    again = f"Make it anew: {_anew(file, '--force')}"
     try:
         arrays = _load(file)
     except _DAMAGE as error:
@@ -78,8 +80,9 @@ def detections_key(path: str | PathLike[str]) -> str | None:
 
 def _anew(file: Path, *options: str) -> str:
     """The command that makes a file of detections."""
-    take = file.parent.with_name(f"{file.parent.name.removesuffix('-detect')}.toml")
-    video = next((p for p in file.parent.glob(f"{file.stem.removesuffix('-detect')}.*") if p.suffix != ".npz"), None)
+    folder = file.parent if file.parent.name else file.absolute().parent
+    take = folder.with_name(f"{folder.name.removesuffix('-detect')}.toml")
+    video = next((p for p in folder.glob(f"{file.stem.removesuffix('-detect')}.*") if p.suffix != ".npz"), None)
     return command("detect", take if take.is_file() else video or "VIDEO", *options)
 
 

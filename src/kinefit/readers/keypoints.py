@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import read_npy
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MEDIAPIPE_33, Keypoints
@@ -61,6 +62,7 @@ class _OpenPoseFrame(msgspec.Struct):
 _decode = msgspec.json.Decoder(_OpenPoseFrame).decode
 
 
+@checked
 def read_openpose(
     folder: str | PathLike[str],
     *,
@@ -114,15 +116,11 @@ def read_openpose(
     return _keypoints(data, names, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
 
 
+@checked
 def read_mediapipe(
-    path: str | PathLike[str],
-    *,
-    camera: str,
-    rate: float,
-    frames: tuple[int, int] | None = None,
-    time_offset: float = 0.0,
-    image_frame: ImageFrame | None = None,
-) -> Keypoints:
+    path: str | PathLike[str], *, camera: str, rate: float, frames: tuple[int, int] | None = None,
+    time_offset: float = 0.0, image_frame: ImageFrame | None = None,
+) -> Keypoints:  # fmt: skip
     """Read MediaPipe pose landmarks from an array file (.npy).
 
     Parameters
@@ -167,6 +165,7 @@ def read_mediapipe(
 _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
 
 
+@checked
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
     """Read the body landmarks (MediaPipe's 33) of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
 
@@ -226,6 +225,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     return keypoints
 
 
+@checked
 def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **options: Any) -> Keypoints:
     """Read one camera's keypoints of any format.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
@@ -22,6 +23,7 @@ _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  #
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
 
 
+@checked
 def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Markers:
     """Read a C3D or TRC file, told apart by its content.
 

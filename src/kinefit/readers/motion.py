@@ -33,6 +33,7 @@ from urllib.parse import unquote
 
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.bodies.serial import body_from_arrays
 from kinefit.errors import FileError, KinefitError
@@ -45,6 +46,7 @@ RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured",
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
+@checked
 def read_motion(path: str | PathLike[str]) -> Motion:
     """Read a motion file.
 

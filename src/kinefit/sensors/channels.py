@@ -55,6 +55,8 @@ class Channels:
 
     def part(self, frames: Sequence[int]) -> Channels:
         """The same channels in some frames."""
+        if len(frames) == len(self.uv) and np.array_equal(frames, np.arange(len(self.uv))):
+            return self
         return replace(self, uv=self.uv[frames], confidence=self.confidence[frames])
 
     @classmethod

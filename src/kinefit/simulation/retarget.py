@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.correspondences import point_rows, prediction_rows, prior_rows
 from kinefit.errors import BodyError, ObservationError, choices
@@ -33,6 +34,7 @@ _POINTS = ("skull_vertex", "l_tragion", "r_tragion") + tuple(
 _EXTREMITIES = tuple(f"toes_{side}" for side in "lr") + _POINTS[3:]
 
 
+@checked
 def retarget(skeleton: SkeletonMotion, body: Body | None = None, *, rate: float | None = None) -> Motion:
     """Motion of a body whose bones point where those of a recorded skeleton do; it keeps its own lengths.
 

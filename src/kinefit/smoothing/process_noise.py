@@ -13,7 +13,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.motion_prior import MotionPrior
 from kinefit.solvers.seen_points import SeenPoints
@@ -55,7 +55,7 @@ class SmoothTake:
 
     `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): its process noise
     over time, as a factor; `others`: what all sensors but the keypoints measured, `linear` the same about
-    the states.
+    the states; `speed_std` (n,) [m/s, rad/s] of the rates of change, which nine tenths of the frames fall below.
     """
 
     body: Body
@@ -73,6 +73,7 @@ class SmoothTake:
     contacts: Contacts | None = None
     others: OtherSensors | None = None
     linear: Linearised | None = None
+    speed_std: NDArray | None = None
 
     def renewed(self, *, keep: bool = False) -> SmoothTake:
         """With all other sensors matched and linearised anew about the states; `keep` keeps the matches."""
@@ -114,6 +115,11 @@ class SmoothTake:
         used = (self.confidence > 0) & np.isfinite(r2)
         s2 = np.where(used, self.confidence * r2 / np.square(sigma), 0.0)
         return np.where(used, self.loss.factor(s2), 0.0)
+
+    def agreeing(self, sigma: NDArray) -> NDArray:
+        """(T, N) robust factor of every channel at its states, 0 where unseen."""
+        parts = [self.part(some) for some in stretches(len(self.roots))]
+        return np.concatenate([p.factors(sigma, p.fitted(p.roots, p.angles)) for p in parts])
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """All frames together, from where they are."""

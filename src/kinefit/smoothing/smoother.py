@@ -22,9 +22,10 @@ from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.equations import inverse
+from kinefit.solvers.smoothing import Posterior
 
 _PARTS = 3  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
@@ -39,14 +40,14 @@ class SmoothedTake:
 
     Parameters
     ----------
-    results : F frames, with the matches of keypoints alone
+    results : F frames, with the matches of keypoints alone; read on demand
     take : SmoothTake as it was solved last
     matched : F lists, the matches of all other sensors; None where there are none
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     provenance : what was estimated, as `Motion.provenance` has it
     """
 
-    results: list[FrameResult]
+    results: Sequence[FrameResult]
     take: SmoothTake
     matched: Sequence[tuple[Matched, ...]] | None
     weight: NDArray
@@ -87,16 +88,15 @@ def smooth_results(
         found = find_contacts(body, take.roots, take.angles, rate, up)
         take, _, others_matched = _solve(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
-    fitted = take.fitted(take.roots, take.angles)
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
-    took_part = take.confidence / np.square(strength.sigma) * take.factors(strength.sigma, fitted)
-    weight = take.confidence / np.square(channels.sigma)
+    took_part = take.confidence / np.square(strength.sigma) * take.agreeing(strength.sigma)
     surfaces = False
-    smoothed, covariance, packed = [], np.empty((body.tree.n_dofs,) * 2), np.triu_indices(body.tree.n_dofs)
+    smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
+    covariance = np.empty((body.tree.n_dofs,) * 2)
     for f, result in enumerate(results):
-        state = BodyState(take.roots[f], take.angles[f])
+        state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
         pixels = tuple(
-            replace(m, uv=np.where(weight[f][:, None] > 0, take.uv[f], np.nan), weight=weight[f], swapped=swapped[f])
+            replace(m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f])
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
         more = () if others_matched is None else others_matched[f]
@@ -110,16 +110,17 @@ def smooth_results(
     return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
 
 
-def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> list[FrameResult]:
+def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> Spool[FrameResult]:
     """Frames that state nothing of joints that are `adrift`, nor of their coordinates."""
-    gone = adrift(body.tree, np.stack([r.lost for r in results]), np.stack([r.hidden for r in results]), half)
+    lost, hidden = map(np.stack, zip(*((r.lost, r.hidden) for r in results)))
+    gone = adrift(body.tree, lost, hidden, half)
     of_dofs = np.concatenate([np.zeros((len(gone), 6), bool), gone[:, body.tree.owners]], axis=1)
-    return [
+    return Spool(
         replace(
             r, joint_std=np.where(joints[:, None], np.inf, r.joint_std), dof_std=np.where(dofs, np.inf, r.dof_std)
         )
         for r, joints, dofs in zip(results, gone, of_dofs)
-    ]  # fmt: skip
+    )  # fmt: skip
 
 
 def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDArray:
@@ -136,7 +137,7 @@ def pixels_of_track(
     body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings
 ) -> SmoothTake:
     """The pixels of a track as they were used, with its states, not smoothed."""
-    roots, angles = (np.stack([getattr(r.state, n) for r in results]) for n in ("T_world_root", "angles"))
+    roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
@@ -153,7 +154,7 @@ def _take(
 ) -> SmoothTake:  # fmt: skip
     """What was tracked, in angles without jumps."""
     take = pixels_of_track(body, channels, results, rate, settings)
-    inliers = take.factors(channels.sigma, take.fitted(take.roots, take.angles)) > INLIER
+    inliers = take.agreeing(channels.sigma) > INLIER
     alone, rows = _observed(take, channels, others)
     told = alone[0] & (levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST) | alone[1]
     lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
@@ -187,6 +188,9 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
 
 def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
     """Pixels (F, N, 2) and confidences (F, N) with sides put right, 0 where unseen."""
+    if len(swapped) == len(channels.uv) and not swapped.any():
+        unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
+        return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
     order = np.where(swapped, channels.partner, np.arange(swapped.shape[1]))
     uv = np.take_along_axis(channels.uv[: len(swapped)], order[:, :, None], axis=1)
     confidence = np.take_along_axis(channels.confidence[: len(swapped)], order, axis=1)
@@ -224,13 +228,14 @@ def _estimate(
 
 def _solve(
     take: SmoothTake, strength: Strength, window: int, overlap: int
-) -> tuple[SmoothTake, NDArray, Spool[tuple[Matched, ...]] | None]:
+) -> tuple[SmoothTake, Spool[NDArray], Spool[tuple[Matched, ...]] | None]:
     """The take at its minimum; of all frames covariances, the upper triangle of each, and other sensors' matches."""
     packed = np.triu_indices(take.body.tree.n_dofs)
-    covariances, matched, others = np.empty((len(take.roots), len(packed[0]))), None, take.others
+    covariances, matched, others = Spool[NDArray](), None, take.others
     windows = parts(len(take.roots), window, overlap)
     for last in [True] if others is None else [False] * (_PASSES - 1) + [True]:
         roots, angles, linear = np.array(take.roots), np.array(take.angles), None
+        covariances, speeds = Spool(), []
         if others is not None:
             matched = Spool[tuple[Matched, ...]]()
             spans = [whole for whole, _ in windows]
@@ -240,9 +245,19 @@ def _solve(
             fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
-            covariances[kept] = post.frames[inside][:, *packed]
-        take = replace(take, roots=roots, angles=angles)
+            speeds.append(_speed_std(post, part.dt)[max(inside.start - 1, 0) : inside.stop - 1])
+            for covariance in post.frames[inside]:
+                covariances.append(covariance[packed])
+        moving = np.concatenate(speeds)
+        speed_std = np.percentile(moving, 90.0, axis=0) if len(moving) else None
+        take = replace(take, roots=roots, angles=angles, speed_std=speed_std)
     return take, covariances, matched
+
+
+def _speed_std(post: Posterior, dt: float) -> NDArray:
+    """(T - 1, n) [m/s, rad/s] standard deviation of each change to the next frame; errors that last are in none."""
+    own = np.einsum("tii->ti", post.frames)
+    return np.sqrt(np.maximum(own[1:] + own[:-1] - 2.0 * np.einsum("tii->ti", post.following), 0.0)) / dt
 
 
 def _swaps(take: SmoothTake) -> NDArray:
@@ -250,11 +265,13 @@ def _swaps(take: SmoothTake) -> NDArray:
     channels, groups = take.channels, limb_groups(take.body, take.channels)
     if not len(channels.column):
         return np.zeros((len(take.roots), 0), bool)
-    fitted, (uv, confidence) = (
-        take.fitted(take.roots, take.angles), exchanged(channels, np.zeros(take.confidence.shape, bool)),
-    )  # fmt: skip
-    weight = confidence / np.square(channels.sigma)
-    return np.stack([find_swaps(channels, groups, uv[f], weight[f], fitted[f]) for f in range(len(fitted))])
+    out = np.empty(take.confidence.shape, bool)
+    for some in stretches(len(out)):
+        fitted, given = take.fitted(take.roots[some], take.angles[some]), channels.part(range(*some.indices(len(out))))
+        uv, confidence = exchanged(given, np.zeros(fitted.shape[:2], bool))
+        weight = confidence / np.square(channels.sigma)
+        out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted)]
+    return out
 
 
 def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
@@ -267,11 +284,13 @@ def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
         }
         for q, label in enumerate(take.channels.sources)
     }
+    speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
     scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
         "acceleration": {name: round(float(v), 2) for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
+        "speed_std": speeds,
         "pixel_sigma": sigma,
         "sigma_factor": scale,
         "liveliest": round(float(take.live.max()), 2),

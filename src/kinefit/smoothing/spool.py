@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import tempfile
 import weakref
+from array import array
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Generic, TypeVar, overload
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Generic, TypeVar, overload
 
 import numpy as np
 
@@ -21,14 +25,22 @@ from kinefit.sensors.settings import TrackSettings
 
 T = TypeVar("T")
 
-IN_MEMORY = 64 * 2**20
-"""Bytes of each kind that stay in memory: depth and silhouettes of about ten seconds, markers of minutes."""
+IN_MEMORY = 16 * 2**20
+"""Bytes of each kind that stay in memory: depth and silhouettes of some seconds, keypoints of a minute."""
+
+STRETCH = 2000
+"""Frames of which arrays over all channels are made at once."""
 
 _OF_ALL_FRAMES = Body, Sensor, Camera, Rig, Channels, Layout, TrackSettings
 _PLAIN = {
     tuple, list, dict, set, frozenset, str, bytes, bytearray, int, float, bool, complex, type(None), np.ndarray,
     np.dtype, pickle.PickleBuffer,
 }  # fmt: skip
+
+
+def stretches(frames: int) -> list[slice]:
+    """Of a take, so long that what is computed of all channels in one stays small."""
+    return [slice(start, min(start + STRETCH, frames)) for start in range(0, max(frames, 1), STRETCH)]
 
 
 class Spool(Sequence[T], Generic[T]):
@@ -43,17 +55,18 @@ class Spool(Sequence[T], Generic[T]):
     ----------
     things : to begin with
     in_memory : bytes up to which no file is made; default `IN_MEMORY`
+    file : that records go to from the first on, and that stays; default: a temporary one
     """
 
-    def __init__(self, things: Iterable[T] = (), *, in_memory: int | None = None) -> None:
-        self._store = _Store(IN_MEMORY if in_memory is None else in_memory)
-        self._places: list[tuple[int, int]] = []
+    def __init__(self, things: Iterable[T] = (), *, in_memory: int | None = None, file: Path | None = None) -> None:
+        self._store = _Store(IN_MEMORY if in_memory is None else in_memory, file)
+        self._places = array("q")  # first byte and number of bytes, one after the other
         self._last: tuple[tuple[int, int], T] | None = None
         for thing in things:
             self.append(thing)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._places) // 2
 
     @overload
     def __getitem__(self, which: int) -> T: ...
@@ -64,13 +77,14 @@ class Spool(Sequence[T], Generic[T]):
     def __getitem__(self, which: int | slice) -> T | Spool[T]:
         if isinstance(which, slice):
             return self.chosen(range(len(self))[which])
-        place = self._places[which]
+        place = self._place(which)
         if self._last is None or self._last[0] != place:
             self._last = place, self._store.read(place)
         return self._last[1]
 
     def __setitem__(self, which: int, thing: T) -> None:
-        self._places[which] = self._store.write(thing)
+        self._place(which)
+        self._places[2 * which : (2 * which + 2) or None] = array("q", self._store.write(thing))
 
     def append(self, thing: T) -> None:
         """Add one at the end.
@@ -80,13 +94,42 @@ class Spool(Sequence[T], Generic[T]):
         ObservationError
             No room in the temporary folder.
         """
-        self._places.append(self._store.write(thing))
+        self._places.extend(self._store.write(thing))
 
     def chosen(self, which: Iterable[int]) -> Spool[T]:
         """Some of them, in this order, in the same file."""
         out: Spool[T] = object.__new__(Spool)
-        out._store, out._places, out._last = self._store, [self._places[i] for i in which], None
+        out._store, out._last = self._store, None
+        out._places = array("q", [number for i in which for number in self._place(i)])
         return out
+
+    def _place(self, which: int) -> tuple[int, int]:
+        if not -len(self) <= which < len(self):
+            raise IndexError(f"record {which} of {len(self)}")
+        which %= len(self)
+        return self._places[2 * which], self._places[2 * which + 1]
+
+    def state(self) -> SpoolState:
+        """What there is beside the file, for `restore`; what was appended is in the file then, whatever happens."""
+        self._store.flush()
+        return SpoolState(bytes(self._places), tuple(self._store.shared))
+
+    def restore(self, state: SpoolState) -> bool:
+        """Have the records of this spool's file that were there at a state, and no others; False if it is damaged."""
+        places = array("q")
+        places.frombytes(state.places)
+        if not self._store.cut(places[-2] + places[-1] if places else 0, state.shared):
+            return False
+        self._places, self._last = places, None
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class SpoolState:
+    """Where records lie in a file, and the objects that they refer to."""
+
+    places: bytes
+    shared: tuple[Any, ...]
 
 
 class _Pickler(pickle.Pickler):
@@ -114,12 +157,30 @@ class _Unpickler(pickle.Unpickler):
 class _Store:
     """A file of records, and what they refer to."""
 
-    def __init__(self, in_memory: int) -> None:
-        self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1))
+    def __init__(self, in_memory: int, file: Path | None = None) -> None:
+        self._file: IO[bytes]
+        if file is None:
+            self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1))
+        else:
+            self._file = open(file, "r+b" if file.exists() else "w+b")
         self._end = 0
-        self._shared: list[Any] = []
+        self.shared: list[Any] = []
         self._numbers: dict[int, int] = {}
         weakref.finalize(self, self._file.close)
+
+    def flush(self) -> None:
+        """Have all that was written in the file."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def cut(self, end: int, shared: Iterable[Any]) -> bool:
+        """Leave out what comes after so many bytes; False where there are not so many."""
+        if self._file.seek(0, os.SEEK_END) < end:
+            return False
+        self._file.truncate(end)
+        self._end, self.shared = end, list(shared)
+        self._numbers = {id(thing): k for k, thing in enumerate(self.shared)}
+        return True
 
     def write(self, thing: Any) -> tuple[int, int]:
         """Where it was written: first byte, and how many."""
@@ -139,7 +200,7 @@ class _Store:
 
     def read(self, place: tuple[int, int]) -> Any:
         self._file.seek(place[0])
-        return _Unpickler(io.BytesIO(self._file.read(place[1])), self._shared).load()
+        return _Unpickler(io.BytesIO(self._file.read(place[1])), self.shared).load()
 
     def _number(self, thing: Any) -> int | None:
         """Of what is kept as it is; None for what is written."""
@@ -150,6 +211,6 @@ class _Store:
             return None
         number = self._numbers.get(id(thing))
         if number is None:
-            number = self._numbers[id(thing)] = len(self._shared)
-            self._shared.append(thing)
+            number = self._numbers[id(thing)] = len(self.shared)
+            self.shared.append(thing)
         return number

@@ -12,7 +12,7 @@ camera, or of another sensor, as a whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
+from kinefit.smoothing.spool import stretches
 from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
 from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.matched_frames import point_moves
@@ -39,6 +40,8 @@ Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 """(frames, covariance of each on its own) -> what an uncertain shape adds to them."""
 
 _MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames tell it
+_APART = 200  # frames: more than residuals are followed over, at up to 400 Hz
 _TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
 
 
@@ -62,8 +65,8 @@ def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
     cameras: tuple[float, float] | None = None,
-) -> tuple[list[FrameResult], DetectorNoise]:  # fmt: skip
-    """The same results with the standard deviations that lasting errors and the shape add; and the detectors' noise.
+) -> tuple[Iterator[FrameResult], DetectorNoise]:  # fmt: skip
+    """The same results, one by one, with the deviations that lasting errors and the shape add; the detectors' noise.
 
     Parameters
     ----------
@@ -76,42 +79,55 @@ def with_lasting_errors(
     cameras : (2,) standard deviations [m], [rad] of the cameras' poses, where neither the subject nor the answers know
     """
     body, channels = subject.body, take.channels
-    fitted = take.fitted(take.roots, take.angles)
-    values, factor = take.uv - fitted, take.factors(channels.sigma, fitted)
+    values, factor = _left_over(take)
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
+    del values, factor
     known = Known.of(subject, channels, cameras)
     layout = Layout(channels.with_points(body), body)
     half, n = round(_TIED * rate), body.tree.n_dofs
-    weights = pooled(weight, half)
     nothing = np.zeros((n, n)), np.zeros((n, n))
     sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
-    added, alone = [], []
-    for f, result in enumerate(results):
+
+    def lasts(f: int) -> Lasting:
         more = nothing if others is None else others.pooled(f, half)
-        one = lasting(known, layout, result.state, weights[f], noise, *more)
-        added.append((np.maximum(np.diag(one.dofs), 0.0), one.joints))
-        if f in sampled:
-            alone.append(one.alone)
-    shapes = [one([int(f) for f in sampled], alone) for one in answers]
-    out = []
-    for f, (result, (dofs, joints)) in enumerate(zip(results, added)):
-        for shape in shapes:
-            dofs, joints = (mine + of_shape for mine, of_shape in zip((dofs, joints), shape.at(f)))
-        out.append(replace(
-            result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),
-            joint_std=np.sqrt(np.square(result.joint_std) + joints),
-        ))  # fmt: skip
-    return out, noise
+        near = weight[max(f - half, 0) : f + half + 1]
+        return lasting(known, layout, results[f].state, near.mean(axis=0), noise, *more)
+
+    shapes = []
+    if answers:
+        alone = [lasts(int(f)).alone for f in sampled]
+        shapes = [one([int(f) for f in sampled], alone) for one in answers]
+
+    def surer_no_more() -> Iterator[FrameResult]:
+        for f, result in enumerate(results):
+            one = lasts(f)
+            dofs, joints = np.maximum(np.diag(one.dofs), 0.0), one.joints
+            for shape in shapes:
+                dofs, joints = (mine + of_shape for mine, of_shape in zip((dofs, joints), shape.at(f)))
+            yield replace(
+                result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),
+                joint_std=np.sqrt(np.square(result.joint_std) + joints),
+            )  # fmt: skip
+
+    return surer_no_more(), noise
 
 
-def pooled(values: NDArray, half: int) -> NDArray:
-    """Values (F, N), each the mean over so many frames to either side: motion ties a frame to its neighbours."""
-    total = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    frames = np.arange(len(values))
-    low, high = np.maximum(frames - half, 0), np.minimum(frames + half + 1, len(values))
-    return np.maximum((total[high] - total[low]) / (high - low)[:, None], 0.0)
+def _left_over(take: SmoothTake) -> tuple[NDArray, NDArray]:
+    """Residuals (F, N, 2) [px] and robust factors (F, N); of long takes in stretches, with unseen frames between."""
+    channels, parts = take.channels, stretches(len(take.roots))
+    chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, _STRETCHES).astype(int))]
+    values, factors = [], []
+    for some in chosen:
+        part = take.part(some)
+        fitted = part.fitted(part.roots, part.angles)
+        values.append(part.uv - fitted)
+        factors.append(part.factors(channels.sigma, fitted))
+        if len(parts) > _STRETCHES:  # as many frames as residuals are followed over
+            values.append(np.full((_APART, *values[0].shape[1:]), np.nan))
+            factors.append(np.zeros((_APART, factors[0].shape[1])))
+    return np.concatenate(values), np.concatenate(factors)
 
 
 @dataclass(frozen=True, eq=False)

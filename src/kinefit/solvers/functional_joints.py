@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import bare, matched
 from kinefit.errors import ObservationError, choices
 from kinefit.observations import Markers
@@ -50,6 +51,7 @@ class FunctionalJoint:
     turns: NDArray
 
 
+@checked
 def functional_centre(markers: Markers, parent: Sequence[str], child: Sequence[str]) -> FunctionalJoint:
     """Centre of a ball joint, such as a hip, from a take in which it moves about more than one axis.
 
@@ -82,6 +84,7 @@ def functional_centre(markers: Markers, parent: Sequence[str], child: Sequence[s
     return FunctionalJoint(0.5 * (Rp @ c[:3] + tp + Rc @ c[3:] + tc), None, spread, turns)
 
 
+@checked
 def functional_axis(markers: Markers, parent: Sequence[str], child: Sequence[str]) -> FunctionalJoint:
     """Axis of a hinge, such as a knee, from a take in which it bends.
 

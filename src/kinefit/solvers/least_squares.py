@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows
@@ -71,6 +72,7 @@ def bounds_of(body: Body, limits: bool) -> tuple[NDArray, NDArray]:
     return -free, free
 
 
+@checked
 def gauss_newton(
     body: Body,
     state: BodyState,
@@ -101,6 +103,7 @@ def gauss_newton(
     return Step(state.retract(delta, bounds), delta, float(np.linalg.norm(delta)), eq)
 
 
+@checked
 def levenberg_marquardt(
     body: Body,
     state: BodyState,

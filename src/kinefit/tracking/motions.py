@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Matched, Measurement, leftovers_at
+from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
@@ -45,7 +45,7 @@ class TrackedFrames:
     channels : keypoints of the F frames, of no points where there are none
     results : F frames, with the matches of keypoints alone
     measurements : of each of them what all sensors but the keypoints measured, without whole images
-    residuals : what the fit leaves over of every sensor in them
+    leftovers : of each of them what the fit leaves over of every sensor
     times : (F,) [s]
     rate : float [Hz]
     scene_of, apart : those of the tracker
@@ -54,7 +54,7 @@ class TrackedFrames:
     channels: Channels
     results: Sequence[FrameResult]
     measurements: Sequence[tuple[Measurement, ...]]
-    residuals: Mapping[str, Residuals]
+    leftovers: Sequence[tuple[Leftover, ...]]
     times: NDArray
     rate: float
     scene_of: SceneOf
@@ -114,8 +114,8 @@ def motion_of(
         scene = frames.scene_of(r.state, r.time) if others is None else others.scene(f, take.roots, take.angles)
         return scene, [*r.matched, *(() if matched is None else matched[f])]
 
-    residuals = frames.residuals if not smooth and lag is None else _residuals(len(results), seen)
     provenance["contradictions"] = contradictions(*zip(*(seen(int(f)) for f in spread(len(results), LOOKS))))
+    residuals = _residuals(len(results), seen if smooth or lag is not None else None, frames.leftovers)
     noise_of_others = None
     if others is not None and matched is not None:
         # the tracker's own frames hold the surfaces' errors already
@@ -135,7 +135,7 @@ def motion_of(
     if cameras := as_told(found):
         provenance[CAMERAS] = cameras
     elsewhere = any(of_cameras(one) is not None for one in found)
-    results, detectors = with_lasting_errors(
+    last, detectors = with_lasting_errors(
         results, subject, take, weight, rate, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_std,
     )  # fmt: skip
@@ -144,20 +144,26 @@ def motion_of(
     provenance["length_std_m"] = subject.length_std
     provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
     return Motion(
-        body=body,
-        rate=rate,
-        times=frames.times,
-        Ts_world_root=np.stack([r.state.T_world_root for r in results]),
-        angles=np.stack([r.state.angles for r in results]),
-        dof_std=np.stack([r.dof_std for r in results]),
-        joint_std=np.stack([r.joint_std for r in results]),
-        quality=np.array([r.quality for r in results]),
-        segment_quality=np.stack([r.segment_quality for r in results]),
-        residuals=residuals,
-        up=up,
-        name=name,
-        provenance=provenance,
-    )
+        body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
+        name=name, provenance=provenance,
+    )  # fmt: skip
+
+
+def _arrays(results: Iterable[FrameResult], body: Body, frames: int) -> dict[str, NDArray]:
+    """Arrays of a motion of so many frames."""
+    segments, D = len(body.tree.segments), len(body.tree.coordinates)
+    shapes = {
+        "Ts_world_root": (4, 4), "angles": (D,), "dof_std": (6 + D,), "joint_std": (segments, 3), "quality": (),
+        "segment_quality": (segments,),
+    }  # fmt: skip
+    out = {name: np.empty((frames, *shape)) for name, shape in shapes.items()}
+    for f, r in enumerate(results):
+        out["Ts_world_root"][f], out["angles"][f] = r.state.T_world_root, r.state.angles
+        for name in ("dof_std", "joint_std", "quality", "segment_quality"):
+            out[name][f] = getattr(r, name)
+    for array in out.values():
+        array.flags.writeable = False  # for a motion to take them as they are
+    return out
 
 
 def _behind(
@@ -185,10 +191,15 @@ def _behind(
     return out, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_told(body)}
 
 
-def _residuals(count: int, seen: Callable[[int], tuple[Scene, list[Matched]]]) -> dict[str, Residuals]:
-    """What every sensor leaves over of so many frames."""
+def _residuals(
+    count: int, seen: Callable[[int], tuple[Scene, list[Matched]]] | None, tracked: Sequence[tuple[Leftover, ...]]
+) -> dict[str, Residuals]:
+    """What every sensor leaves over of so many frames: as it was tracked, or of what was matched since."""
     remains = Remains(count)
     for f in range(count):
+        if seen is None:
+            remains.add(f, tracked[f])
+            continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))
     return remains.residuals()

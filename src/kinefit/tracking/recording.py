@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any, get_args
 
 import numpy as np
@@ -77,6 +78,9 @@ class Recording:
     name: str = "motion"
 
     def __post_init__(self) -> None:
+        of_kind(self.times, np.ndarray, "the times of a recording", "Give an array [s], as of_frames makes it.")
+        of_kind(self.rig, Rig, "the rig of a recording", "Give a Rig, such as read_calibration returns.")
+        of_kind(self.rate, Real, "the rate of a recording", "Give it in Hz.")
         if not len(self.times) or not 0.0 < self.rate < np.inf:
             problem = f"a recording of {len(self.times)} steps at {self.rate} Hz"
             raise ObservationError(problem, remedy="Give sensors that share some time, and a positive rate.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -10,19 +10,22 @@ from typing import Any
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
-from kinefit.motion import Residuals
-from kinefit.sensors.base import Measurement
+from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import Spool, SpoolState
 from kinefit.subject.subject import Progress
+from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.residuals import Remains
 from kinefit.tracking.session import KeptFrame
+from kinefit.tracking.so_far import append_rows
 from kinefit.tracking.tracker import Tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
+_KINDS = "results", "measurements", "leftovers"
+_TOLD = "so-far.csv"
+_EVERY = 300  # steps after which a checkpoint is written: ten seconds of video, a second of work or half a minute
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,25 +34,96 @@ class Tracked:
 
     Parameters
     ----------
-    results : one for each step of `steps`, with the matches of keypoints alone
+    results : one for each step of `steps`, with the matches of keypoints alone; read on demand
     steps : numbers of the steps that were done, in order
     measurements : of each of them what all sensors but the keypoints measured, without whole images; read on demand
-    residuals : what the fit leaves over of every sensor in them
+    leftovers : of each of them what the fit leaves over of every sensor; read on demand
     tracker : that did it
     complete : whether all steps were done
     """
 
-    results: list[FrameResult]
+    results: Sequence[FrameResult]
     steps: list[int]
     measurements: Sequence[tuple[Measurement, ...]]
-    residuals: Mapping[str, Residuals]
+    leftovers: Sequence[tuple[Leftover, ...]]
     tracker: Tracker
     complete: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Before the step `at`: the tracker, the steps done in their order, what is kept of each."""
+
+    at: int
+    tracker: Tracker
+    steps: tuple[int, ...]
+    spools: tuple[SpoolState, ...]
+
+
+class _Frames:
+    """What is kept of all steps done, in the order in which they were done; in files that stay, with a checkpoint."""
+
+    def __init__(self, checkpoint: Checkpoint | None) -> None:
+        files = [None if checkpoint is None else checkpoint.file(f"{what}.bin") for what in _KINDS]
+        self.results = Spool[FrameResult](file=files[0])
+        self.measurements = Spool[tuple[Measurement, ...]](file=files[1])
+        self.leftovers = Spool[tuple[Leftover, ...]](file=files[2])
+        self.place, self.told = dict[int, int](), 0
+
+    def add(self, i: int, one: KeptFrame) -> None:
+        count = len(self.place)
+        self.results.append(one.result)
+        self.measurements.append(one.measurements)
+        self.leftovers.append(one.leftovers)
+        self.place[i] = count  # last: Ctrl-C may come between
+
+    @property
+    def spools(self) -> tuple[Spool[Any], ...]:
+        return self.results, self.measurements, self.leftovers
+
+    def keep(self, checkpoint: Checkpoint, tracker: Tracker, at: int) -> Tracker:
+        """Write a checkpoint before a step; returns the tracker to go on with."""
+        state = _State(at, tracker, tuple(self.place), tuple(spool.state() for spool in self.spools))
+        state = checkpoint.keep("frames", state)
+        self._restore(state)
+        self._tell(checkpoint, state.tracker.body)
+        return state.tracker
+
+    def go_on(self, checkpoint: Checkpoint, tracker: Tracker, at: int) -> tuple[Tracker, int]:
+        """The tracker and the step to go on with, after those of an earlier run; as given where there is none."""
+        checkpoint.file(_TOLD).unlink(missing_ok=True)
+        state = checkpoint.load("frames")
+        if state is None or not self._restore(state):
+            self.place = {}
+            for spool in self.spools:
+                spool.restore(SpoolState(b"", ()))
+            return tracker, at
+        self._tell(checkpoint, state.tracker.body)
+        return state.tracker, state.at
+
+    def _tell(self, checkpoint: Checkpoint, body: Body) -> None:
+        new = list(self.place)[self.told :]
+        append_rows(checkpoint.file(_TOLD), body, ((step, self.results[self.place[step]]) for step in new))
+        self.told = len(self.place)
+
+    def _restore(self, state: _State) -> bool:
+        self.place = {step: k for k, step in enumerate(state.steps)}
+        whole = [spool.restore(told) for spool, told in zip(self.spools, state.spools, strict=True)]
+        return all(whole)
+
+    def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> Tracked:
+        """In the order of time; `steps` of the whole recording."""
+        done = sorted(self.place)
+        order = [self.place[i] for i in done]
+        return Tracked(
+            self.results.chosen(order), done, self.measurements.chosen(order), self.leftovers.chosen(order), tracker,
+            not stopped and len(done) == steps,
+        )  # fmt: skip
+
+
 def run(
     recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *,
-    start: Any = None, values: Any = None, progress: Progress | None = None,
+    start: Any = None, values: Any = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
 ) -> Tracked:  # fmt: skip
     """Track all steps of a recording, each from those before it.
 
@@ -58,6 +132,7 @@ def run(
     channels : the person's keypoints on this body
     start : step and state to begin with; default: the first that the tracker finds by itself.
     values : {sensor: {name: value}} of the sensors' own unknowns
+    checkpoint : where it goes on from, and what is done is kept
 
     Raises
     ------
@@ -75,52 +150,46 @@ def run(
     if start is not None:
         begin, state = start
         tracker.start_at(state)
-    results: dict[int, FrameResult] = {}
-    kept, place = Spool[tuple[Measurement, ...]](), dict[int, int]()
-    remains = Remains(len(times))
+    frames, at = _Frames(checkpoint), begin
+    if checkpoint is not None:
+        checkpoint.know(layout=layout, channels=channels, body=body, found_rig=recording.rig, settings=settings)
+        tracker, at = frames.go_on(checkpoint, tracker, at)
 
-    def step(tracker: Tracker, i: int, time: float) -> FrameResult | None:
-        frames = list(recording.steps(i))
+    def step(tracker: Tracker, i: int, time: float) -> bool:
+        seen = list(recording.steps(i))
         if len(layout.points) and (channels.confidence[i] > 0).any():
-            seen = channels.uv[i], channels.confidence[i]
-            frames.append(KeypointMeasurement(tracker.sensors.keypoints, layout, *seen, time))
-        found = tracker.update(frames, time)
-        if found is None:
-            return None
-        moving = {"measurements": found.measurements, "velocity": tracker.speed}
-        one = KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving))
-        remains.add(i, one.leftovers)
-        place[i] = len(kept)
-        kept.append(one.measurements)
-        return one.result
+            pixels = channels.uv[i], channels.confidence[i]
+            seen.append(KeypointMeasurement(tracker.sensors.keypoints, layout, *pixels, time))
+        found = tracker.update(seen, time)
+        if found is not None:
+            moving = {"measurements": found.measurements, "velocity": tracker.speed}
+            frames.add(i, KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving)))
+        return found is not None
 
     stopped = False
     try:
-        for i in range(begin, len(times)):
-            found = step(tracker, i, float(times[i]))
-            if found is not None:
-                results[i] = found
-            elif not results and i - begin >= _GIVE_UP and tracker.sees_surfaces:
+        for i in range(at, len(times)):
+            if checkpoint is not None and i > at and (i - begin) % _EVERY == 0:
+                tracker = frames.keep(checkpoint, tracker, i)
+            found = step(tracker, i, float(times[i])) or frames.place
+            if not found and i - begin >= _GIVE_UP and tracker.sees_surfaces:
                 break
             if progress:
                 progress("frames", i + 1 - begin, len(times))
-        if not results:
+        if not frames.place:
             remedy = "Begin with a step that shows the whole person; check units, calibration and the range gate."
             raise TrackingError(f"the body is found in none of the first {i + 1 - begin} steps", remedy=remedy)
-        first = min(results)
-        back = tracker.backwards(results[first].state)
+        if checkpoint is not None and len(times) > at:
+            tracker = frames.keep(checkpoint, tracker, len(times))
+        first = min(frames.place)
+        back = tracker.backwards(frames.results[frames.place[first]].state)
         for i in range(first - 1, -1, -1):
             again = step(back, i, float(times[i]))
-            assert again is not None
-            results[i] = again
+            assert again
             if progress:
-                progress("frames", len(results), len(times))
+                progress("frames", len(frames.place), len(times))
     except KeyboardInterrupt:
-        if not results:
+        if not frames.place:
             raise
         stopped = True
-    done = sorted(results)
-    return Tracked(
-        [results[i] for i in done], done, kept.chosen(place[i] for i in done), remains.residuals(done), tracker,
-        not stopped and len(done) == len(times),
-    )  # fmt: skip
+    return frames.tracked(tracker, len(times), stopped=stopped)

@@ -20,7 +20,6 @@ from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import Spool
 from kinefit.tracking.motions import TrackedFrames
-from kinefit.tracking.residuals import Remains
 
 _Key = tuple[str, str, int]  # camera, keypoint set, and which of a layout's records of these
 
@@ -109,13 +108,10 @@ class Session:
     def frames(self, body: Body, rig: Rig, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras as one list of channels."""
         results = self._results
-        remains = Remains(len(results))
-        for f, several in enumerate(self._leftovers):
-            remains.add(f, several)
         channels, matches = one_layout(body, rig, results, self.rate)
         return TrackedFrames(
             channels, [replace(r, matched=m) for r, m in zip(results, matches)], self._measurements[:],
-            remains.residuals(), np.array([r.time for r in results]), self.rate, scene_of, apart,
+            self._leftovers[:], np.array([r.time for r in results]), self.rate, scene_of, apart,
         )  # fmt: skip
 
 

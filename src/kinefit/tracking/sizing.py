@@ -63,11 +63,18 @@ class Person:
     calibrated: Rig = field(default_factory=lambda: Rig(()))
 
 
+def channels_of(recording: Recording, body: Body) -> Channels:
+    """The keypoints of a recording on a body; of no points where there are none."""
+    if not recording.keypoints:
+        return Channels.none(recording.rig, len(recording))
+    return make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
+
+
 def fitted_to_person(
-    recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None, trial: Subject | None,
-    height: float | None, size: bool, frames: int | None, progress: Progress | None,
+    recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *, subject: Subject | None,
+    trial: Subject | None, height: float | None, size: bool, frames: int | None, progress: Progress | None,
 ) -> Person:  # fmt: skip
-    """The body in the person's size and shape; arguments as of `track`.
+    """The body in the person's size and shape; `channels` on the body as it is, other arguments as of `track`.
 
     Raises
     ------
@@ -77,11 +84,6 @@ def fitted_to_person(
     KinefitError
         What the fits raise.
     """
-    channels = Channels.none(recording.rig, len(recording))
-    if recording.keypoints:
-        channels = make_channels(
-            body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma
-        )
     cameras = len({k.camera for k in recording.keypoints})
     others = _others(recording)
     if cameras == 1 and not (others or recording.start):

@@ -7,6 +7,7 @@ from os import PathLike
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
@@ -23,18 +24,20 @@ from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
 from kinefit.tracking.cameras import as_found
+from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
 _USUAL = "humanoid"  # body of a take that names none
 
 
+@checked
 def track_take(
     take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, settings: TrackSettings | None = None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, checkpoint: Checkpoint | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file in all that its sensors saw; `smooth`, `contacts`, `lag`, `noise` as in `track`.
+    """Track the person of a take file in all that its sensors saw; arguments as of `track`.
 
     Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
     videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays), with
@@ -77,6 +80,7 @@ def track_take(
     motion = track(
         recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
         size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings, progress=progress,
+        checkpoint=checkpoint,
     )  # fmt: skip
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
@@ -10,18 +13,20 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import lag_frames
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.subject import Progress, Subject
+from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.motions import TrackedFrames, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
-from kinefit.tracking.sizing import fitted_to_person
+from kinefit.tracking.sizing import channels_of, fitted_to_person
 
 
+@checked
 def track(
     recording: Recording, body: Body, *, subject: Subject | None = None, trial: Subject | None = None,
     height: float | None = None, size: bool = True, settings: TrackSettings | None = None, smooth: bool = True,
     contacts: bool = False, lag: float | None = None, noise: KnownNoise | None = None, shape_frames: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | None = None, checkpoint: Checkpoint | None = None,
 ) -> Motion:  # fmt: skip
     """Motion of one person from whatever sensors saw, with no pose given.
 
@@ -52,6 +57,8 @@ def track(
         `KnownNoise.usual`.
     shape_frames : int, how many frames bone lengths are found from by keypoints of several cameras; default 25.
     progress : called with (what, done, total).
+    checkpoint : Checkpoint
+        A folder from which a run that was stopped goes on, to the same result.
 
     Raises
     ------
@@ -80,17 +87,28 @@ def track(
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     settings = settings or TrackSettings()
-    person = fitted_to_person(
-        recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
-        progress=progress,
+    channels = channels_of(recording, body)
+    fitted = partial(
+        fitted_to_person, recording, body, channels, settings, subject=subject, trial=trial, height=height, size=size,
+        frames=shape_frames, progress=progress,
     )  # fmt: skip
+    if checkpoint is None:
+        person = fitted()
+    else:
+        if recording.sensors:
+            problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
+            raise ObservationError(problem, remedy="Leave the checkpoint out.")
+        whole = {name: getattr(recording, name) for name in ("steps", "keypoints", "people", "markers", "depth", "rig")}
+        pixels = {"uv": channels.uv, "confidence": channels.confidence}
+        checkpoint.know(recording=recording, settings=settings, **whole, **pixels)
+        person = checkpoint.piece("person", fitted)
     tracked = run(
         person.recording, person.subject.body, person.channels, settings, start=person.start, values=person.values,
-        progress=progress,
+        progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     steps, tracker = tracked.steps, tracked.tracker
     frames = TrackedFrames(
-        person.channels.part(steps), tracked.results, tracked.measurements, tracked.residuals,
+        person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
     told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}

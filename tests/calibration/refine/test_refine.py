@@ -108,6 +108,7 @@ def test_focal_lengths_are_found_on_request():
 # what is refused
 
 
+@pytest.mark.slow
 def test_exchanged_cameras_are_named():
     names = room().names
     swapped = Rig(tuple(replace(room().cameras[k], name=n) for k, n in zip((0, 2, 1, 3), names, strict=True)))

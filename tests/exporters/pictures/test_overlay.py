@@ -11,10 +11,11 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 from kinefit.errors import ExportError
 from kinefit.exporters import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.pictures.drawing import bones
-from kinefit.exporters.pictures.overlay import nearest_frame
+from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
 from kinefit.exporters.skeletons.tubes import CENTRE, LEFT, RIGHT
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.video import Video
+from kinefit.simulation import cut
 
 CAMERA = a_camera("cam 0", 0.3)
 GREY = np.full((480, 320, 3), 90, np.uint8)
@@ -123,6 +124,20 @@ def test_every_picture_is_in_the_video(tmp_path, motion, size):
             patch = at(image, 0.5 * (a + b))
             assert patch[0] > patch[2] + 40  # orange
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.mkv", "out.mp4"]
+
+
+def test_only_the_motion_s_pictures_are_drawn(tmp_path, motion):
+    path, done = a_video(tmp_path / "in.mkv", (320, 480), 20), []
+    part = cut(motion, 0, 4)
+    part = replace(part, times=2.0 + (6 + np.arange(4)) / 60)
+    with Video(path) as video:
+        write_overlay(part, CAMERA, video, tmp_path / "out.mp4", time_offset=2.0, progress=done.append)
+    assert done == [1, 2, 3, 4]
+    with Video(tmp_path / "out.mp4") as out:
+        assert len(out) == 4
+        assert np.abs(out.read(0).astype(int)[-20:, :40] - (60 + 6)).mean() < 8
+    assert frames_of(part, 2.0 + np.arange(20) / 60) == range(6, 10)
+    assert frames_of(part, np.arange(100.0, 120.0)) == range(20)  # none: all, each with a note
 
 
 def test_frames_are_matched_by_time(motion):

@@ -7,7 +7,7 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.exporters.report.angles import Curve, curves
+from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.ranges import NAMES, WIDE, extremes, ranges_table
 
 RATE = 50.0
@@ -24,7 +24,9 @@ def test_of_a_sine_its_ends_range_and_speed():
     assert found.lowest == pytest.approx((10.0, 4.0), abs=0.05)
     assert found.highest == pytest.approx((50.0, 4.0), abs=0.05)
     assert found.span == pytest.approx((40.0, 4 * 2**0.5), abs=0.1)
-    assert found.fastest == pytest.approx(20 * 2 * np.pi, rel=0.01) and found.share == 1.0
+    assert found.fastest[0] == pytest.approx(20 * 2 * np.pi, rel=0.01) and found.share == 1.0
+    assert np.isnan(found.fastest[1])  # nobody told it
+    assert extremes(replace(curve(), speed_std=3.0), RATE, np.ones(101, bool)).fastest[1] == 6.0
 
 
 def test_what_was_not_observed_takes_no_part():
@@ -33,7 +35,7 @@ def test_what_was_not_observed_takes_no_part():
     std = np.full(101, 2.0)
     std[40:50] = np.inf
     found = extremes(curve(std, values), RATE, np.ones(101, bool))
-    assert found.highest[0] < 51 and found.fastest < 150 and found.share == pytest.approx(91 / 101)
+    assert found.highest[0] < 51 and found.fastest[0] < 150 and found.share == pytest.approx(91 / 101)
     tracked = np.arange(101) < 20
     assert extremes(curve(), RATE, tracked).lowest[0] == pytest.approx(30.0)
     assert extremes(curve(WIDE), RATE, np.ones(101, bool)) is None
@@ -50,3 +52,16 @@ def test_the_table_has_left_beside_right_and_says_what_is_unknown():
     knee = next(row for row in rows if "Knee flexion" in row)
     assert knee.count("not observed") == 1 and knee.count("±") == 3  # of the right knee
     assert {c.stem for c in curves(motion) if c.unit == "deg"} <= set(NAMES)
+
+
+def test_the_highest_speed_has_the_uncertainty_that_smoothing_told():
+    motion = smooth_motion(40)
+    motion = replace(motion, quality=np.ones(40), dof_std=np.full_like(motion.dof_std, 0.01))
+    speeds = dict.fromkeys(motion.body.dof_names, 0.1) | {"knee_angle_r": 0.2}
+    motion = replace(motion, provenance={"smoothing": {"speed_std": speeds}})
+    found = {c.name: c.speed_std for c in curves(motion)}
+    assert found["knee_angle_r"] == pytest.approx(np.degrees(0.2))
+    assert found["pelvis_tilt"] == pytest.approx(np.degrees(0.1)) and found["pelvis_tx"] == pytest.approx(0.1)
+    rows = own(ranges_table(motion)).split("<tr>")
+    knee = next(row for row in rows if "Knee flexion" in row)
+    assert knee.count("±") == 9 and "± 23" in knee and "± 11" in knee

@@ -12,7 +12,8 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
-from kinefit.exporters.report.angles import _band, _root_turns, curves, thinned
+from kinefit.exporters.curves import _root_turns, curves
+from kinefit.exporters.report.angles import _band, thinned
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (

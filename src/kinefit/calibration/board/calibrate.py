@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.calibration.board.bundle import BoardBundle, adjust_boards
 from kinefit.calibration.board.detection import Board, CameraViews
 from kinefit.calibration.board.extrinsics import Placed, place_cameras
@@ -89,6 +90,7 @@ class BoardCalibration:
         }
 
 
+@checked
 def calibrate_board(
     seen: Mapping[str, CameraViews],
     board: Board,

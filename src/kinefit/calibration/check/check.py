@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.calibration.check.arrangement import disagreement_share, mistake_findings, sample, stranger_findings
 from kinefit.calibration.check.bias import CameraBias, camera_biases, disagreement
@@ -81,6 +82,7 @@ class Check:
         return tuple(found for found in self.findings if camera in found.cameras)
 
 
+@checked
 def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = None) -> Check:
     """Look for everything that is wrong with a take.
 

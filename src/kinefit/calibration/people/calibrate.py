@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, PointSet
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
@@ -30,6 +31,7 @@ _ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
 _AGREE = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
 
 
+@checked
 def calibrate_people(
     cameras: Sequence[Camera],
     keypoints: Sequence[Keypoints],

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
 from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
@@ -46,6 +47,7 @@ Length = tuple[str, str, float]
 Gauge = Callable[[Rig, Sighting], tuple[Rig, str]]
 
 
+@checked
 def refine(
     rig: Rig,
     keypoints: Sequence[Keypoints],

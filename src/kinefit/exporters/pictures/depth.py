@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.pictures.drawing import WHITE, write_lines
-from kinefit.exporters.pictures.overlay import _encoder, nearest_frame
+from kinefit.exporters.pictures.overlay import _encoder, frames_of, nearest_frame
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations import DepthVideo
@@ -61,7 +61,7 @@ def write_depth_overlay(
     motion: Motion, camera: Camera, depth: DepthVideo, path: str | PathLike[str], *,
     progress: Callable[[int], None] | None = None,
 ) -> None:  # fmt: skip
-    """Write a video of every depth image with the fitted body's outlines.
+    """Write a video of the depth images of a motion with the fitted body's outlines.
 
     Raises
     ------
@@ -70,9 +70,10 @@ def write_depth_overlay(
     """
     height, width = (n - n % 2 for n in depth_picture(depth.frame(0).depth, motion, None, camera).shape[:2])
     with writing(path) as temporary, _encoder(path, temporary, depth.rate, width, height) as encode:
-        for i, time in enumerate(depth.times):
-            at = nearest_frame(motion, float(time))
+        span = frames_of(motion, depth.times)
+        for i in span:
+            at = nearest_frame(motion, float(depth.times[i]))
             label = f"{camera.name}   frame {i}" + ("" if at is not None else "   no motion here")
             encode(depth_picture(depth.frame(i).depth, motion, at, camera, label=label)[:height, :width])
             if progress:
-                progress(i + 1)
+                progress(i + 1 - span.start)

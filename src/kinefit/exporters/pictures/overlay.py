@@ -37,7 +37,7 @@ def write_overlay(
     blur: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> None:
-    """Write a video (H.264 where the codec is there, else MPEG-4) of every picture with the fit drawn on it.
+    """Write a video (H.264 where the codec is there, else MPEG-4) of a motion's pictures with the fit drawn on them.
 
     Left is blue, right orange, the middle green, a lost segment thin and grey; of bodies with a skin or a mesh outlines
     are drawn. Measured keypoints are yellow rings, those left out as outliers red crosses; pink lines lead to the
@@ -67,7 +67,8 @@ def write_overlay(
     """
     width, height = (side - side % 2 for side in video.size)  # the encoder wants even sides
     with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
-        for i, image in enumerate(video.frames()):
+        span = frames_of(motion, np.arange(len(video)) / video.rate + time_offset)
+        for i, image in zip(span, video.frames(span.start, span.stop)):
             frame = nearest_frame(motion, i / video.rate + time_offset)
             drawn = draw_overlay(
                 image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}",
@@ -75,7 +76,14 @@ def write_overlay(
             )  # fmt: skip
             encode(drawn[:height, :width])
             if progress:
-                progress(i + 1)
+                progress(i + 1 - span.start)
+
+
+def frames_of(motion: Motion, times: NDArray) -> range:
+    """Pictures of a video, at increasing times [s], from the first to the last of a motion; all where it shows none."""
+    margin = 0.5 / motion.rate
+    inside = np.flatnonzero((times > motion.times[0] - margin) & (times < motion.times[-1] + margin))
+    return range(inside[0], inside[-1] + 1) if len(inside) else range(len(times))
 
 
 def nearest_frame(motion: Motion, time: float) -> int | None:

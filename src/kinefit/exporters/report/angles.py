@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.opensim.files import root_coordinates
+from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
-from kinefit.exporters.skeletons.common import euler_zxy
 from kinefit.motion import Motion
 
 MOST = 1000  # points of a curve; the page is about as many pixels wide
@@ -36,44 +34,6 @@ _POSITIVE = {
     "arm_rot": "inwards", "elbow_flex": "flexion", "pro_sup": "pronation", "wrist_flex": "flexion",
     "wrist_dev": "towards the little finger", "pelvis_tilt": "backward", "pelvis_list": "right side down",
 }  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One coordinate over time, as OpenSim calls it: values and standard deviations (F,) in `unit`."""
-
-    name: str
-    joint: str
-    side: str  # "left", "right" or ""
-    unit: str
-    values: NDArray
-    std: NDArray
-
-    @property
-    def stem(self) -> str:
-        """Name without the side."""
-        return self.name[:-2] if self.side else self.name
-
-
-def curves(motion: Motion) -> list[Curve]:
-    """All coordinates: the root's as OpenSim's ground_pelvis joint has them, y up, then the angles; without jumps."""
-    tree, y_up = motion.body.tree, motion.turned("y")
-    names = root_coordinates(motion.body)
-    turns, turns_std = _root_turns(y_up)
-    out = []
-    if tree.root_free:
-        columns = [*turns.T, *y_up.Ts_world_root[:, :3, 3].T]
-        stds = [*turns_std.T, *y_up.dof_std[:, :3].T]
-        units = ["deg"] * 3 + ["m"] * 3
-        out = [Curve(n, "pelvis", "", u, c, s) for n, u, c, s in zip(names, units, columns, stds)]
-    for d, name in enumerate(tree.coordinates):
-        slides = bool(tree.prismatic[d])
-        values, std = motion.angles[:, d], motion.dof_std[:, 6 + d]
-        if not slides:
-            values, std = np.degrees(np.unwrap(values)), np.degrees(std)
-        side, joint = _side(name), motion.body.joints[tree.owners[d]]
-        out.append(Curve(name, joint[:-2] if _side(joint) else joint, side, "m" if slides else "deg", values, std))
-    return out
 
 
 def joint_plots(motion: Motion) -> dict[str, Html]:
@@ -127,10 +87,6 @@ def thinned(values: NDArray, most: int = MOST) -> NDArray:
     return np.unique([0, *ends, len(values) - 1])
 
 
-def _side(name: str) -> str:
-    return {"_l": "left", "_r": "right"}.get(name[-2:], "")
-
-
 def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
     """{joint: {name without the side: curves}}, in the order of interest, with the joints' names in words."""
     order = list(_JOINTS)
@@ -143,25 +99,6 @@ def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
                 rows.setdefault(curve.stem, []).append(curve)
         out[_JOINTS.get(joint, joint)] = rows
     return out
-
-
-def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:
-    """Tilt, list and rotation (F, 3) [deg] with their standard deviations, from those of a turn about the world's axes.
-
-    R = Rz Rx Ry, so ω = z ż + Rz x ẋ + Rz Rx y ẏ; the three errors are taken as independent.
-    """
-    angles = euler_zxy(y_up.Ts_world_root[:, :3, :3])
-    if not len(angles):
-        return angles, angles
-    c, s = np.cos(angles), np.sin(angles)
-    J = np.zeros((len(angles), 3, 3))
-    J[:, 2, 0] = 1
-    J[:, 0, 1], J[:, 1, 1] = c[:, 0], s[:, 0]
-    J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = -s[:, 0] * c[:, 1], c[:, 0] * c[:, 1], s[:, 1]
-    known = np.isfinite(y_up.dof_std[:, 3:6]).all(axis=1) & (np.abs(c[:, 1]) > 1e-3)
-    std = np.full((len(angles), 3), np.inf)
-    std[known] = np.sqrt((np.linalg.inv(J[known]) ** 2 @ y_up.dof_std[known, 3:6, None] ** 2)[..., 0])
-    return np.degrees(np.unwrap(angles, axis=0)), np.degrees(std)
 
 
 def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dict]:

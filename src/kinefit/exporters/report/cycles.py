@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.motion import Motion
+from kinefit.motion import Motion, rotation_between_up
 
 PERCENT = np.arange(101.0)
 _SHORTEST, _LONGEST = 0.4, 3.0  # [s] of a stride: sprinters take 0.45 s, people who hardly walk 2.5 s
@@ -101,11 +101,16 @@ def foot_ahead(motion: Motion, side: str) -> NDArray | None:
     names = ("l_heel", "r_heel", "l_hip", "r_hip")
     if any(name not in motion.body.landmarks.names for name in names):
         return None
-    left, right, hip_l, hip_r = np.moveaxis(motion.turned("y").positions(motion.body.landmarks.select(names)), 1, 0)
+    left, right, hip_l, hip_r = np.moveaxis(_upright(motion, names), 1, 0)
     forward = np.cross([0.0, 1.0, 0.0], hip_r - hip_l)
     forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-9)
     heel = left if side == "l" else right
     return np.sum((heel - 0.5 * (hip_l + hip_r)) * forward, axis=1)
+
+
+def _upright(motion: Motion, names: tuple[str, ...]) -> NDArray:
+    """(F, K, 3) [m] landmarks in a world whose vertical axis is y."""
+    return motion.positions(motion.body.landmarks.select(names)) @ rotation_between_up(motion.up, "y").T
 
 
 def gait_numbers(motion: Motion, cycles: Cycles) -> dict[str, list[tuple[float, float]]]:
@@ -119,7 +124,7 @@ def gait_numbers(motion: Motion, cycles: Cycles) -> dict[str, list[tuple[float, 
         if cycles.kind != "gait":
             found = {"cycle time [s]": times}
         else:
-            heel = motion.turned("y").positions(motion.body.landmarks.select((f"{side.name[0]}_heel",)))[:, 0, ::2]
+            heel = _upright(motion, (f"{side.name[0]}_heel",))[:, 0, ::2]
             lengths = np.linalg.norm(heel[side.spans[:, 1]] - heel[side.spans[:, 0]], axis=1)
             found = {"stride time [s]": times, "cadence [steps/min]": 120 / times, "stance [% of cycle]": side.toe_off}
             if np.min(lengths) > _STEP * (motion.body.stature or 1.7):  # not on a treadmill, nor on the spot

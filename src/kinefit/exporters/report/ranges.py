@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import Curve, by_joint, curves
+from kinefit.exporters.report.angles import by_joint
 from kinefit.motion import Motion
 
 WIDE = 45.0
@@ -51,14 +52,15 @@ class Extremes:
     ----------
     lowest, highest, span : (value, two standard deviations)
         Those of the span as if both ends erred on their own: an error that lasts is in neither.
-    fastest : largest speed.
+    fastest : largest speed; its deviation is NaN where the motion does not tell it. Of a greatest of many it is no
+        interval of its own: that of noise alone is above zero, too.
     share : of the frames in which the coordinate was observed.
     """
 
     lowest: tuple[float, float]
     highest: tuple[float, float]
     span: tuple[float, float]
-    fastest: float
+    fastest: tuple[float, float]
     share: float
 
 
@@ -82,7 +84,9 @@ def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
     inside[[0, -1]] = False
     fastest = float(speed[inside].max()) if inside.any() else np.nan
     ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
-    return Extremes(ends[0], ends[1], (span, float(np.hypot(ends[0][1], ends[1][1]))), fastest, float(known.mean()))
+    share = float(known.mean())
+    of_span = span, float(np.hypot(ends[0][1], ends[1][1]))
+    return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share)
 
 
 def ranges_table(motion: Motion) -> p.Html:
@@ -112,7 +116,8 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
     if found is None:
         return ("not observed", "", "", "")
     part = "" if found.share > 0.995 else "*"
-    fastest = f"{found.fastest:.0f}" if np.isfinite(found.fastest) else "–"
+    speed, twice = found.fastest
+    fastest = "–" if not np.isfinite(speed) else _told(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
     return (*(_told(*pair) for pair in (found.lowest, found.highest)), _told(*found.span) + part, fastest)
 
 

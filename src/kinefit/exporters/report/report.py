@@ -18,8 +18,9 @@ import numpy as np
 
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
+from kinefit.exporters.curves import curves
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import curves, cycle_plots, joint_plots
+from kinefit.exporters.report.angles import cycle_plots, joint_plots
 from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
@@ -189,7 +190,7 @@ def _summary(
     about = (
         "± is two standard deviations. That of a range takes its two ends to err on their own. A * marks what was "
         "observed in a part of the frames only; an angle with a standard deviation above 45° counts as not observed. "
-        "The greatest speed is of the angles as they are, without a deviation of its own."
+        "That of the greatest speed is what smoothing leaves of a change from frame to frame in lively moments."
     )
     return p.section(
         "Summary", p.facts(facts), *parts, p.heading("How far every joint moved"), ranges_table(motion),

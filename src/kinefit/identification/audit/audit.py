@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
@@ -79,6 +80,7 @@ class AuditFinding:
         return self.text
 
 
+@checked
 def audit_take(
     markers: Markers, *, model: MarkerModel | None = None, marker_set: MarkerSet | None = None
 ) -> list[AuditFinding]:

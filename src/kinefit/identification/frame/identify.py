@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import place_joint
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
@@ -67,6 +68,7 @@ class Identification:
     guess: NDArray | None = None
 
 
+@checked
 def identify(
     model: MarkerModel,
     points: ArrayLike,

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.errors import ObservationError
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
@@ -206,6 +207,7 @@ def guess_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArr
     return deviation
 
 
+@checked
 def model_from_frame(
     positions: ArrayLike, labels: Sequence[str], marker_set: MarkerSet, *, name: str = "subject"
 ) -> MarkerModel:

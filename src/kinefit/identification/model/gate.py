@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import RANGE, MarkerSet, find_marker_set
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 from kinefit.identification.model.rigid import told
@@ -52,6 +53,7 @@ class Finding:
         return f"{self.name}: {self.text}. {self.remedy}."
 
 
+@checked
 def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet | None = None) -> list[Finding]:
     """What the training take leaves open, worst first; empty if nothing.
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.errors import ObservationError
 from kinefit.identification.model.clusters import learn_segments
@@ -39,6 +40,7 @@ WIDEST = 4.0
 """[m] that the markers of one subject spread over at most."""
 
 
+@checked
 def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet | str | None = None) -> MarkerModel:
     """What the markers of a labelled take hold to each other.
 

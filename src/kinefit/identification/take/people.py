@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.naming import Step
@@ -14,6 +15,7 @@ from kinefit.identification.take.takes import TakeIdentification, TakeSettings, 
 from kinefit.observations import Markers
 
 
+@checked
 def identify_people(
     models: Sequence[MarkerModel], markers: Markers, *, settings: TakeSettings | None = None,
     progress: Step | None = None,

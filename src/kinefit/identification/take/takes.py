@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
@@ -107,6 +108,7 @@ def identify_anchor(model: MarkerModel, points: NDArray) -> Identification:
     return identify(model, points, settings=ANCHOR)
 
 
+@checked
 def identify_take(
     model: MarkerModel, markers: Markers, *, settings: TakeSettings | None = None, progress: Step | None = None,
     identify_frame: Callable[[MarkerModel, NDArray], Identification] = identify_anchor,

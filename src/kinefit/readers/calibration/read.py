@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.errors import CalibrationError, ExportError, FileError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
@@ -33,6 +34,7 @@ FORMATS = (
 _FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
 
 
+@checked
 def read_calibration(
     path: str | PathLike[str],
     *,

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import CalibrationError, ExportError, KinefitError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
@@ -31,6 +32,7 @@ from kinefit.readers.calibration.tables import find, read_table
 _REMEDY = "Write it as Pose2Sim TOML instead: kinefit.readers.calibration.read.write_calibration."
 
 
+@checked
 def write_calibration_like(
     rig: Rig,
     like: str | PathLike[str],

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import FileError, ObservationError
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
@@ -27,6 +28,7 @@ _UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] a count, a
 _RATE = 30.0  # [Hz] of nearly every depth camera, where nothing tells it
 
 
+@checked
 def read_depth(
     path: str | PathLike[str],
     *,
@@ -83,6 +85,7 @@ def read_depth(
     return video
 
 
+@checked
 def read_clouds(
     path: str | PathLike[str],
     *,

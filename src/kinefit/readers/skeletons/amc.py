@@ -7,12 +7,14 @@ from os import PathLike, fspath
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import FileError, choices
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.asf import AsfSkeleton, Bone, read_asf
 from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text
 
 
+@checked
 def read_amc(
     asf_path: str | PathLike[str],
     amc_path: str | PathLike[str],

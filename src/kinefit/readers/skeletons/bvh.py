@@ -11,6 +11,7 @@ from os import PathLike, fspath
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import FileError
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text
@@ -30,6 +31,7 @@ class _Joint:
     channels: tuple[str, ...]  # such as "xposition", in the file's order
 
 
+@checked
 def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str = "auto") -> SkeletonMotion:
     """Read a BVH file.
 

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml
 from kinefit.errors import FileError, TakeError, choices, shortened
 from kinefit.readers.markers import UNITS
@@ -129,6 +130,7 @@ class Take:
     session: SessionEntry = field(default_factory=SessionEntry)
 
 
+@checked
 def read_take(path: str | PathLike[str]) -> Take:
     """Read a take file, or the one in a folder; relative paths in it start at its own folder.
 

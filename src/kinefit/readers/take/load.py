@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -88,6 +89,7 @@ class Observations:
         return (*self.depth, *self.clouds, *self.silhouettes, *self.skin, *self.lines)
 
 
+@checked
 def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     """Read everything that a take names, and check that it fits together.
 

@@ -1,0 +1,60 @@
+"""`kinefit track` goes on where it was stopped."""
+
+import os
+
+from click.testing import CliRunner
+from tests.tracking.test_checkpoint import assert_same
+
+from kinefit import read_motion
+from kinefit.cli import _results as results
+from kinefit.cli import main
+from kinefit.readers.take.file import read_take
+from kinefit.tracking import run as running
+from kinefit.tracking.checkpoint import key_of
+from kinefit.tracking.tracker import Tracker
+
+
+def test_its_key_tells_files_and_options(take):
+    whole = read_take(take)
+    key = key_of(whole, smooth=True)
+    assert key == key_of(read_take(take), smooth=True) and key != key_of(whole, smooth=False)
+    calibration = whole.calibration.file
+    os.utime(calibration, (1, 1))
+    assert key_of(whole, smooth=True) != key
+
+
+def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "_EVERY", 4)
+    words = ["track", str(take), "--no-overlays", "--no-report", "--formats", "motion", "--out"]
+    assert CliRunner().invoke(main, [*words, str(tmp_path / "whole")]).exit_code == 0
+    update, count = Tracker.update, []
+
+    def until(self, frames, time=None, **more):
+        count.append(time)
+        if len(count) == 30:
+            raise KeyboardInterrupt
+        return update(self, frames, time, **more)
+
+    monkeypatch.setattr(Tracker, "update", until)
+    told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
+    assert told.exit_code == 130 and "The same command goes on" in told.output
+    assert len(read_motion(tmp_path / "out" / "motion.npz")) == 29
+    told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
+    assert told.exit_code == 0 and "going on with what an earlier run left" in told.output, told.output
+    assert len(count) == 30 + 60 - 28
+    assert_same(*(read_motion(tmp_path / name / "motion.npz") for name in ("out", "whole")))
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["motion.npz"]
+
+
+def test_restart_begins_anew(take, tmp_path, monkeypatch):
+    words = ["track", str(take), "--no-overlays", "--no-report", "--formats", "motion", "--out", str(tmp_path / "out")]
+    with monkeypatch.context() as patched:
+        patched.setattr(results, "write_results", lambda *given: 1 / 0)
+        assert CliRunner().invoke(main, words).exit_code != 0
+    counted = []
+    update = Tracker.update
+    monkeypatch.setattr(Tracker, "update", lambda self, *given: counted.append(1) or update(self, *given))
+    told = CliRunner().invoke(main, [*words, "--restart"])
+    assert told.exit_code == 0 and "going on" not in told.output
+    assert len(counted) == 60
+    assert not (tmp_path / "out" / "unfinished").exists()

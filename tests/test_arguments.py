@@ -1,0 +1,83 @@
+"""Wrong types in the public functions and records are told by name, with what is wanted, before any work."""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+import kinefit
+from kinefit._arguments import checked
+from kinefit.errors import KinefitError, ObservationError
+
+WRONG = {
+    "None": None, "text": "text", "bytes": b"bytes", "whole": 3, "number": 2.5, "nan": float("nan"), "list": [],
+    "map": {}, "thing": object(), "texts": ["a"], "nones": [None], "array": np.zeros(3), "array of text": np.array("x"),
+    "set": {1}, "function": len, "class": int, "generator": ...,
+}  # fmt: skip
+
+
+def public():
+    for name in kinefit.__all__:
+        thing = getattr(kinefit, name)
+        if callable(thing) and not (inspect.isclass(thing) and issubclass(thing, BaseException)):
+            yield name
+
+
+@pytest.mark.parametrize("name", list(public()))
+def test_every_wrong_type_is_a_typed_error_or_right(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function = getattr(kinefit, name)
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    places = [p for p in needed if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    if not places:
+        return
+    for value in WRONG.values():
+        make = lambda value=value: (x for x in [1]) if value is ... else value
+        try:
+            function(*(make() for _ in places), **{p.name: make() for p in needed if p.kind == p.KEYWORD_ONLY})
+        except KinefitError as error:
+            assert len(str(error)) <= 600, str(error)
+        except TypeError as error:
+            assert "missing a required argument" in str(error)  # of a format that has more of them
+
+
+@checked
+def some(
+    path: str | Path, values: ArrayLike, names: Sequence[str] = (), count: int = 1, *,
+    table: Mapping[str, float] | None = None, tell: Callable | None = None,
+):  # fmt: skip
+    return path
+
+
+RIGHT = [
+    (("a", [1, 2]), {}), ((Path("a"), np.zeros(2)), {"names": ["a"]}), (("a", 1.0, ("a", "b"), np.int64(2)), {}),
+    (("a", [[1, 2], [3, 4]]), {"table": {"a": 1}, "tell": len}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("args", "more"), RIGHT)
+def test_what_is_right_goes_through(args, more):
+    assert some(*args, **more) is args[0]
+
+
+@pytest.mark.parametrize(("args", "more", "said"), [
+    ((None, [1]), {}, "some: path is a NoneType. It takes str or Path"), ((3, [1]), {}, "path is a int"),
+    (("a", "b"), {}, "values is a str. It takes an array of numbers"), (("a", [[1], [2, 3]]), {}, "values is a list"),
+    (("a", 1, "abc"), {}, "names is a str. It takes Sequence of str"),
+    (("a", 1, [1]), {}, "names is a list that does"),
+    (("a", 1, (), 1.5), {}, "count is a float. It takes int"),
+    (("a", 1), {"table": {"a": "b"}}, "table is a dict that"),
+    (("a", 1), {"tell": 3}, "tell is a int"),
+])  # fmt: skip
+def test_what_is_wrong_is_told(args, more, said):
+    with pytest.raises(ObservationError) as told:
+        some(*args, **more)
+    assert said in str(told.value)
+
+
+def test_what_is_missing_is_python_s_own_error():
+    with pytest.raises(TypeError):
+        some("a")
