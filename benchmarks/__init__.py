@@ -4,5 +4,5 @@
 figure can still be measured, `python -m benchmarks.AREA [PART ...] [--quick]` one area or some of its parts.
 """
 
-AREAS = ("solver", "video", "depth", "silhouettes", "regions", "markers", "mixed", "product")
+AREAS = ("solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "product")
 """Modules that run alone."""
