@@ -4,5 +4,7 @@
 figure can still be measured, `python -m benchmarks.AREA [PART ...] [--quick]` one area or some of its parts.
 """
 
-AREAS = ("solver", "video", "depth", "silhouettes", "markers", "mixed", "closures", "product")
+AREAS = (
+    "solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "closures", "product",
+)  # fmt: skip
 """Modules that run alone."""

@@ -226,6 +226,8 @@ class Motion:
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""
+        if up == self.up:
+            return self
         R = rotation_between_up(self.up, up)
         T = se3.transform(R, np.zeros(3))
         axis = np.argmax(np.abs(R), axis=1)  # R takes axes onto axes; a product with it would make NaN of ∞ · 0

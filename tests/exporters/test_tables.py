@@ -3,6 +3,7 @@
 import csv
 import sys
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -127,3 +128,13 @@ def test_parquet_names_its_extra_where_it_is_missing(tmp_path, monkeypatch):
     with pytest.raises(ExportError, match=r"kinefit\[parquet\]"):
         write_parquet(smooth_motion(2), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_pieces_of_any_length_give_the_same_files(tmp_path, monkeypatch):
+    module = import_module("kinefit.exporters.tables")  # the package has a function of this name
+    motion = smooth_motion(40)
+    whole = write_csv(motion, tmp_path / "whole")
+    monkeypatch.setattr(module, "_ROWS", 7)
+    monkeypatch.setattr(module, "_FRAMES", 3)
+    for one, other in zip(whole, write_csv(motion, tmp_path / "pieces"), strict=True):
+        assert one.read_bytes() == other.read_bytes()

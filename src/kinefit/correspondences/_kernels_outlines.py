@@ -54,16 +54,29 @@ def seen(camera, vertices, x, uv):
 
 
 @jit
-def shift(a, b, most):
-    """Largest difference of any coordinate of points (N, 2), or the first one found beyond `most`."""
-    largest = 0.0
+def shift(a, b, together):
+    """How far points (N, 2) have moved together since b, if they may, and how far any coordinate has beyond that."""
+    x, y, largest = 0.0, 0.0, 0.0
+    if together:
+        for i in range(len(a)):
+            x += a[i, 0] - b[i, 0]
+            y += a[i, 1] - b[i, 1]
+        x, y = x / len(a), y / len(a)
     for i in range(len(a)):
-        u, v = abs(a[i, 0] - b[i, 0]), abs(a[i, 1] - b[i, 1])
+        u, v = abs(a[i, 0] - b[i, 0] - x), abs(a[i, 1] - b[i, 1] - y)
         largest = u if u > largest else largest
         largest = v if v > largest else largest
-        if largest > most:
-            return largest
-    return largest
+    return x, y, largest
+
+
+@jit
+def bounds(uv):
+    """Smallest and largest coordinates of points (N, 2): left, top, right, bottom."""
+    left, top, right, bottom = uv[0, 0], uv[0, 1], uv[0, 0], uv[0, 1]
+    for i in range(len(uv)):
+        left, right = min(left, uv[i, 0]), max(right, uv[i, 0])
+        top, bottom = min(top, uv[i, 1]), max(bottom, uv[i, 1])
+    return left, top, right, bottom
 
 
 @jit

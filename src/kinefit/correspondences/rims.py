@@ -6,9 +6,10 @@ and triangle of every pixel, tells whether it is seen, and what is behind it: no
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,38 @@ from kinefit.rendering import Canvas, Raster
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
 _APART = 0.03  # [m] depth behind a rim from which it is the outline of one part before another, and no crease
+
+
+_MARGIN = 4.0  # [px] of a window about the body
+_CELL = 32  # [px] by which windows grow, so that few canvases serve all of them
+
+
+class Window(NamedTuple):
+    """A part of a camera's image, drawn at another size: pixel i of it is at (i + 0.5) / scale - 0.5 + left.
+
+    Parameters
+    ----------
+    left, top : float [px] of the camera's image
+    size : (width, height) [px] of the window's own
+    scale : float [px] of the window in one of the camera's
+    """
+
+    left: float
+    top: float
+    size: tuple[int, int]
+    scale: float
+
+    @classmethod
+    def about(cls, uv: NDArray, camera: Camera, longest: int) -> Window:
+        """About points (N, 2) [px] of a camera's image, at most `longest` [px] and a margin wide."""
+        (left, top, right, bottom), (width, height) = kernels.bounds(uv), camera.size
+        left, right = min(max(left, 0.0), width - 1.0), min(max(right, 0.0), width - 1.0)
+        top, bottom = min(max(top, 0.0), height - 1.0), min(max(bottom, 0.0), height - 1.0)
+        scale = min(longest / max(right - left, bottom - top, 1.0), 1.0)
+        margin = math.ceil(_MARGIN / scale)
+        wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
+        size = math.ceil(wide / _CELL) * _CELL, math.ceil(high / _CELL) * _CELL
+        return cls(float(math.floor(left - margin)), float(math.floor(top - margin)), size, scale)
 
 
 class Triangles(Protocol):
@@ -89,7 +122,9 @@ class RimFinder:
         self._out, self._place = np.empty((4, _ROOM)), np.empty((_ROOM, 2))
         self._kind = np.empty(_ROOM, np.int8)
         self._canvases: dict[tuple[int, int], Canvas] = {}
-        self._last: tuple[Camera, NDArray, Raster] | None = None
+        self._last: tuple[Camera, NDArray, Raster, Window] | None = None
+        #: the part of the image that was drawn last, moved with the body since then
+        self.window = Window(0.0, 0.0, (0, 0), 1.0)
 
     @cached_property
     def _edges(self) -> tuple[NDArray, NDArray]:
@@ -107,26 +142,47 @@ class RimFinder:
         """(H, W) int32 triangle of every pixel of a camera of this size, -1 for none, as it was drawn last."""
         return self._canvases[camera.size].face
 
+    @property
+    def face(self) -> NDArray:
+        """(h, w) int32 triangle of every pixel of the window that was drawn last, -1 for none."""
+        assert self._last is not None
+        return self._last[2].face
+
     def find(
-        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0
-    ) -> Rim:
+        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
+        close: int | None = None,
+    ) -> Rim:  # fmt: skip
         """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world.
 
         Parameters
         ----------
         inner : whether outlines of one part before another are wanted, which silhouettes do not show.
         stale : float [px]
-            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn.
+            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn;
+            with `close`, than all of them together.
+        close : int [px], optional
+            Only the part of the image that the body fills is drawn, so many pixels wide at most; see `window`.
         """
         x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
-        last = self._last
-        if last is not None and last[0] is camera and stale > 0.0 and kernels.shift(uv, last[1], stale) <= stale:
-            drawn = last[2]
+        last, moved = self._last, np.inf
+        if last is not None and last[0] is camera and stale > 0.0:
+            du, dv, moved = kernels.shift(uv, last[1], close is not None)
+        if last is not None and moved <= stale:
+            drawn, w = last[2], last[3]._replace(left=last[3].left + du, top=last[3].top + dv)
+            self.window = w
         else:
-            canvas = self._canvases.setdefault(camera.size, Canvas(camera.size))
-            drawn = canvas.draw(x, self.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
-            self._last = camera, uv, drawn
+            w = Window(0.0, 0.0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
+            if w.size not in self._canvases:
+                self._canvases[w.size] = Canvas(w.size)
+            canvas = self._canvases[w.size]
+            fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
+            cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
+            drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
+            self._last = camera, uv, drawn, w
+            self.window = w
+        if close is not None:
+            uv = (uv + (0.5 - w.left, 0.5 - w.top)) * w.scale - 0.5
         edges, sides = self._edges
         n = kernels.rims(
             x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _NEAR, _APART,
@@ -134,7 +190,10 @@ class RimFinder:
         )  # fmt: skip
         number = self._place[:n, 0].astype(np.int64)
         own = np.where(self._front[sides[number, 0]] == 1, sides[number, 0], sides[number, 1])
+        outline = self._out[:, :n].copy()
+        if close is not None:
+            outline[:2] = (outline[:2] + 0.5) / w.scale - 0.5 + np.array([[w.left], [w.top]])
         return Rim(
-            self._out[:, :n].copy(), edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
+            outline, edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
             self._kind[:n] == kernels.INNER,
         )  # fmt: skip

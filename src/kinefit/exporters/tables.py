@@ -28,7 +28,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.motion import Motion
-from kinefit.motion_columns import angle_columns, joint_columns, place_columns
+from kinefit.motion_columns import angle_columns, continuous_quaternions, joint_columns, place_columns
 
 Table = dict[str, NDArray]  # column -> (rows,)
 
@@ -126,10 +126,12 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
     start = {"frame": np.arange(len(motion)), "time [s]": motion.times}
     stretches = [slice(row, row + _ROWS) for row in range(0, max(len(motion), 1), _ROWS)]
 
+    turns = continuous_quaternions(motion.Ts_world_root[:, :3, :3])  # their signs go on from part to part
+    quaternions = {f"root_q{part}": turns[:, i] for i, part in enumerate("wxyz")}
+
     def angles() -> Iterator[Table]:
-        whole = angle_columns(motion, factor, unit)  # of a quaternion's two signs the nearer to the frame before
-        for some in stretches:
-            yield {name: column[some] for name, column in (start | whole).items()}
+        for some, piece in zip(stretches, of_parts(lambda part: angle_columns(part, factor, unit))):
+            yield piece | {name: column[some] for name, column in quaternions.items()}
 
     def of_parts(columns: Callable[[Motion], Table]) -> Iterator[Table]:
         for some in stretches:

@@ -78,7 +78,8 @@ class FrameFit:
 
     def __init__(self, body: Body, settings: TrackSettings) -> None:
         self.body, self.settings = body, settings
-        self._pairs: CollisionPairs | None = collision_pairs(body) if body.surfaces else None
+        pairs = collision_pairs(body) if body.surfaces else None
+        self._pairs: CollisionPairs | None = pairs if pairs is not None and len(pairs.pairs) else None
         self._hard = hard_equations(body)
 
     def run(
@@ -105,6 +106,12 @@ class FrameFit:
             gain = found.cost - other.cost if every else sum(e.balance for e in also) - sum(e.balance for e in told)
             if gain > 0.0:
                 found, told = other, also
+        for m, one in zip(measurements, list(told)):
+            for state in m.starts(scene, None if held is None else held[1], one):
+                other = self._fitted(scene.at(state), held, measurements)
+                also = evidence_of(other.scene, other.matched)
+                if sum(e.balance for e in also) > sum(e.balance for e in told):
+                    found, told = other, also
         return self._judged(found, held, told, known)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
@@ -112,8 +119,9 @@ class FrameFit:
         return self._settled(scene, held, measurements) if settled else self._renewed(scene, held, measurements)
 
     def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
-        """Where nearest points take part: one step under each match."""
-        s, reach, iterations = self.settings, self.settings.far, 0
+        """Where nearest points take part: one step under each match, within a distance that shrinks to `near`."""
+        s, iterations = self.settings, 0
+        reach = float(np.clip(max(m.within for m in measurements if not m.settled), s.near, s.far))
         while iterations < s.iterations:
             iterations += 1
             matched = _match(scene, measurements, reach)
@@ -193,7 +201,8 @@ class FrameFit:
         parts = rows_of(scene, matched, self.settings, without=without)
         if held is not None:
             parts.append(belief(scene.state, *held))
-        parts.append(prior_rows(self.body, scene.state))
+        if len(scene.state.angles):
+            parts.append(prior_rows(self.body, scene.state))
         parts += soft_closures(self.body, scene.state)
         return [*parts, *self.apart(scene)] if apart else parts
 

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, LineFrame, MarkerFrame, PointCloud, SilhouetteFrame
+from kinefit.observations import (
+    ColourFrame,
+    DepthFrame,
+    Frame,
+    KeypointFrame,
+    LineFrame,
+    MarkerFrame,
+    PointCloud,
+    SilhouetteFrame,
+)
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.background import Background
 from kinefit.sensors.base import Measurement, Sensor, named
@@ -20,6 +29,7 @@ from kinefit.sensors.keypoints import NAME as KEYPOINTS
 from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.markers import MarkerSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
+from kinefit.sensors.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
@@ -33,7 +43,8 @@ class Sensors:
     rig : Rig
     rate : float [Hz] of the frames
     sigma : {sensor: standard deviation}
-        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
+        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA",
+        of regions as "region CAMERA".
     settings : TrackSettings
     own : sensors of one's own
     on_body : depth cameras whose images show nothing but the body: no background is learnt
@@ -72,6 +83,7 @@ class Sensors:
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
+            ColourFrame: self._region,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -148,7 +160,7 @@ class Sensors:
         return out
 
     def _of_frame(self, frame: Frame) -> Sensor:
-        kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
+        kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region "}.get(type(frame), "")
         name = kind + frame.sensor
         if name not in self._sensors:
             self._sensors[name] = self._makers[type(frame)](frame.sensor)
@@ -173,6 +185,9 @@ class Sensors:
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
         return ImageLineSensor(own, self.sigma.get(own, s.line), s.loss, s.near)
+
+    def _region(self, name: str) -> RegionSensor:
+        return RegionSensor(self.rig[name], self.sigma.get(f"region {name}", self.settings.region), self.settings)
 
     def _silhouette(self, name: str) -> SilhouetteSensor:
         sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)

@@ -292,7 +292,7 @@ class Rig:
         if twice:
             raise CalibrationError("two cameras of one name", place=f"camera {twice[0]}", remedy="Rename one of them.")
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras, in order."""
         return tuple(camera.name for camera in self.cameras)

@@ -4,9 +4,11 @@ Readers make them, correspondences use them; nothing here opens a file or knows 
 one sensor, `frames` what it saw at one time.
 """
 
+from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.features import KeypointVideo, LineVideo
 from kinefit.observations.frames import (
+    ColourFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -21,6 +23,8 @@ from kinefit.observations.silhouettes import SilhouetteVideo
 __all__ = [
     "MEDIAPIPE_33",
     "CloudVideo",
+    "ColourFrame",
+    "ColourVideo",
     "DepthFrame",
     "DepthVideo",
     "Detections",

@@ -256,4 +256,40 @@ class LineFrame:
         object.__setattr__(self, "ends", ends)
 
 
-Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame
+@dataclass(frozen=True, eq=False)
+class ColourFrame:
+    """One colour image.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of its camera in the rig.
+    time : float [s]
+    image : (H, W, 3) uint8 RGB
+        In the calibration's image frame. It is not copied.
+
+    Raises
+    ------
+    ObservationError
+        No image, or one that is not of three channels of 8 bits.
+    """
+
+    sensor: str
+    time: float
+    image: NDArray
+
+    def __post_init__(self) -> None:
+        check_seen(self.sensor, self.time)
+        image = np.asarray(self.image)
+        if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.uint8:
+            problem = f"an image of {self.sensor} has shape {image.shape} and type {image.dtype}"
+            raise ObservationError(problem, remedy="Give (height, width, 3), RGB of uint8.")
+        object.__setattr__(self, "image", np.ascontiguousarray(image))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self.image.shape[1], self.image.shape[0]
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame

@@ -20,6 +20,7 @@ from kinefit.photogrammetry.spline_image import SplineImage
 
 _EXACT = 1e-6  # [px²] of the template's own place, which defines the point
 _FEWEST = 3  # points of a surface
+_REPEATED = 31  # [px] of windows in which a repetition is sought
 _ALIKE = 0.95  # of the best correlation; of random texture the runner-up has 0.6 to 0.8 of it
 _OUTLYING = 6.0  # robust deviations of the parallax beyond which a match is a wrong one
 _LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration leaves as much
@@ -149,12 +150,14 @@ def _refuse(first: SplineImage, camera: str) -> None:
 def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, camera: str) -> None:
     """Refuse texture that looks the same again nearby, where nobody said which place is meant.
 
-    Of 50 points windows of 13 px are sought about their matches; texture repeats where most are as well found
-    elsewhere.
+    Windows of 31 px about 50 points are sought about their matches, two windows far. Texture repeats where most are
+    found as well elsewhere. Smaller windows would call a random pattern of coarse grains repeated.
     """
     index = np.flatnonzero(found.found)
     index = index[np.linspace(0, len(index) - 1, min(len(index), 50)).astype(int)]
-    told = search_box(first, second, found.points[index], found.uv[index], reach=3 * WINDOW)
+    told = search_box(
+        first, second, found.points[index], found.uv[index], reach=2 * _REPEATED, window=_REPEATED
+    )
     seen = np.isfinite(told.best)
     if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
         problem = "texture that repeats: most points are found as well elsewhere, so their distance is not known"

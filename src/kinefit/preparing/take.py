@@ -82,7 +82,9 @@ def ensure_detections(
 def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
     """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
     asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
-    videos = any(camera.video for camera in take.cameras) and not (take.depth or take.stereo or take.silhouettes)
+    videos = any(camera.video for camera in take.cameras) and not (
+        take.depth or take.stereo or take.silhouettes or take.regions
+    )
     if not asked and (take.keypoints or take.skin or take.lines or not videos):
         return take
     files = ensure_detections(take, progress=progress, tell=tell)

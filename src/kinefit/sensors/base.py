@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, PairRows, ParameterRows
 from kinefit.sensors.checks import check_rows, named
@@ -152,11 +152,13 @@ class Measurement(ABC):
     time : float [s]
     settled : whether a match depends on the state only in what is discrete (labels, sides), so that the fit may go to
         its minimum under one match. False for nearest points, which are sought anew at every step.
+    within : float [m] how far at most the body is from where it is expected, as far as the sensor knows
     """
 
     sensor: str
     time: float
     settled: bool = True
+    within: float = np.inf
 
     @abstractmethod
     def match(self, scene: Scene, reach: float) -> Matched:
@@ -165,6 +167,17 @@ class Measurement(ABC):
     def hints(self, scene: Scene) -> Hints:
         """What it shows where no pose is known."""
         return Hints()
+
+    def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
+        """Other states that a fit may as well begin at; a sensor that searches gives some where they are of use.
+
+        Parameters
+        ----------
+        scene : where the body is expected
+        information : (n, n) of that, None where nothing was known
+        told : what this measurement says of the state that was found from there
+        """
+        return ()
 
     def depth_image(self) -> DepthSeen | None:
         """A depth image that other sensors may ask what is in front of something."""

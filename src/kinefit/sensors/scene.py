@@ -84,7 +84,7 @@ class Scene:
 
         So rows of every sensor follow a rig whose extrinsics are estimated. Asked again it gives the same camera.
         """
-        if camera.name not in self.rig:
+        if any(c is camera for c in self.rig.cameras) or camera.name not in self.rig:
             return camera
         there = self.rig[camera.name]
         return camera if np.array_equal(there.T_camera_world, camera.T_camera_world) else _placed(camera, there)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from kinefit.images.regions import RegionSettings
 from kinefit.losses import Loss, geman_mcclure
 
 
@@ -32,8 +33,9 @@ class TrackSettings:
         measurements count as there are patches.
     render_every : int
         Iterations after which the body's own hidden parts are found anew.
-    depth, pixel, marker, silhouette, line : float [m], [px], [m], [px], [px]
+    depth, pixel, marker, silhouette, region, line : float [m], [px], [m], [px], [px], [px]
         Standard deviation of a sensor that none is given for.
+    regions : RegionSettings, of colours inside and outside of a body
     outline : int [px]
         Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
         and the room about. Outlines are found to parts of a pixel.
@@ -97,7 +99,9 @@ class TrackSettings:
     pixel: float = 4.0
     marker: float = 0.005
     silhouette: float = 4.0
+    region: float = 0.5
     line: float = 2.0
+    regions: RegionSettings = field(default_factory=RegionSettings)
     outline: int = 320
     angle: float = 1.0
     background: float = 0.5

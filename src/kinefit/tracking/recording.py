@@ -16,6 +16,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
 from kinefit.observations import (
+    ColourFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -200,7 +201,7 @@ class Recording:
 
 def _name(frame: Any) -> str:
     """Of the sensor that a frame is of."""
-    kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines "}.get(type(frame), "")
+    kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region "}.get(type(frame), "")
     return kind + str(frame.sensor)
 
 

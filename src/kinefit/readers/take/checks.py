@@ -42,7 +42,7 @@ def check_enough(take: Take) -> None:
     TakeError
         With what to add.
     """
-    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.lines)
+    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines)
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     if len(seeing) == 1 and not (any(others) or take.start or take.pose):
         raise TakeError(
@@ -106,6 +106,9 @@ def _values(take: Take) -> None:
             refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
         if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
+    for region in take.regions:
+        if not 0 < region.sigma < 1e4:
+            refuse(f"sigma {region.sigma} px", f"region of camera {region.camera}", "Give a positive number.")
     for shape in take.silhouettes:
         place = f"silhouette of camera {shape.camera}"
         if not 0 < shape.sigma < 1e4 or (shape.rate is not None and not 0 < shape.rate < 1e6):
@@ -219,7 +222,8 @@ def _uses(take: Take) -> None:
 
 def _names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
-    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or take.silhouettes):
+    shapes = (*take.silhouettes, *take.regions)
+    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or shapes):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
@@ -229,7 +233,8 @@ def _names(take: Take) -> None:
             kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
             raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
     named = [("keypoints", k.camera) for k in (*take.keypoints, *take.skin)]
-    named += [("silhouette", s.camera) for s in take.silhouettes] + [("lines", e.camera) for e in take.lines]
+    named += [("silhouette", s.camera) for s in take.silhouettes] + [("region", r.camera) for r in take.regions]
+    named += [("lines", e.camera) for e in take.lines]
     for kind, camera in named:
         if camera not in names:
             raise TakeError(
@@ -249,15 +254,18 @@ def _names(take: Take) -> None:
             raise TakeError("left and right are one camera", file=take.path, place=f"stereo {pair.name}")
     videos = [entry.name for entry in take.cameras if entry.video is not None]
     seen = [("silhouette", s.camera) for s in take.silhouettes if s.format in ("background", "threshold")]
+    seen += [("region", r.camera) for r in take.regions]
     for kind, camera in [*seen, *(("keypoints", k.camera) for k in take.skin)]:
         if camera not in videos:
             raise TakeError(
                 choices("camera with a video", camera, videos), file=take.path,
                 place=f"{kind} of camera {camera}", remedy="Give the [[camera]] its video.",
             )  # fmt: skip
-    for shape in take.silhouettes:
-        if [s.camera for s in take.silhouettes].count(shape.camera) > 1:
-            raise TakeError("two silhouettes", file=take.path, place=f"camera {shape.camera}", remedy="Leave one out.")
+    for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
+        cameras = [s.camera for s in several]  # type: ignore[attr-defined]
+        for camera in cameras:
+            if cameras.count(camera) > 1:
+                raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(

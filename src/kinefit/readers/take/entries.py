@@ -103,6 +103,13 @@ class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
     smooth: float | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
 
 
+class RegionEntry(_Entry, frozen=True, kw_only=True):
+    """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
+
+    camera: str
+    sigma: float = 0.5  # [px] standard deviation of the contour, shape included, in the calibration's image
+
+
 class LinesEntry(_Entry, frozen=True, kw_only=True):
     """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
 

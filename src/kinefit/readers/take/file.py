@@ -24,6 +24,7 @@ from kinefit.readers.take.entries import (
     KeypointsEntry,
     LinesEntry,
     MarkersEntry,
+    RegionEntry,
     SessionEntry,
     SilhouetteEntry,
     StartEntry,
@@ -40,6 +41,7 @@ __all__ = [
     "KeypointsEntry",
     "LinesEntry",
     "MarkersEntry",
+    "RegionEntry",
     "SessionEntry",
     "SilhouetteEntry",
     "StartEntry",
@@ -60,13 +62,14 @@ class _File(_Entry, frozen=True, kw_only=True):
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
     silhouette: tuple[SilhouetteEntry, ...] = ()
+    region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
-    "silhouette": SilhouetteEntry, "lines": LinesEntry,
+    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
@@ -103,7 +106,7 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, skin, lines : tuples of entries
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples of entries
         `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
@@ -122,6 +125,7 @@ class Take:
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
     silhouettes: tuple[SilhouetteEntry, ...] = ()
+    regions: tuple[RegionEntry, ...] = ()
     start: Path | None = None
     pose: StartEntry | None = None
     size: bool | None = None
@@ -169,7 +173,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
         keypoints=tuple(k for k in content.keypoints if k.format != "skin"), markers=content.markers,
         depth=content.depth, stereo=content.stereo,
-        silhouettes=content.silhouette,
+        silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
         pose=content.start, size=head.size, session=content.session,
     )  # fmt: skip

@@ -15,6 +15,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
     CloudVideo,
+    ColourVideo,
     DepthVideo,
     Keypoints,
     KeypointVideo,
@@ -30,6 +31,7 @@ from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
+from kinefit.readers.take.regions import load_regions
 from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.video import Video, check_rates, common_frames
@@ -61,6 +63,8 @@ class Observations:
         Those whose files are points without order.
     silhouettes : tuple of SilhouetteVideo
         In the order of `take.silhouettes`, whole, at their own rates.
+    regions : tuple of ColourVideo
+        In the order of `take.regions`, whole, at their own rates.
     skin : tuple of KeypointVideo
         In the order of `take.skin`: face and hands by colour, followed as their frames are asked for.
     lines : tuple of LineVideo
@@ -79,14 +83,17 @@ class Observations:
     depth: tuple[DepthVideo, ...] = ()
     clouds: tuple[CloudVideo, ...] = ()
     silhouettes: tuple[SilhouetteVideo, ...] = ()
+    regions: tuple[ColourVideo, ...] = ()
     skin: tuple[KeypointVideo, ...] = ()
     lines: tuple[LineVideo, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
-    def recordings(self) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | KeypointVideo | LineVideo, ...]:
-        """Every recording with `at_step(step, rate)` and `frame(i)`: depth, clouds, silhouettes, skin, lines."""
-        return (*self.depth, *self.clouds, *self.silhouettes, *self.skin, *self.lines)
+    def recordings(
+        self,
+    ) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | ColourVideo | KeypointVideo | LineVideo, ...]:
+        """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
+        return (*self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines)
 
 
 @checked
@@ -151,7 +158,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         markers=markers,
         keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
-        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes, skin=skin, lines=lines,
+        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
+        regions=load_regions(take, rig, images), skin=skin, lines=lines,
         notes=sensors.notes(rate),
     )
 

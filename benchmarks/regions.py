@@ -1,0 +1,13 @@
+"""Every figure of region-based tracking: `python -m benchmarks.regions`; some parts: `... regions regions_cat`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "regions_cat": "a real hand-held object before clutter, followed by its mesh",
+    "regions_rendered": "rendered objects in the manner of RBOT: moving light, noise, an occluder, larger steps",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)

@@ -1,0 +1,209 @@
+"""Compiled colour statistics of two regions, and the likelihood of a contour's place along its normals.
+
+A pixel's colour is one of 32768 (five bits a channel); a table gives the bin of each, another the logarithm of the
+ratio of inside to outside of each bin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from kinefit._jit import jit
+from kinefit._kernels_rendering import rasterise
+
+UNKNOWN = 1e6  # in a table of log ratios
+
+
+@jit
+def _colour(image, j, i):
+    """Number of a pixel's colour, five bits a channel."""
+    return ((image[j, i, 0] >> 3) << 10) | ((image[j, i, 1] >> 3) << 5) | (image[j, i, 2] >> 3)
+
+
+@jit
+def count(image, bins, face, left, top, scale, box, inside, near, far):
+    """Add pixels of an image (H, W, 3) uint8 to the histograms (B,) of inside, near and far outside: one in nine.
+
+    face (h, w) is the body as drawn in a window of the image, -1 where it is not: pixel (x, y) of the image lies at
+    ((x - left + 0.5) scale, (y - top + 0.5) scale). Pixels at its edge count for neither. box: left, top, right, bottom
+    [px] of what is near; of what is far one pixel in 36 is looked at.
+    """
+    height, width = image.shape[:2]
+    for y in range(0, height, 6):
+        for x in range(0, width, 6):
+            if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
+                far[bins[_colour(image, y, x)]] += 1.0
+    for y in range(max(box[1], 0), min(box[3], height), 3):
+        for x in range(max(box[0], 0), min(box[2], width), 3):
+            here = _drawn(face, x, y, left, top, scale)
+            if _drawn(face, x - 2, y, left, top, scale) != here or _drawn(face, x + 2, y, left, top, scale) != here:
+                continue
+            if _drawn(face, x, y - 2, left, top, scale) != here or _drawn(face, x, y + 2, left, top, scale) != here:
+                continue
+            if here:
+                inside[bins[_colour(image, y, x)]] += 1.0
+            else:
+                near[bins[_colour(image, y, x)]] += 1.0
+
+
+@jit
+def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, weight, own):
+    """Add the pixels along the normals of a contour (4, N) to the histograms own (2, A, B) of its points' anchors (N,).
+
+    weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for
+    neither. face, left, top, scale as of `count`.
+    """
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
+        a_ = anchor[p]
+        for side in range(2):
+            sign = 1.0 if side else -1.0
+            for k in range(2, reach + 2):
+                x, y = u + sign * k * a, v + sign * k * b
+                i, j = math.floor(x + 0.5), math.floor(y + 0.5)
+                if not (0 <= i < width and 0 <= j < height):
+                    break
+                if _drawn(face, x, y, left, top, scale) == (side == 1):
+                    break
+                bin_ = bins[_colour(image, j, i)]
+                own[side, a_, bin_] += weight[side]
+
+
+@jit
+def _drawn(face, x, y, left, top, scale):
+    """Whether the body was drawn at a pixel (x, y) of the image."""
+    i, j = math.floor((x - left + 0.5) * scale), math.floor((y - top + 0.5) * scale)
+    return 0 <= i < face.shape[1] and 0 <= j < face.shape[0] and face[j, i] >= 0
+
+
+@jit
+def look_up(image, bins, table, own, total, general, floor, most, anchor, contour, reach):
+    """Find the log ratios of all colours within `reach` [px] of a contour (4, N) that are UNKNOWN in a table (A, B).
+
+    own (2, A, B) pixels counted inside and outside near each anchor, general (2, B) of the body as a whole, both
+    divided by total (2, A); to both densities `floor` is added; ratios lie between -most and most.
+    """
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, x, y, a = contour[0, p], contour[1, p], contour[2, p], contour[3, p], anchor[p]
+        for k in range(-reach, reach):
+            i, j = math.floor(u + (k + 0.5) * x + 0.5), math.floor(v + (k + 0.5) * y + 0.5)
+            if not (0 <= i < width and 0 <= j < height):
+                continue
+            b = bins[_colour(image, j, i)]
+            if table[a, b] == UNKNOWN:
+                inside = (own[0, a, b] + general[0, b]) / total[0, a] + floor
+                told = math.log(inside / ((own[1, a, b] + general[1, b]) / total[1, a] + floor))
+                table[a, b] = most if told > most else -most if told < -most else told
+
+
+@jit
+def profiles(image, bins, table, anchor, contour, face, left, top, scale, half, step, guard, out):
+    """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
+
+    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log
+    ratios, of which a point has the row of its anchor (N,); `look_up` must have found them. face (h, w) is the body as
+    drawn, see `count`: where a line has left the body on its other side, or met it again, it tells nothing any more
+    (0); `guard` [px] about the contour always tell.
+    """
+    height, width = image.shape[:2]
+    for p in range(contour.shape[1]):
+        u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
+        a_ = anchor[p]
+        for side in range(2):
+            ended = False
+            for q in range(half):
+                k = half + q if side else half - 1 - q
+                told = 0.0
+                if not ended:
+                    for r in range(step):
+                        s = (k - half) * step + r + 0.5
+                        x, y = u + s * a, v + s * b
+                        i, j = math.floor(x + 0.5), math.floor(y + 0.5)
+                        if not (0 <= i < width and 0 <= j < height):
+                            ended = True
+                            break
+                        if abs(s) > guard and _drawn(face, x, y, left, top, scale) == (side == 1):
+                            ended = True
+                            break
+                        told += table[a_, bins[_colour(image, j, i)]]
+                out[p, k] = told
+
+
+@jit
+def places(lines, step, heat, out):
+    """Where along each line (N, 2 half) of log ratios the contour is: out (3, N).
+
+    With the contour at boundary c the likelihood is exp(S(c)), S the sum of all log ratios inside of c; it is taken to
+    the power 1 / heat, as neighbouring pixels are alike. out: mean [px] and variance [px²] of the contour's offset, and
+    by how much (in logarithms) the best place explains the line better than no contour on it does.
+    """
+    n = lines.shape[1]
+    half = n // 2
+    total = np.empty(n + 1)
+    for p in range(lines.shape[0]):
+        total[0], best = 0.0, 0.0
+        for k in range(n):
+            total[k + 1] = total[k] + lines[p, k]
+            best = total[k + 1] if total[k + 1] > best else best
+        weight, mean, square = 0.0, 0.0, 0.0
+        for k in range(n + 1):
+            x = (k - half) * step
+            if total[k] > best - 20.0 * heat:
+                w = math.exp((total[k] - best) / heat)
+                weight += w
+                mean += w * x
+                square += w * x * x
+        mean /= weight
+        out[0, p] = mean
+        out[1, p] = square / weight - mean * mean + step * step / 12.0
+        out[2, p] = best - (total[n] if total[n] > 0.0 else 0.0)
+
+
+@jit
+def shifts(lines, step, out):
+    """The paper's rule on the same lines: out (2, N), by how much a point of the contour is shifted, and the variance.
+
+    One step [px] outwards where the samples on both sides of it together look like the body, inwards where they do not,
+    none where they tell nothing; the variance is that of a step.
+    """
+    half = lines.shape[1] // 2
+    for p in range(lines.shape[0]):
+        here = lines[p, half - 1] + lines[p, half]
+        out[0, p] = step if here > 0.0 else -step if here < 0.0 else 0.0
+        out[1, p] = step * step
+
+
+@jit
+def ratio_map(image, bins, ratio, left, top, step, out):
+    """Mean log ratio of cells of step x step pixels, from pixel (left, top) on: out (h, w); 0 outside of the image."""
+    height, width = image.shape[:2]
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            total = 0.0
+            for y in range(top + j * step, top + (j + 1) * step):
+                if 0 <= y < height:
+                    for x in range(left + i * step, left + (i + 1) * step):
+                        if 0 <= x < width:
+                            total += ratio[bins[_colour(image, y, x)]]
+            out[j, i] = total / (step * step)
+
+
+@jit
+def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
+    """How much of a map of log ratios (h, w) lies inside of a body's silhouette, for M poses: out (M,), the sums.
+
+    vertices (V, 3) [m] about the body's middle, in the camera's axes; poses (M, 4, 4) take them to the camera's frame;
+    lens fx, fy, cx, cy, near of the map; room, depth, face as of `rasterise`.
+    """
+    for m in range(len(poses)):
+        rasterise(vertices, poses[m], faces, lens[0], lens[1], lens[2], lens[3], lens[4], False, room, depth, face)
+        total = 0.0
+        for j in range(face.shape[0]):
+            for i in range(face.shape[1]):
+                if face[j, i] >= 0:
+                    total += ratios[j, i]
+        out[m] = total

@@ -1,0 +1,113 @@
+"""What lines across a contour look at: an image with tables of log ratios, or what is kept of it, a band of them."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.images import _kernels_regions as kernels
+from kinefit.images.regions import Ratios
+
+_LEVELS = 127  # of a log ratio that is kept, to either side of 0
+# A map that is kept is drawn as an image whose colours are numbers of levels, so that one kernel looks at both.
+_PALETTE = np.arange(32768, dtype=np.int32) % 256
+
+
+@dataclass(frozen=True, eq=False)
+class Coloured:
+    """An image and the log ratio of each of its colours near each anchor.
+
+    Parameters
+    ----------
+    image : (H, W, 3) uint8 RGB
+    bins : (32768,) int32, see `colour_bins`
+    ratios : Ratios
+    """
+
+    image: NDArray
+    bins: NDArray
+    ratios: Ratios
+
+    def profiles(
+        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
+        guard: float,
+    ) -> NDArray:  # fmt: skip
+        """(N, 2 half) log ratios along the normals of a contour (4, N); see `kernels.profiles`."""
+        out = np.empty((outline.shape[1], 2 * half))
+        kernels.look_up(self.image, self.bins, *self.ratios.packed, anchor, outline, half * step)
+        kernels.profiles(self.image, self.bins, self.ratios.table, anchor, outline, *drawn, half, step, guard, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Kept(Coloured):
+    """A band of log ratios about a contour, in place of the image: `image` and so on are unpacked when asked for.
+
+    Parameters
+    ----------
+    packed : bytes, (h, w) uint8 levels
+    shape : (h, w)
+    left, top : int [px] of the image
+    """
+
+    packed: bytes = b""
+    shape: tuple[int, int] = (0, 0)
+    left: int = 0
+    top: int = 0
+
+    @cached_property
+    def _painted(self) -> NDArray:
+        levels = np.frombuffer(zlib.decompress(self.packed), np.uint8).reshape(self.shape)
+        out = np.zeros((*self.shape, 3), np.uint8)
+        out[..., 1], out[..., 2] = (levels >> 5) << 3, (levels & 31) << 3
+        return out
+
+    def profiles(
+        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
+        guard: float,
+    ) -> NDArray:  # fmt: skip
+        """As of the image, within the band; beyond it nothing is told."""
+        out, (face, left, top, scale) = np.empty((outline.shape[1], 2 * half)), drawn
+        moved = np.array(outline)
+        moved[:2] -= np.array([[self.left], [self.top]])
+        kernels.profiles(
+            self._painted, self.bins, self.ratios.table, np.zeros_like(anchor), moved, face, left - self.left,
+            top - self.top, scale, half, step, guard, out,
+        )  # fmt: skip
+        return out
+
+    def __getstate__(self) -> dict[str, object]:
+        return {k: v for k, v in self.__dict__.items() if k != "_painted"}
+
+
+def kept(seen: Coloured, outline: NDArray, anchor: NDArray, reach: int, most: float) -> Coloured:
+    """What lines from a contour (4, N), and from others a little beside it, would see within a reach [px].
+
+    A pixel has the log ratio of the anchor (N,) of the contour's nearest point.
+    """
+    height, width = seen.image.shape[:2]
+    uv = np.rint(outline[:2]).astype(np.int64)
+    inside = (uv[0] >= 0) & (uv[0] < width) & (uv[1] >= 0) & (uv[1] < height)
+    levels = Ratios.of_table(((np.arange(256) - _LEVELS) * (most / _LEVELS)).astype(np.float32)[None])
+    none = np.zeros((1, 1, 3), np.uint8)
+    if not inside.any():
+        return Kept(none, _PALETTE, levels, zlib.compress(bytes([_LEVELS])), (1, 1), 0, 0)
+    (u, v), anchor = uv[:, inside], anchor[inside]
+    left, top = max(int(u.min()) - reach, 0), max(int(v.min()) - reach, 0)
+    crop = seen.image[top : int(v.max()) + reach + 1, left : int(u.max()) + reach + 1].astype(np.int32)
+    away = np.ones(crop.shape[:2], np.uint8)
+    away[v - top, u - left] = 0
+    distance, label = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    of = np.zeros(int(label.max()) + 1, np.int64)
+    of[label[v - top, u - left]] = anchor
+    colour = ((crop[..., 0] >> 3) << 10) | ((crop[..., 1] >> 3) << 5) | (crop[..., 2] >> 3)
+    value = np.zeros(crop.shape[:2])
+    j, i = np.nonzero(distance <= reach)
+    value[j, i] = seen.ratios.at(of[label[j, i]], seen.bins[colour[j, i]])
+    packed = np.rint(value * (_LEVELS / most) + _LEVELS).astype(np.uint8)
+    return Kept(none, _PALETTE, levels, zlib.compress(packed.tobytes(), 1), packed.shape, left, top)

@@ -1,0 +1,185 @@
+"""Where a body may be that colours alone show: its silhouette sought in a small map of log ratios (P3, eq. 8).
+
+With p₁, p₂ fixed the energy (8) of a pose is, but for a constant, minus the sum of log p₁ / p₂ over its silhouette. So
+a pose costs one small drawing of a coarse mesh. Places are found by correlation of the silhouette at some rotations
+with the map; the best of them are improved by drawing poses at random around them, closer and closer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera
+from kinefit.images import _kernels_regions as kernels
+from kinefit.images.regions import SearchSettings
+from kinefit.rendering import NEAR
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.scene import Scene
+from kinefit.solvers.equations import inverse
+
+_CELLS = 14  # of a grid about the body in which vertices are merged: two cells of the map each
+_CLOSER = 0.6  # by which poses are drawn closer in every round
+_LEAST, _MOST = (0.05, 0.05), (2.0, 1.0)  # [lengths of the body], [rad] between which a deviation is taken to be
+_SIGMAS = 3.0  # standard deviations to which places are looked at
+
+
+class Seeker:
+    """A coarse mesh of a body with room to draw it.
+
+    Parameters
+    ----------
+    vertices, faces : (V, 3) [m], (T, 3) of the body at rest
+
+    Attributes
+    ----------
+    size : float [m] from end to end
+    """
+
+    def __init__(self, vertices: NDArray, faces: NDArray) -> None:
+        self.size = float(np.ptp(vertices, axis=0).max())
+        cells = ((vertices - vertices.min(axis=0)) / (self.size / _CELLS)).astype(np.int64)
+        self._cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
+        self._number = np.bincount(self._cell)
+        f = self._cell[faces]
+        f = f[(f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])]
+        f = f[np.unique(np.sort(f, axis=1), axis=0, return_index=True)[1]]
+        self._faces, self._room = np.ascontiguousarray(f, np.int32), np.empty((6, len(self._number)))
+
+    def posed(self, vertices: NDArray) -> NDArray:
+        """(C, 3) [m] of the coarse mesh, from the vertices (V, 3) of the fine one."""
+        sums = [np.bincount(self._cell, vertices[:, k], len(self._number)) for k in range(3)]
+        return np.ascontiguousarray((np.array(sums) / self._number).T)
+
+    def explained(self, x: NDArray, poses: NDArray, lens: NDArray, ratios: NDArray) -> tuple[NDArray, NDArray]:
+        """Sums (M,) of log ratios inside of the silhouettes of M poses (M, 4, 4), and the faces (h, w) drawn last."""
+        depth, face = np.empty(ratios.shape, np.float32), np.empty(ratios.shape, np.int32)
+        out = np.empty(len(poses))
+        kernels.explained(x, self._faces, poses, lens, ratios, self._room, depth, face, out)
+        return out, face
+
+
+def region_starts(
+    scene: Scene, camera: Camera, seeker: Seeker, image: NDArray, bins: NDArray, ratio: NDArray,
+    information: NDArray | None, told: Evidence, s: SearchSettings,
+) -> list[BodyState]:  # fmt: skip
+    """States from which a fit may as well begin, the best first; none where the body is where it was expected.
+
+    Parameters
+    ----------
+    scene : where the body is expected
+    image, bins, ratio : (H, W, 3) uint8 RGB, and the log ratio (B,) of each bin of colours
+    information : (n, n) of where it is expected, None where nothing is known
+    told : what the image says of the state that was found from there
+    """
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    x, size, spread = seeker.posed(scene.pose.vertices), seeker.size, np.full(6, np.inf)
+    if information is not None:
+        arm = se3.hat(scene.state.T_world_root[:3, 3] - x.mean(axis=0))
+        J = np.block([[R, R @ arm], [np.zeros((3, 3)), R]])
+        spread = np.sqrt(np.diag(J @ inverse(information)[:6, :6] @ J.T))
+    rough = spread[:3].max() > s.far * size or spread[3:].max() > s.turn
+    agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
+    if not rough and agreeing >= s.poor * (agreeing + contrary):
+        return []
+    x = x @ R.T + t
+    if x[:, 2].min() < NEAR:
+        return []
+    low, high = (np.repeat([length * size, angle], 3) for length, angle in (_LEAST, _MOST))
+    spread = np.clip(spread, low, high)
+    scale = camera.matrix[0, 0] / float(x[:, 2].mean())  # [px/m]
+    step = max(round(size * scale / s.side), 1)
+    uv, reach = camera.project(scene.pose.vertices), (_SIGMAS * spread[:2].max() + 0.25 * size) * scale
+    first = np.clip(np.floor(np.nanmin(uv, axis=0) - reach), 0, camera.size).astype(int)
+    last = np.clip(np.ceil(np.nanmax(uv, axis=0) + reach), 0, camera.size).astype(int)
+    wide, tall = (last - first) // step
+    if wide < 2 or tall < 2:
+        return []
+    cells, (left, top) = np.empty((tall, wide)), (int(first[0]), int(first[1]))
+    kernels.ratio_map(image, bins, ratio, left, top, step, cells)
+    K, half = camera.matrix, 0.5 * (step - 1)
+    lens = np.array([K[0, 0] / step, K[1, 1] / step, (K[0, 2] - left - half) / step, (K[1, 2] - top - half) / step,
+                     NEAR])  # fmt: skip
+    T = camera.T_camera_world
+    moved = [np.linalg.inv(T) @ m @ T @ scene.state.T_world_root for m in seek(seeker, x, cells, lens, spread, s)]
+    return [BodyState(T_world_root, scene.state.angles) for T_world_root in moved]
+
+
+def seek(
+    seeker: Seeker, x_camera: NDArray, ratios: NDArray, lens: NDArray, spread: NDArray, s: SearchSettings
+) -> NDArray:
+    """Motions (K, 4, 4) of a body in the camera's frame under which its silhouette explains a map best, the best first.
+
+    Parameters
+    ----------
+    x_camera : (C, 3) [m] the coarse mesh where it is expected
+    ratios : (h, w) log ratios
+    lens : (5,) fx, fy, cx, cy [cells] of the map, and the nearest depth [m] drawn
+    spread : (6,) one standard deviation of where it is expected: along the camera's axes [m], about them [rad]
+    """
+    middle = x_camera.mean(axis=0)
+    x = np.ascontiguousarray(x_camera - middle)
+    whole = max(float(np.maximum(ratios, 0.0).sum()), 1e-9)
+
+    def poses(p: NDArray) -> NDArray:
+        out = np.tile(np.eye(4), (len(p), 1, 1))
+        out[:, :3, :3], out[:, :3, 3] = se3.exp_so3(p[:, 3:]), middle + p[:, :3]
+        return out
+
+    def value(p: NDArray) -> NDArray:
+        sums, _ = seeker.explained(x, poses(p), lens, ratios)
+        return np.asarray(sums / whole - s.doubt * np.sum((p / spread) ** 2, axis=1))
+
+    turned = np.zeros((s.rotations, 6))
+    turned[:, 3:] = _draws(s.rotations, 3) * spread[3:]
+    found, small = [np.zeros(6)], ratios.astype(np.float32)
+    for p in turned:
+        _, face = seeker.explained(x, poses(p[None]), lens, ratios)
+        rows, cols = np.flatnonzero((face >= 0).any(axis=1)), np.flatnonzero((face >= 0).any(axis=0))
+        if not len(rows):
+            continue
+        mask = (face[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] >= 0).astype(np.float32)
+        match = cv2.matchTemplate(small, mask, cv2.TM_CCORR)
+        dx = (np.arange(match.shape[1]) - cols[0]) * middle[2] / lens[0]
+        dy = (np.arange(match.shape[0]) - rows[0]) * middle[2] / lens[1]
+        far = (dx / spread[0]) ** 2 + ((dy / spread[1]) ** 2)[:, None]
+        j, i = np.unravel_index(int(np.argmax(match / whole - s.doubt * far)), match.shape)
+        found.append(p + np.array([dx[i], dy[j], 0, 0, 0, 0]))
+    pool = np.array(found)
+    worth = value(pool)
+    cell = 2.0 * middle[2] / lens[0]
+    width = np.minimum(0.5 * spread, [cell, cell, 0.05 * middle[2], 0.3, 0.3, 0.3])
+    ends = [_improved(value, pool[k], float(worth[k]), width, s) for k in np.argsort(-worth)[: s.best]]
+    ends.sort(key=lambda end: -end[1])
+    back = np.eye(4)
+    back[:3, 3] = -middle
+    return np.asarray(poses(np.array([p for p, _ in ends[: s.starts]])) @ back)
+
+
+def _improved(
+    value: Callable[[NDArray], NDArray], p: NDArray, best: float, width: NDArray, s: SearchSettings
+) -> tuple[NDArray, float]:
+    """The best of some poses drawn around one (6,), closer and closer, and its worth."""
+    draws = _draws(s.draws, 6)
+    for _ in range(s.rounds):
+        tried = p + draws * width
+        worth = value(tried)
+        k = int(np.argmax(worth))
+        if worth[k] > best:
+            p, best = tried[k], float(worth[k])
+        width = _CLOSER * width
+    return p, best
+
+
+@lru_cache(maxsize=8)
+def _draws(count: int, dimensions: int) -> NDArray:
+    """(count, dimensions) normal numbers, the same ones every time, the first of them zero."""
+    out = np.random.default_rng(7).normal(size=(count, dimensions))
+    out[0] = 0.0
+    return out

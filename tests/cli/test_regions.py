@@ -1,0 +1,40 @@
+"""A real hand-held object by its colours, through the command."""
+
+import numpy as np
+from click.testing import CliRunner
+
+from kinefit import read_motion
+from kinefit.cli import main
+
+FRAMES = 9
+
+
+def test_a_real_object_is_followed_by_its_mesh(tmp_path, data_dir):
+    folder = data_dir("region_cat")
+    rows = np.loadtxt(folder / "img" / "pose.txt")[:FRAMES]
+    R, t, K = rows[:, :9].reshape(-1, 3, 3), 1e-3 * rows[:, 9:], np.loadtxt(folder / "K.txt").reshape(3, 3)
+    (tmp_path / "cat.toml").write_text(
+        '[body]\nname = "cat"\n[[segment]]\nname = "cat"\njoint = { name = "free", type = "free" }\n'
+        f'surface = {{ mesh = "{folder}/Cat.obj", unit = "mm" }}\n'
+    )
+    (tmp_path / "calibration.toml").write_text(
+        f'[cam]\nname = "cam"\nsize = [640.0, 512.0]\nmatrix = {K.tolist()}\ndistortions = [0.0, 0.0, 0.0, 0.0]\n'
+        "rotation = [0.0, 0.0, 0.0]\ntranslation = [0.0, 0.0, 0.0]\nfisheye = false\n"
+    )
+    (tmp_path / "take.toml").write_text(
+        f'[take]\nrate = 30.0\nup = "-y"\nbody = "cat.toml"\nsize = false\nframes = [0, {FRAMES}]\n[start]\n'
+        f"at = {np.round(t[0], 2).tolist()}\nforward = {np.round(R[0, :, 0], 1).tolist()}\n"
+        f"upward = {np.round(R[0, :, 1], 1).tolist()}\n"
+        f'[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam"\nvideo = "{folder}/img/*.png"\n'
+        '[[region]]\ncamera = "cam"\n'
+    )
+    told = CliRunner().invoke(
+        main, ["track", str(tmp_path / "take.toml"), "-o", str(tmp_path / "out"), "--formats", "motion", "--no-report"]
+    )
+    assert told.exit_code == 0, told.output
+    motion = read_motion(tmp_path / "out" / "motion.npz")
+    turn = np.arccos(np.clip((np.einsum("fij,fij->f", motion.Ts_world_root[:, :3, :3], R) - 1) / 2, -1, 1))
+    assert np.linalg.norm(motion.Ts_world_root[:, :3, 3] - t, axis=1).max() < 0.05
+    assert np.degrees(turn).max() < 10.0 and np.degrees(np.median(turn)) < 6.0  # the truth is good to some degrees here
+    assert motion.quality.min() > 0.4
+    assert list((tmp_path / "out" / "overlays").glob("*.mp4"))

@@ -1,0 +1,88 @@
+"""Tracked points of a surface as a sensor: they stick to the body, and see turns that a cloud cannot."""
+
+import numpy as np
+import pytest
+from tests.oracle import central_differences, design
+from tests.sensors.scenes import at, posture
+
+from kinefit.bodies import load_body
+from kinefit.bodies.surfaces import sample
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.surface_points import SurfacePointFrame, SurfacePointSensor
+from kinefit.tracking.tracker import Tracker
+
+BODY = load_body("humanoid")
+POINTS, NORMALS, SEGMENT = sample(BODY, 300)
+
+
+def frame(state, time=0.0, rng=None, sigma=0.002):
+    """Points of the surface at a state."""
+    f = Scene(BODY, state, Rig(())).frames[SEGMENT]
+    x = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), POINTS) + f[:, 9:]
+    if rng is not None:
+        x = x + sigma * rng.normal(size=x.shape)
+    return SurfacePointFrame("skin", time, np.arange(len(x)), x, np.tile(sigma**2 * np.eye(3), (len(x), 1, 1)))
+
+
+def learnt(state):
+    sensor, scene = SurfacePointSensor("skin"), Scene(BODY, state, Rig(()))
+    sensor.learn(sensor.prepare(frame(state), scene), scene, True)
+    return sensor
+
+
+def test_anchors_are_where_the_points_were_seen():
+    sensor = learnt(posture(BODY, 0))
+    assert len(sensor.anchors) > 250
+    right = [s == SEGMENT[i] and np.allclose(x, POINTS[i], atol=1e-9) for i, (s, x) in sensor.anchors.items()]
+    assert np.mean(right) > 0.9  # at joints the nearest segment may be the other one
+    before = sensor.anchors
+    scene = Scene(BODY, posture(BODY, 1), Rig(()))
+    sensor.learn(sensor.prepare(frame(posture(BODY, 1)), scene), scene, False)
+    assert sensor.anchors is before
+
+
+def test_rows_of_old_and_new_points_have_the_derivative_of_their_residuals():
+    sensor, state = learnt(posture(BODY, 0)), posture(BODY, 1)
+    sensor.anchors = {i: anchor for i, anchor in sensor.anchors.items() if i % 2}
+    here = Scene(BODY, state, Rig(()))
+    match = sensor.prepare(frame(posture(BODY, 2)), here).match(here, 0.1)
+    off = state.retract(0.02 * np.random.default_rng(1).normal(size=BODY.tree.n_dofs))
+    made = match.rows(here.at(off))
+    assert len(made) == 4
+    for k, rows in enumerate(made):
+        some = np.arange(0, len(rows), 17)
+        slope = central_differences(
+            lambda s, k=k, i=some: match.rows(here.at(s))[k].residual[i], BODY, off, 1e-6
+        )
+        np.testing.assert_allclose(-design(rows, BODY, off)[some], slope, atol=1e-6)
+
+
+def test_a_turn_about_the_limb_is_followed():
+    rng, start = np.random.default_rng(0), at(BODY, elbow_flex_r=60, arm_add_r=-30)
+    sensor = SurfacePointSensor("skin")
+    tracker = Tracker(BODY, Rig(()), rate=30.0, sensors=[sensor])
+    tracker.start_at(start)
+    turn = BODY.tree.coordinate("arm_rot_r")
+    for k in range(12):
+        truth = at(BODY, elbow_flex_r=60, arm_add_r=-30, arm_rot_r=3.0 * k)
+        result = tracker.update([frame(truth, k / 30.0, rng)])
+    assert len(sensor.anchors) > 200
+    assert abs(np.degrees(result.state.angles[turn]) - 33.0) < 6.0
+
+
+def test_frames_that_are_none():
+    x, c = np.zeros((3, 3)), np.zeros((3, 3, 3))
+    for ids, points in ((np.array([1, 1, 2]), x), (np.arange(2), x), (np.array([0.5, 1, 2]), x), (np.arange(3), x[:2])):
+        with pytest.raises(ObservationError):
+            SurfacePointFrame("skin", 0.0, ids, points, c)
+    x[1] = np.nan
+    assert SurfacePointFrame("skin", 0.0, np.arange(3), x, c).ids.tolist() == [0, 2]
+    with pytest.raises(ObservationError):
+        SurfacePointSensor("skin", slide=0.0)
+    scene = Scene(BODY, BODY.usual_state(), Rig(()))
+    with pytest.raises(ObservationError, match="SurfacePointFrame"):
+        SurfacePointSensor("skin").prepare(object(), scene)
+    empty = SurfacePointFrame("skin", 0.0, np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    assert SurfacePointSensor("skin").prepare(empty, scene).match(scene, 0.1).rows(scene) == []
