@@ -45,12 +45,12 @@ def test_markers_set_cameras_right_that_point_beside_their_calibration():
         steps.append([*pixels, MarkerFrame("mocap", time, points.names, x, marker_set="HANIM_45")])
     sigma = {**dict.fromkeys(rig.names, 2.0), "mocap": 0.002}
     told = {}
-    for shift, turn in ((0.005, 0.003), (0.0, 0.0)):
-        settings = TrackSettings(camera_shift=shift, camera_turn=turn)
+    for std in ((0.005, 0.003), None):
+        settings = TrackSettings(camera_std=std)
         recording = Recording.of_frames(steps, off, rate=motion.rate, sigma=sigma)
-        told[shift] = track(recording, body, smooth=False, settings=settings).provenance
-    assert "cameras" not in told[0.0]
-    moved = as_found(off, told[0.005])
+        told[std] = track(recording, body, smooth=False, settings=settings).provenance
+    assert "cameras" not in told[None]
+    moved = as_found(off, told[0.005, 0.003])
     for a, b, c in zip(moved, off, rig):
         left, before = (np.linalg.norm(se3.log(x.T_camera_world @ np.linalg.inv(c.T_camera_world))[3:]) for x in (a, b))
         assert left < 0.5 * before

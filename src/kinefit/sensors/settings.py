@@ -56,9 +56,9 @@ class TrackSettings:
         Shift: with silhouettes of the balancing trial's first 30 frames, 0 left keypoints 1.25 times as far off as
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
         catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces for exact everywhere.
-    camera_shift, camera_turn : float [m], [rad]
+    camera_std : (2,) [m] and [rad], or None
         Standard deviations of each camera's calibrated position and of its direction, for error bars; and how far
-        markers beside keypoints may move cameras. 0 and 0 take calibrations for exact.
+        markers beside keypoints may move cameras. None takes calibrations for exact.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
@@ -110,8 +110,7 @@ class TrackSettings:
     flesh: float = 0.02
     skin_shift: float = 0.02
     skin_turn: float = 0.1
-    camera_shift: float = 0.003
-    camera_turn: float = 0.001745
+    camera_std: tuple[float, float] | None = (0.003, 0.001745)
     angle_acceleration: float = 60.0
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
@@ -126,8 +125,3 @@ class TrackSettings:
     smooth_memory: float = 1.0
     acceleration_memory: float = 0.2
     smooth_rounds: int = 8
-
-    @property
-    def camera_std(self) -> tuple[float, float] | None:
-        """(2,) [m] and [rad] of cameras' poses; None where calibrations are exact."""
-        return (self.camera_shift, self.camera_turn) if self.camera_shift > 0.0 and self.camera_turn > 0.0 else None

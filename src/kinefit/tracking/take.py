@@ -91,7 +91,8 @@ def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSetti
     settings, entry = settings or TrackSettings(), take.calibration
     if entry is None or entry.position_sigma is None or entry.rotation_sigma is None:
         return settings
-    return replace(settings, camera_shift=entry.position_sigma, camera_turn=float(np.radians(entry.rotation_sigma)))
+    std = entry.position_sigma, float(np.radians(entry.rotation_sigma))
+    return replace(settings, camera_std=std if min(std) > 0.0 else None)
 
 
 def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
