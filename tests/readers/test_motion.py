@@ -62,8 +62,9 @@ def test_bodies_come_back_exactly(name):
         np.testing.assert_array_equal(one, other, err_msg=field.name)
     assert {f.name for f in fields(body)} == {
         "name", "tree", "joints", "scale_groups", "segment_scale", "landmarks", "keypoint_sets", "marker_sets",
-        "surfaces", "aliases", "stature", "morphs", "skin", "family",
+        "surfaces", "aliases", "stature", "morphs", "skin", "family", "closures", "dimensions",
     }  # fmt: skip
+    assert back.closures == body.closures and back.dimensions == body.dimensions
     assert back.surfaces == body.surfaces and back.aliases == dict(body.aliases)
     assert back.joints == body.joints and back.stature == body.stature and back.tree.root_free == body.tree.root_free
     assert list(back.keypoint_sets) == list(body.keypoint_sets) and list(back.marker_sets) == list(body.marker_sets)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,6 +204,10 @@ class AnnyShape:
     @cached_property
     def _made(self) -> Callable[[bytes], Body]:
         return lru_cache(maxsize=16)(lambda values: self._family.at(np.frombuffer(values)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the bodies that were made, which are made again."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("_made", "_family")}
 
     @property
     def names(self) -> tuple[str, ...]:
