@@ -78,6 +78,7 @@ def test_a_frame_holds_what_it_says(make):
 
 @pytest.mark.parametrize("make", [
     lambda: track("x", BODY), lambda: track(None, BODY), lambda: Recording.of_keypoints(RIG, "x"),
+    lambda: Recording.of_keypoints(RIG, np.zeros(3)),
     lambda: Recording.of_keypoints(RIG, [None]), lambda: Recording.of_frames("x", RIG, rate=30.0),
     lambda: Recording.of_frames(([FRAME] for _ in range(3)), RIG, rate=30.0),
     lambda: Recording.of_frames([None], RIG, rate=30.0), lambda: Recording.of_frames([[FRAME]], None, rate=30.0),

@@ -125,7 +125,7 @@ class Recording:
         TrackingError
             Nobody is seen in any frame.
         """
-        of_kind(keypoints or (), Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
+        of_kind(() if keypoints is None else keypoints, Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
         if not keypoints:
             remedy = "Name at least one [[keypoints]] in the take."
             raise ObservationError("there are no keypoints to track", remedy=remedy)
