@@ -125,8 +125,9 @@ class Recording:
         TrackingError
             Nobody is seen in any frame.
         """
-        of_kind(() if keypoints is None else keypoints, Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
-        if not keypoints:
+        given = () if keypoints is None else keypoints
+        of_kind(given, Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
+        if not given:
             remedy = "Name at least one [[keypoints]] in the take."
             raise ObservationError("there are no keypoints to track", remedy=remedy)
         lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
