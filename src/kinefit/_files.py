@@ -20,6 +20,14 @@ BACKSLASHES = "A backslash in double quotes begins a special character: use forw
 """What to do about C:\\Users in a TOML file."""
 
 
+def read_bytes(path: Path) -> bytes:
+    """All of a file; FileError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as problem:
+        raise FileError(f"cannot be read ({problem.strerror})", file=path, remedy="Check the path.") from problem
+
+
 def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
     """The tables of a TOML text.
 

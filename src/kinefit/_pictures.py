@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_bytes
 from kinefit.errors import FileError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -23,10 +24,7 @@ def read_picture(file: str | os.PathLike[str], flags: int = cv2.IMREAD_COLOR_RGB
         No picture, cut or damaged.
     """
     path = Path(file)
-    try:
-        data = path.read_bytes()
-    except OSError as problem:
-        raise FileError(f"cannot be read ({problem.strerror})", file=path, remedy="Check the path.") from problem
+    data = read_bytes(path)
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_whole(data) else None
     except cv2.error:

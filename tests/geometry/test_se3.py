@@ -171,6 +171,18 @@ def test_a_screw_without_pitch_leaves_its_axis_still():
     assert abs(axis_distance[0] - axis_distance[1]) < 1e-14
 
 
+def test_points_are_laid_onto_others_best():
+    random = np.random.default_rng(2)
+    T, x = se3.exp(random.normal(size=6)), random.normal(size=(9, 3))
+    y = se3.apply(T, x)
+    np.testing.assert_allclose(se3.aligned(x, y), T, atol=1e-12)
+    weight = np.arange(9.0)
+    y[0] += 5.0  # weighs nothing
+    np.testing.assert_allclose(se3.aligned(x, y, weight), T, atol=1e-12)
+    flat = x * (1.0, 1.0, 0.0)  # a reflection would do as well
+    assert np.linalg.det(se3.aligned(flat, -flat)[:3, :3]) == pytest.approx(1.0)
+
+
 def test_any_leading_shape():
     xi = np.random.default_rng(6).normal(size=(2, 5, 6))
     T = se3.exp(xi)

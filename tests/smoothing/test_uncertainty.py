@@ -7,6 +7,7 @@ import pytest
 
 from kinefit.bodies import PointSet, load_body
 from kinefit.correspondences import pixel_rows, prior_rows
+from kinefit.geometry.camera import Rig
 from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.keypoints import Layout
@@ -121,6 +122,22 @@ def test_a_camera_that_stands_elsewhere_moves_the_pose_as_refitting_does(scene, 
     sure = (told < 0.1) & (told > 1e-4)
     np.testing.assert_allclose(np.abs(moved)[sure], told[sure], rtol=0.25, atol=2e-3)
     assert told[:6].max() > 1e-3
+
+
+def test_a_subject_of_other_cameras_tells_its_shape_and_nothing_of_these(scene):
+    _, channels, _, _ = scene
+    body = load_body("humanoid")
+    other = fit_subject(body, channels, cameras=(0.003, 0.002))
+    mine = Known.of(other, channels, (0.003, 0.002))
+    assert mine.cameras is other.fit.cameras and mine.covariance.shape == other.covariance.shape
+    names = tuple(f"other {name}" for name in RIG.names)
+    elsewhere = replace(channels, rig=Rig(tuple(replace(c, name=n) for c, n in zip(RIG, names))))
+    known = Known.of(other, elsewhere, (0.003, 0.002))
+    assert known.cameras.free == names
+    count = len(other.fit.mean) - 6 * len(RIG)
+    np.testing.assert_array_equal(known.covariance[:count, :count], other.covariance[:count, :count])
+    np.testing.assert_allclose(known.covariance[count:, count:], np.linalg.inv(known.cameras.information))
+    assert Known.of(other, elsewhere, None).cameras is None
 
 
 def test_nothing_seen_leaves_finite_bars(scene):

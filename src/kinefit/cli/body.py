@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
@@ -41,11 +42,13 @@ def body(ctx: click.Context) -> None:
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file of your own."""
     from kinefit.bodies.files import catalogue_text
+    from kinefit.cli._results import check_file
     from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
     if target.exists():
         raise FileError("this file exists already", file=target, remedy="Name another file, or move it away.")
+    check_file(target, "FILE")
     target.write_text(text, encoding="utf-8")
     _screen.say(f"{target}: name it in the take, body = \"{target}\"")
 
@@ -64,7 +67,7 @@ def check(file: str) -> None:
         where = f"'{c.to}'" if c.to else "a place in the world" + (" that is estimated" if c.place_std > 0.0 else "")
         _screen.say(f"  closure '{c.name}': {c.kind}, '{c.point}' and {where}, {'hard' if c.hard else 'soft'}")
     for d in one.dimensions:
-        value, unit = (d.value * 57.29577951308232, "deg") if d.turns else (d.value, "m")
+        value, unit = (math.degrees(d.value), "deg") if d.turns else (d.value, "m")
         _screen.say(f"  dimension '{d.name}': {value:.4g} {unit}{', to estimate' if d.std > 0.0 else ''}")
     _screen.say(f"Gruebler: F = {m.gruebler}")
     _screen.say(f"rank of the closures: {m.rank} of {m.equations} equations; mobility: {m.mobility}")
@@ -89,11 +92,13 @@ def picture(file: str, out: Path, azimuth: float) -> None:
     import cv2
 
     from kinefit.bodies import load_body
+    from kinefit.cli._results import check_file
     from kinefit.errors import FileError
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise FileError("a picture is a PNG or a JPEG file", file=out, remedy=f"Call it {out.stem}.png.")
+    check_file(out)
     written, data = cv2.imencode(out.suffix, portrait(load_body(file), azimuth))
     assert written
     out.write_bytes(data.tobytes())

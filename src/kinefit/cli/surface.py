@@ -45,8 +45,10 @@ def surface(
     photographs (states, in the order of the names) or its video. The first camera's first image holds the grid of
     points.
     """
+    from kinefit.cli._results import check_folder
     from kinefit.cli._surface import Wanted, measure_photographs, measure_videos, read_views
 
+    check_folder(out)
     rig, paths = read_views(calibration, unit, views)
     wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field)
     with _screen.bars() as progress:

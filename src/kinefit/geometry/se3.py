@@ -98,6 +98,15 @@ def transform(rotation: NDArray, translation: NDArray) -> NDArray:
     return out
 
 
+def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
+    """T_y_x (4, 4) that lays points x (K, 3) onto y (K, 3) best, by least squares with weights (K,) (Kabsch)."""
+    w = np.full(len(x), 1.0 / len(x)) if weight is None else weight / weight.sum()
+    middle, aim = w @ x, w @ y
+    u, _, vt = np.linalg.svd((w[:, None] * (y - aim)).T @ (x - middle))
+    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return transform(R, aim - R @ middle)
+
+
 def inverse(T: NDArray) -> NDArray:
     """Inverse of rigid motions (..., 4, 4)."""
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
+from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -80,14 +81,7 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
         depth[s] = depth[body.tree.parents[s]] + 1
     near = np.exp(-np.linalg.norm(rest[:, [0, 2]], axis=1) / 0.2) * np.where(rest[:, 1] < -0.1, 0.05, 1.0)
     w = np.where(known, near / (1 + 0.2 * depth[points.segments]), 0.0)
-    a, b = rest - w @ rest / w.sum(), np.where(known[:, None], x_world, 0.0)
-    b = b - w @ b / w.sum()
-    u, _, vt = np.linalg.svd((w[:, None] * b).T @ a)
-    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    T = np.eye(4)
-    T[:3, :3] = R
-    T[:3, 3] = w @ np.where(known[:, None], x_world, 0.0) / w.sum() - R @ (w @ rest / w.sum())
-    return T
+    return se3.aligned(rest, np.where(known[:, None], x_world, 0.0), w)
 
 
 def pose_from_points(

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from kinefit.observations.depth import _Recording, checked_times
+from kinefit.observations.depth import _ImageRecording
 from kinefit.observations.frames import ColourFrame
 
 
 @dataclass(frozen=True, eq=False)
-class ColourVideo(_Recording):
+class ColourVideo(_ImageRecording):
     """Colour images of one camera.
 
     Parameters
@@ -34,14 +30,6 @@ class ColourVideo(_Recording):
         Times that do not increase.
     """
 
-    size: tuple[int, int]
-    image: Callable[[int], NDArray]
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
-
     def frame(self, i: int) -> ColourFrame:
         """Frame number `i`, negative ones from the end; read now."""
-        i = range(len(self))[i]
-        return ColourFrame(self.sensor, float(self.times[i]), np.asarray(self.image(i)))
+        return ColourFrame(self.sensor, *self._image(i))

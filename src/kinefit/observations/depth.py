@@ -63,6 +63,29 @@ class _Recording:
 
 
 @dataclass(frozen=True, eq=False)
+class _ImageRecording(_Recording):
+    """What recordings of one camera's images have in common."""
+
+    size: tuple[int, int]
+    image: Callable[[int], NDArray]
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
+
+    def _image(self, i: int) -> tuple[float, NDArray]:
+        """Time and image of a frame, negative ones from the end; read now."""
+        i = range(len(self))[i]
+        image = np.asarray(self.image(i))
+        if image.shape[1::-1] != self.size:
+            raise ObservationError(
+                f"the image has {image.shape[1::-1]} px, its camera {self.size}", file=self.source or None,
+                place=f"frame {i} of {self.sensor}", remedy="All images of one camera are of its image's size.",
+            )  # fmt: skip
+        return float(self.times[i]), image
+
+
+@dataclass(frozen=True, eq=False)
 class DepthVideo(_Recording):
     """Depth images of one sensor.
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
@@ -109,9 +110,5 @@ def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
     seen = np.isfinite(reference).all(axis=1) & np.isfinite(state).all(axis=1)
     if seen.sum() < 3:
         raise ObservationError(f"{seen.sum()} points in both states", remedy="Three are needed.")
-    a, b = reference[seen], state[seen]
-    U, _, V = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ V)]) @ V
-    T[:3, 3] = b.mean(axis=0) - T[:3, :3] @ a.mean(axis=0)
-    return T, state - (reference @ T[:3, :3].T + T[:3, 3])
+    T = se3.aligned(reference[seen], state[seen])
+    return T, state - se3.apply(T, reference)

@@ -73,8 +73,4 @@ def _fitted(body: Body, start: BodyState, points: PointSet, target: NDArray, cha
 
 def _aligned(body: Body, state: BodyState, points: PointSet, target: NDArray) -> NDArray:
     """T_world_root (4, 4) that brings the points of a state nearest to their targets (Kabsch)."""
-    x = body.positions(state, points)
-    mean, aim = x.mean(axis=0), target.mean(axis=0)
-    U, _, Vt = np.linalg.svd((x - mean).T @ (target - aim))
-    R = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-    return se3.transform(R, aim - R @ mean) @ state.T_world_root
+    return se3.aligned(body.positions(state, points), target) @ state.T_world_root

@@ -234,7 +234,6 @@ class FixedLag:
                 out.append(judged(scene, sure, matched, self._last.iterations, observed=observed))
         return out
 
-
     def _exact(self, state: BodyState, covariance: NDArray) -> NDArray:
         """A covariance (n, n) of a state that is closed exactly."""
         return covariance if self._hard is None else on_null_space(covariance, self._hard(state)[1])

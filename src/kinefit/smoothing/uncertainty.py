@@ -35,7 +35,7 @@ from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves
-from kinefit.subject.sensor_parameters import CameraExtrinsics
+from kinefit.subject.sensor_parameters import CameraExtrinsics, alike
 from kinefit.subject.subject import Subject
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
@@ -151,17 +151,17 @@ class Known:
 
     @classmethod
     def of(cls, subject: Subject, channels: Channels, std: tuple[float, float] | None) -> Known:
-        """Of a subject; cameras that its fit did not seek are as sure as their calibration, where that is stated."""
+        """Of a subject; cameras that its fit did not seek are as sure as `std`, their calibration; None for exact."""
         if subject.fit is not None and subject.covariance is not None:
-            cameras = next((p for p in subject.fit.parameters if isinstance(p, CameraExtrinsics)), None)
+            cameras = subject.fit.cameras
             moves, covariance = point_moves(subject.fit), subject.covariance
             closing = closing_moves(subject.fit, subject.body)
-            if cameras is not None:
+            if cameras is not None and alike(cameras.rig, channels.rig):
                 stay = np.zeros(len(covariance))  # where they were found, and the motion was not
                 stay[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
                 return cls(moves, cameras, covariance + np.outer(stay, stay), closing)
-            if std is None:
-                return cls(moves, None, covariance, closing)
+            if cameras is not None:  # those of another take tell nothing of these
+                covariance = covariance[: -len(cameras.names), : -len(cameras.names)]
         else:
             moves, covariance, closing = None, np.zeros((0, 0)), None
         if std is None or not len(channels.camera):

@@ -84,8 +84,7 @@ def mobility(body: Body, seed: int = 0) -> Mobility:
     ranks, moves = [], []
     for state in poses:
         A = closed_at(body, state).jacobian[:, ~fixed]
-        s = np.linalg.svd(A, compute_uv=False)
-        ranks.append(int(np.sum(s > _RANK * s[0])))
+        ranks.append(_rank(A))
         moves.append(_finite(body, state, fixed))
     best = int(np.argmax(ranks))
     return Mobility(

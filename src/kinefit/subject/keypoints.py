@@ -50,7 +50,6 @@ def fit_subject(
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
-
     cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
         default: the calibration is exact.
 

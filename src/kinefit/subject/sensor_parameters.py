@@ -6,11 +6,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.displaced import AXES, CLOCK
@@ -74,8 +74,7 @@ class CameraExtrinsics:
     def apply(self, world: World, values: NDArray) -> World:
         """The rig with its cameras moved."""
         twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
-        cameras = tuple(_moved(c, twist[c.name]) if c.name in twist else c for c in world.rig)
-        return replace(world, rig=Rig(cameras))
+        return replace(world, rig=moved_rig(world.rig, twist))
 
     def values_of(self, rig: Rig) -> NDArray:
         """(6 C,) with which the cameras stand as in another rig."""
@@ -100,8 +99,17 @@ class CameraExtrinsics:
         return out
 
 
-def _moved(camera: Camera, twist: NDArray) -> Camera:
-    return camera.with_pose(se3.exp(twist) @ camera.T_camera_world)
+def alike(a: Rig, b: Rig) -> bool:
+    """Whether two rigs are of the same cameras in the same places."""
+    return a.names == b.names and all(np.array_equal(c.T_camera_world, d.T_camera_world) for c, d in zip(a, b))
+
+
+def moved_rig(rig: Rig, twists: Mapping[str, ArrayLike]) -> Rig:
+    """The rig with some cameras, by name, moved by twists (6,) (v, ω) [m, rad] in their own frames."""
+    return Rig(tuple(
+        c.with_pose(se3.exp(np.asarray(twists[c.name], float)) @ c.T_camera_world) if c.name in twists else c
+        for c in rig
+    ))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.border import Prior
 from kinefit.subject.parameters import Parameters, World
+from kinefit.subject.sensor_parameters import CameraExtrinsics
 
 Progress = Callable[[str, int, int], None]
 """(what is done, how many of it, of how many)."""
@@ -75,6 +76,11 @@ class SubjectFit:
     def std(self) -> NDArray:
         """(p,) posterior standard deviation of each parameter."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def cameras(self) -> CameraExtrinsics | None:
+        """The parameters of cameras, where they were sought."""
+        return next((p for p in self.parameters if isinstance(p, CameraExtrinsics)), None)
 
     def value(self, name: str) -> tuple[float, float]:
         """A parameter by name: its estimate and standard deviation.

@@ -7,20 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.subject.sensor_parameters import CameraExtrinsics
+from kinefit.subject.sensor_parameters import CameraExtrinsics, moved_rig
 from kinefit.subject.subject import SubjectFit
 
 CAMERAS = "cameras"
 """Key of `Motion.provenance`: {camera: {"moved": (6,), "std": (6,)}} [m, rad] as `CameraExtrinsics` has them."""
 
 _FAR = 3.0  # standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes
-
-
-def of_cameras(found: SubjectFit) -> CameraExtrinsics | None:
-    """The parameters of cameras that a fit has."""
-    return next((p for p in found.parameters if isinstance(p, CameraExtrinsics)), None)
 
 
 def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
@@ -59,7 +53,4 @@ def sentences(provenance: Mapping[str, Any], std: tuple[float, float] | None) ->
 
 def as_found(rig: Rig, provenance: Mapping[str, Any]) -> Rig:
     """The cameras of a calibration where a motion's fit found them; as they are where it did not seek them."""
-    moved = {name: one["moved"] for name, one in provenance.get(CAMERAS, {}).items()}
-    return Rig(tuple(
-        c.with_pose(se3.exp(np.array(moved[c.name])) @ c.T_camera_world) if c.name in moved else c for c in rig
-    ))  # fmt: skip
+    return moved_rig(rig, {name: one["moved"] for name, one in provenance.get(CAMERAS, {}).items()})

@@ -31,7 +31,7 @@ from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, contradictions
-from kinefit.tracking.cameras import CAMERAS, as_told, of_cameras
+from kinefit.tracking.cameras import CAMERAS, as_told
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
 
@@ -134,7 +134,7 @@ def motion_of(
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
     if cameras := as_told(found):
         provenance[CAMERAS] = cameras
-    elsewhere = any(of_cameras(one) is not None for one in found)
+    elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_lasting_errors(
         results, subject, take, weight, rate, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_std,

@@ -25,7 +25,6 @@ from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
-from kinefit.tracking.cameras import of_cameras
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
@@ -257,7 +256,7 @@ def _by_joint(person: Person, found: SubjectFit) -> Person:
         )  # fmt: skip
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     person = _wearing(person, replace(subject, body=found.body), shape={**person.told.get("shape", {}), **shape})
-    if of_cameras(found) is not None:
+    if found.cameras is not None:
         person = _seen_by(person, found.rig)
     values = {**person.values, **found.values}
     return replace(person, values=values, joint=(*person.joint, found))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_bytes
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import inverse
@@ -55,10 +56,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
         Missing, cut, or of another kind; the message tells what is wrong.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
+    data = read_bytes(path)
     try:
         if data.startswith(b"ply"):
             return _ply(data, path)
