@@ -26,7 +26,7 @@ from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import STRETCH, Spool
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
@@ -197,9 +197,12 @@ def _residuals(
     """What every sensor leaves over of so many frames: as it was tracked, or of what was matched since."""
     remains = Remains(count)
     for f in range(count):
+        if f % STRETCH == 0:
+            remains.release()
         if seen is None:
             remains.add(f, tracked[f])
             continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))
+    remains.release()
     return remains.residuals()

@@ -11,8 +11,8 @@ import numpy as np
 from kinefit.errors import FileError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.readers.keypoints import KEYPOINT_SETS
-from kinefit.readers.markers import UNITS
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
+from kinefit.readers.units import LENGTHS, worth
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -135,8 +135,8 @@ def _values(take: Take) -> None:
         place = f"markers {entry.file.name}"
         if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
             refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
-        if entry.unit is not None and entry.unit.lower() not in UNITS:
-            refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+        if entry.unit is not None and worth(entry.unit, LENGTHS) is None:
+            refuse(choices("unit", entry.unit, LENGTHS), place, "Use one of these.")
         if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
             refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
     for problem, place, remedy in _odd_depth(take):

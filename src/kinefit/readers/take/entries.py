@@ -58,7 +58,7 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
-    unit: str = "auto"  # of its translations, where the format does not state it
+    unit: str | float = "auto"  # of its translations, where the format does not state it; or [m] of one
     position_sigma: float | None = None  # [m] of each camera's position; with rotation_sigma, or neither
     rotation_sigma: float | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
 
