@@ -6,18 +6,18 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import data, figure, quick
 from kinefit import load_body
 from kinefit.errors import AssetError, ObservationError
-from kinefit.multiview.followed import follow
-from kinefit.observations import Keypoints
 from kinefit.preparing import detecting
 from kinefit.preparing.take import prepared
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
+from kinefit.readers.video import Video
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take import people_in_view, track_take
 from kinefit.tracking.video import track
@@ -28,6 +28,7 @@ _GOALS = {
     "people_woman_residual": ("px, the worst camera", "<= 12"),
 }  # fmt: skip
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
+_FAR = 30.0  # px, pictures are not moved further: what matches beyond is no match
 ACCURACY = 8.0  # px, as `kinefit track` takes it for the built-in detector
 
 
@@ -69,10 +70,13 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     motions = [track_take(replace(together, person=k + 1))[0] for k in range(len(people))]
     man = int(np.argmax([p.speed for p in people]))
     seen, alone = load_observations(together), load_observations(by_himself)
-    shift = _shifts(seen, alone, man + 1)
+    shift = {c: _shift(seen, alone, c) for c in CAMERAS}
     print(f"# the pictures were moved by {', '.join(f'{c} {v.round(1).tolist()}' for c, v in shift.items())} px")
     assert seen.rig is not None and alone.rig is not None
-    moved = [replace(k, points=k.points - shift[k.camera]) for k in seen.keypoints]
+    moved = []
+    for k in seen.keypoints:  # as if her pictures were his, but for a constant shift
+        pixels = seen.images[k.camera].from_calibration(k.points) - shift[k.camera]
+        moved.append(replace(k, points=alone.images[k.camera].to_calibration(pixels)))
     with_her = track(Recording.of_keypoints(seen.rig, moved, accuracy=ACCURACY, person=man + 1), load_body("humanoid"))
     without = track(Recording.of_keypoints(alone.rig, alone.keypoints, accuracy=ACCURACY), load_body("humanoid"))
     for name, motion in (("as they are", motions[man]), ("moved back", with_her)):
@@ -86,20 +90,17 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     _figure("people_woman_residual", max(residuals))
 
 
-def _shifts(seen: Observations, alone: Observations, person: int) -> dict[str, NDArray]:
-    """{camera: (2,) px} by which one recording's pictures are moved against the other's, from the man in both."""
-    assert seen.rig is not None
-    out = {}
-    for a, b in zip(follow(seen.rig, seen.keypoints, person).keypoints, alone.keypoints, strict=True):
-        other = follow(alone.rig, alone.keypoints).keypoints if alone.rig else alone.keypoints
-        b = next(k for k in other if k.camera == a.camera)
-        out[a.camera] = np.nanmedian((_sure(a) - _sure(b)).reshape(-1, 2), axis=0)
-    return out
-
-
-def _sure(record: Keypoints) -> NDArray:
-    """(F, K, 2) [px] points of the first person of a record, NaN for unsure ones."""
-    return np.where((record.confidence[:, 0] > 0.5)[..., None], record.points[:, 0], np.nan)
+def _shift(seen: Observations, alone: Observations, camera: str) -> NDArray:
+    """(2,) [px] by which one recording's pictures are moved against the other's: of what does not move in either."""
+    background = []
+    for one in (seen, alone):
+        with Video(one.videos[camera]) as video:
+            grey = [cv2.cvtColor(video.read(f), cv2.COLOR_BGR2GRAY) for f in range(0, len(video), 10)]
+        background.append(np.median(grey, axis=0).astype(np.uint8))
+    points, features = zip(*(cv2.ORB.create(4000).detectAndCompute(b, None) for b in background))
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, True).match(*features)
+    moved = np.array([np.subtract(points[0][m.queryIdx].pt, points[1][m.trainIdx].pt) for m in pairs])
+    return np.median(moved[np.linalg.norm(moved, axis=1) < _FAR], axis=0)
 
 
 def _figure(name: str, value: float) -> None:

@@ -82,6 +82,12 @@ def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monke
     assert not (tmp_path / "person-1" / "motion.npz").exists() and (tmp_path / "person-2" / "motion.npz").exists()
 
 
+def test_the_report_says_who_is_shown(take, tmp_path):
+    told = run("track", take, "--person", "2", "--no-overlays", "--formats", "motion", "--out", tmp_path)
+    assert told.exit_code == 0
+    assert "2 of 2 in view" in (tmp_path / "report.html").read_text("utf-8")
+
+
 def test_check_says_by_whom_it_goes(take):
     told = run("check", take)
     assert "2 people are in view; the check is by person" in told.stdout
