@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
@@ -151,7 +151,7 @@ class _Search:
         """Who goes on, who comes back and who is new in a frame."""
         self._go_on(frame, self.tracks)
         came = self._newcomers(frame)
-        away = [t for t in self.tracks if frame not in t.nodes]
+        away = [t for t in self.tracks if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
         cost = np.array([[_apart(t.x, x) for _, x in came] for t in away]).reshape(len(away), len(came))
         reach = np.array([STRIDE + SPEED * (frame - t.last) / self.rate for t in away])
         cost[cost > reach[:, None]] = np.inf
@@ -226,7 +226,9 @@ class _Search:
         """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
         while len(nodes) > 1:
             uv = np.stack([self.uv[q][frame, p] for q, p in nodes], axis=1)
-            x = triangulate(self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes)), uv)
+            height = float(np.nanmedian(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
+            rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
+            x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
             off = np.array([self._off(x, frame, node) for node in nodes])
             if off.max() <= _FITS:
                 return nodes, x
