@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.errors import FileError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
+from kinefit.observations.person import PersonChoice
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 from kinefit.readers.units import LENGTHS, worth
@@ -78,6 +79,13 @@ def _values(take: Take) -> None:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
         refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+    if take.person is not None:
+        try:
+            PersonChoice.of(take.person)
+        except ObservationError as error:
+            refuse(error.problem, "[take] person", error.remedy or "")
+        if not take.keypoints and (take.depth or take.stereo or take.markers or take.silhouettes or take.skin):
+            refuse("'person' has no use without [[keypoints]]", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")

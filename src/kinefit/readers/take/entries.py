@@ -179,6 +179,7 @@ class _Head(_Entry, frozen=True, kw_only=True):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: float | None = None
+    person: int | str | None = None
     subject: Path | None = None
     start: Path | None = None
     size: bool | None = None

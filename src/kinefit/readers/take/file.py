@@ -95,6 +95,8 @@ class Take:
         Name in the catalogue, or absolute path of a body file.
     height : float [m] or None
         Stature of the person, as a first guess.
+    person : int, str or None
+        Who is followed where several people are in view, see `PersonChoice`; None: the one of whom most is seen.
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
@@ -130,6 +132,7 @@ class Take:
     start: Path | None = None
     pose: StartEntry | None = None
     size: bool | None = None
+    person: int | str | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
@@ -173,7 +176,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size, session=content.session,
+        pose=content.start, size=head.size, person=head.person, session=content.session,
     )  # fmt: skip
     check_take(take)
     return take

@@ -1,0 +1,13 @@
+"""Every figure of several people in view: `python -m benchmarks.people`; some parts: `... people people_simulated`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "people_real": "two people in four real videos, by the built-in detector",
+    "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)
