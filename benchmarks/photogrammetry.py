@@ -5,6 +5,7 @@ from __future__ import annotations
 from benchmarks.figures import run_parts
 
 PARTS = {
+    "bar": "cameras from a bar with two targets, drawn",
     "dic": "speckle images with known displacement and strain, beside pyvale",
     "lsm": "sub-pixel shifts and affinities of drawn texture, beside OpenCV",
     "stereo_cylinder": "a speckled cylinder before two cameras, in three positions",
