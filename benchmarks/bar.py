@@ -35,8 +35,9 @@ def run() -> None:
         z = _deviations(found, rig)
         inside.append(np.abs(z) < 1.96)
         print(
-            f"  seed {seed}, {len(rig)} cameras: noise {found.sigma_px:.4f} px, scale {1e6 * scale:+.0f}e-6, distances of "
-            f"cameras within {1e6 * baseline:.0f}e-6, deviations' rms {np.sqrt(np.mean(z**2)):.2f}", flush=True,
+            f"  seed {seed}, {len(rig)} cameras: noise {found.sigma_px:.4f} px, scale {1e6 * scale:+.0f}e-6, "
+            f"distances of cameras within {1e6 * baseline:.0f}e-6, deviations' rms {np.sqrt(np.mean(z**2)):.2f}",
+            flush=True,
         )  # fmt: skip
     figure("bar_noise_over_true", float(np.mean(noise)) / _NOISE, "", "<= 1.02")
     figure("bar_scale_rms", 1e4 * float(np.sqrt(np.mean(np.square(scales)))), "e-4", "<= 1")
@@ -52,7 +53,8 @@ def _scale(found: BarCalibration, rig: Rig, seed: int) -> float:
     """How much too long other bars are measured, that took no part, from pixels without noise."""
     ends = wave_bar(_LENGTH, 200, seed=seed + 5000)
     uv = np.stack([camera.project(ends) for camera in rig], axis=2).reshape(-1, len(rig), 2)
-    inside = np.stack([((uv[:, c] >= 0) & (uv[:, c] < camera.size)).all(axis=1) for c, camera in enumerate(rig)], axis=1)
+    size = np.array([camera.size for camera in rig])
+    inside = ((uv >= 0) & (uv < size)).all(axis=2)
     x = triangulate(found.rig, np.where(inside[..., None], uv, np.nan)).reshape(-1, 2, 3)
     return float(np.nanmean(np.linalg.norm(x[:, 1] - x[:, 0], axis=1)) / _LENGTH - 1.0)
 

@@ -57,8 +57,10 @@ def track_take(
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
     alone = take.start or take.pose or any(sensors)
-    if (take.silhouettes or take.regions) and not alone:
+    if (take.silhouettes or take.regions or take.surface_points) and not alone:
         kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")
+        if take.surface_points:
+            kind, table = "points of a surface", "surface_points"
         raise TakeError(
             f"{kind} alone do not show where the body is to begin with", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',

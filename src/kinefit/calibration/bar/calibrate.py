@@ -187,7 +187,8 @@ def _adjusted(
         placed = place(rig, uv, length, limit, (0.05, 0.02, 0.01, 0.01)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
-        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=1e-3 * length)
+        scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
+        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter)
         rig, x_world = problem.adjust(rig, placed.x_world[used], rounds=3 if n < 3 else 8, iterations=20)
         sigma = problem.sigma
     return problem.result(rig, x_world), placed.uv[used], used, placed.ambiguous

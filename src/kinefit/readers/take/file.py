@@ -29,6 +29,7 @@ from kinefit.readers.take.entries import (
     SilhouetteEntry,
     StartEntry,
     StereoEntry,
+    SurfacePointsEntry,
     _Entry,
     _Head,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "SilhouetteEntry",
     "StartEntry",
     "StereoEntry",
+    "SurfacePointsEntry",
     "Take",
     "read_take",
 ]
@@ -64,12 +66,14 @@ class _File(_Entry, frozen=True, kw_only=True):
     silhouette: tuple[SilhouetteEntry, ...] = ()
     region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+    "surface_points": SurfacePointsEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
@@ -106,8 +110,8 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples of entries
-        `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points : tuples
+        Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
     path: Path
@@ -131,6 +135,7 @@ class Take:
     size: bool | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
 
 
@@ -175,7 +180,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size, session=content.session,
+        pose=content.start, size=head.size, session=content.session, surface_points=content.surface_points,
     )  # fmt: skip
     check_take(take)
     return take
