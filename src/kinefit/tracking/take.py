@@ -59,8 +59,10 @@ def track_take(
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
     alone = take.start or take.pose or any(sensors)
-    if (take.silhouettes or take.regions) and not alone:
+    if (take.silhouettes or take.regions or take.surface_points) and not alone:
         kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")
+        if take.surface_points:
+            kind, table = "points of a surface", "surface_points"
         raise TakeError(
             f"{kind} alone do not show where the body is to begin with", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
@@ -93,7 +95,10 @@ def people_in_view(take: Take) -> tuple[Person, ...]:
 
     Where other sensors take part it is empty, too: their pixels and markers are not parted by people.
     """
-    beside = (take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines)
+    beside = (
+        take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines,
+        take.surface_points,
+    )  # fmt: skip
     if any(beside) or not take.keypoints:
         return ()
     seen = load_observations(take)

@@ -95,7 +95,7 @@ def track(
     if checkpoint is None:
         person = fitted()
     else:
-        if recording.sensors:
+        if any(type(sensor).__module__.partition(".")[0] != "kinefit" for sensor in recording.sensors):
             problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
             raise ObservationError(problem, remedy="Leave the checkpoint out.")
         whole = {name: getattr(recording, name) for name in ("steps", "keypoints", "people", "markers", "depth", "rig")}

@@ -43,7 +43,8 @@ def check_enough(take: Take) -> None:
     TakeError
         With what to add.
     """
-    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines)
+    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
+              take.surface_points)  # fmt: skip
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     if len(seeing) == 1 and not (any(others) or take.start or take.pose):
         raise TakeError(
@@ -147,6 +148,10 @@ def _values(take: Take) -> None:
             refuse(choices("unit", entry.unit, LENGTHS), place, "Use one of these.")
         if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
             refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
+    for surface in take.surface_points:
+        place = f"surface points {surface.file.name}"
+        if not 0 < surface.sigma < 1 or not abs(surface.time_offset) < 1e6:
+            refuse(f"sigma {surface.sigma} m, time offset {surface.time_offset} s", place, "Give metres and seconds.")
     for problem, place, remedy in _odd_depth(take):
         refuse(problem, place, remedy)
 
@@ -231,7 +236,7 @@ def _uses(take: Take) -> None:
 def _names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
     shapes = (*take.silhouettes, *take.regions)
-    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or shapes):
+    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or take.surface_points or shapes):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
@@ -291,6 +296,7 @@ def _files(take: Take) -> None:
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
     named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
     named += [("markers", entry.file) for entry in take.markers]
+    named += [("surface points", entry.file) for entry in take.surface_points]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]

@@ -121,6 +121,14 @@ class LinesEntry(_Entry, frozen=True, kw_only=True):
     sigma: float = 2.0  # [px] standard deviation, in the calibration's image
 
 
+class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
+    """`[[surface_points]]`: a surface that was tracked, such as by `kinefit surface`."""
+
+    file: Path  # table of time_s, point, x, y, z, std_x, std_y, std_z [s, m]
+    time_offset: float = 0.0  # [s]
+    sigma: float = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
+
+
 class MarkersEntry(_Entry, frozen=True, kw_only=True):
     """`[[markers]]`: a marker recording."""
 

@@ -28,6 +28,7 @@ from kinefit.readers.take.entries import (
     SilhouetteEntry,
     StartEntry,
     StereoEntry,
+    SurfacePointsEntry,
     _Entry,
     _Head,
 )
@@ -47,6 +48,7 @@ __all__ = [
     "SilhouetteEntry",
     "StartEntry",
     "StereoEntry",
+    "SurfacePointsEntry",
     "Take",
     "read_take",
 ]
@@ -65,12 +67,14 @@ class _File(_Entry, frozen=True, kw_only=True):
     silhouette: tuple[SilhouetteEntry, ...] = ()
     region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+    "surface_points": SurfacePointsEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
@@ -109,8 +113,8 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples of entries
-        `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points : tuples
+        Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
     path: Path
@@ -135,6 +139,7 @@ class Take:
     person: int | str | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
 
 
@@ -177,6 +182,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
         pose=content.start, size=head.size, person=head.person, session=content.session,
+        surface_points=content.surface_points,
     )  # fmt: skip
     check_take(take)
     return take
