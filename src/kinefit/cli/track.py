@@ -184,7 +184,7 @@ def _track_one(
             if overlays:
                 _results.write_overlays(motion, take, seen, out, step, files, blur=pictures == "blurred")
             if report:
-                write_track_report(motion, take, seen, out, step, files, pictures)
+                write_track_report(motion, take, seen, out, step, files, pictures, notes)
             if not total:
                 unfinished.remove()
     except BaseException as error:
