@@ -45,7 +45,7 @@ def run() -> None:
         named.append(set(motion.provenance["contradictions"]) == {name})
         inside.append(100 * float(np.mean(np.abs(away[known]) < 1.96 * motion.joint_std[known])))
         sigma = 1e3 * float(np.median(motion.joint_std[known]))
-        print(f"# {name} turned: joints {gaps[-1]:.1f} mm, named {named[-1]}, inside {inside[-1]:.1f} %, median standard "
-              f"deviation {sigma:.1f} mm")  # fmt: skip
+        print(f"# {name} turned: joints {gaps[-1]:.1f} mm, named {named[-1]}, inside {inside[-1]:.1f} %, standard "
+              f"deviation {sigma:.1f} mm (median)")  # fmt: skip
     for name, value in zip(_GOALS, (max(gaps), 100 * float(np.mean(named)), min(inside))):
         figure(name, value, *_GOALS[name])
