@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
+from kinefit.multiview.boxes import same_people
 from kinefit.observations import Keypoints
 
 _ENOUGH = 4  # points of a person that must be seen
@@ -31,11 +32,37 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     whom the groups show most over the whole take, by the number of keypoints seen and how sure the detector was of
     them; gone after from frame to frame, so that nobody else stands in for a moment (dynamic programming).
 
+    Where a camera has records of several detectors, the person is sought in those of the surest one, and in the others
+    by the boxes; alone where the surest sees nobody, if both are of one person elsewhere.
+
     Raises
     ------
     TrackingError
         Nobody is seen in any frame.
     """
+    sets = list(dict.fromkeys(k.names for k in keypoints))
+    each = {names: [q for q, k in enumerate(keypoints) if k.names == names] for names in sets}
+    chosen: dict[int, NDArray] = {}
+    for own in each.values():
+        chosen |= zip(own, _of_one_detector(rig, [keypoints[q] for q in own]))
+    frames = min(len(k) for k in keypoints)
+    sure = {n: sum(float(surety_of(keypoints[q], frames).sum()) for q in own) for n, own in each.items()}
+    surest = {keypoints[q].camera: q for q in reversed(each[max(sure, key=lambda names: sure[names])])}
+    for q, record in enumerate(keypoints):
+        main = surest.get(record.camera, q)
+        if main != q:
+            by_box = same_people([chosen[main]], keypoints[main], record)[0][:frames]
+            both = (by_box >= 0) & (chosen[q] >= 0)
+            alone = (chosen[main] < 0) & (np.mean((by_box == chosen[q])[both]) > 0.5 if both.any() else False)
+            chosen[q] = np.where(alone, chosen[q], by_box)
+    out = [chosen[q] for q in range(len(keypoints))]
+    if all(np.all(c < 0) for c in out):
+        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
+    return out
+
+
+def _of_one_detector(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
+    """(F,) the person to follow in each of several records of one kind of keypoints."""
     frames = min(len(k) for k in keypoints)
     surety = [surety_of(k, frames) for k in keypoints]
     chosen = [np.full(frames, -1) for _ in keypoints]
@@ -53,8 +80,6 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         for f, group in enumerate(_one_person(groups, keypoints[0].rate)):
             for q, p in group:
                 chosen[q][f] = p
-    if all(np.all(c < 0) for c in chosen):
-        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
     return chosen
 
 

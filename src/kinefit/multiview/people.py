@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
+from kinefit.multiview.boxes import same_people
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
 
@@ -24,7 +25,6 @@ _TALL = 1.7  # [m] ... how far people go from frame to frame, for one of this st
 _FITS = 0.08  # views of one person all lie within this share of the height; two, see association, within half of it
 _SAME = 0.2  # [m] points of two people are further apart than detections of one and the same
 _LASTING = 1.0  # [s] for which somebody must be seen to be a person; half of a take that is shorter than two
-_BOX = 0.3  # boxes that two detectors give one person differ by less, as a share of their height
 _STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as large as a motion
 
 
@@ -87,7 +87,11 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
             people.append(search.person(track, chosen, views, main))
     people.sort(key=lambda one: -one.surety)
     for q in set(range(len(keypoints))) - set(main):
-        _beside(people, keypoints, main, q)
+        own = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
+        if own is not None:
+            there = same_people([one.chosen[own] for one in people], keypoints[own], keypoints[q])
+            for one, places in zip(people, there):
+                one.chosen[q][:] = places
     return people
 
 
@@ -262,31 +266,3 @@ def _apart(a: NDArray, b: NDArray) -> float:
     """[m] median distance of points (k, 3) from their likes; infinite where none is in both."""
     d = np.linalg.norm(a - b, axis=1)
     return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else np.inf
-
-
-def _beside(people: Sequence[Person], keypoints: Sequence[Keypoints], main: Sequence[int], q: int) -> None:
-    """Whom another detector's record shows, by the boxes of people in the same camera."""
-    own = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
-    if own is None:
-        return
-    theirs, mine = _boxes(keypoints[own]), _boxes(keypoints[q])
-    for f in range(min(len(keypoints[q]), len(keypoints[own]))):
-        cost = np.full((len(people), mine.shape[1]), np.inf)
-        for i, one in enumerate(people):
-            p = one.chosen[own][f]
-            if p >= 0:
-                off = np.linalg.norm(mine[f, :, :2] - theirs[f, p, :2], axis=1) / max(theirs[f, p, 3], 1.0)
-                cost[i] = np.where(np.isfinite(off), off, np.inf)
-        for i, p in assign(cost, _BOX):
-            people[i].chosen[q][f] = p
-
-
-def _boxes(record: Keypoints) -> NDArray:
-    """(F, P, 4) [px] median point, width and height of what is seen of each person; NaN for nothing."""
-    seen = np.isfinite(record.points).all(axis=-1) & (record.confidence > 0.1)
-    uv = np.where(seen[..., None], record.points, np.nan)
-    out = np.full((*uv.shape[:2], 4), np.nan)
-    some = seen.any(axis=2)
-    out[some, :2] = np.nanmedian(uv[some], axis=1)
-    out[some, 2:] = np.nanmax(uv[some], axis=1) - np.nanmin(uv[some], axis=1)
-    return out
