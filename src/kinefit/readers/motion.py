@@ -78,7 +78,7 @@ def read_motion(path: str | PathLike[str]) -> Motion:
         raise
     except KeyError as error:
         raise FileError(f"motion file without the array {error}", file=file, remedy=_REMEDY) from error
-    except (KinefitError, ValueError, TypeError, IndexError) as error:
+    except (KinefitError, ValueError, TypeError, IndexError, RecursionError) as error:
         problem = f"motion file whose contents do not fit together ({error})"
         raise FileError(problem, file=file, remedy=_REMEDY) from error
 
