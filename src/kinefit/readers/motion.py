@@ -46,13 +46,13 @@ RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured",
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
-@checked
 def find_motion(path: str | PathLike[str]) -> Path:
     """A motion file, or the one in a folder of results."""
     inside = Path(path) / "motion.npz"
     return inside if inside.is_file() else Path(path)
 
 
+@checked
 def read_motion(path: str | PathLike[str]) -> Motion:
     """Read a motion file, or that in a folder of results.
 
