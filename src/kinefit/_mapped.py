@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import mmap
 import os
+import sys
 import tempfile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+_trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
 LARGE = 8 * 2**20
 """Bytes from which an array lies in a file: keypoints of a camera of some minutes."""
@@ -40,9 +44,13 @@ def kept(array: NDArray) -> NDArray:
 
 def release(*arrays: NDArray | None) -> None:
     """Give back the memory of what lies in files; the numbers stay, and take memory again when they are looked at."""
+    some = False
     for array in arrays:
         owner: Any = array
         while isinstance(owner, np.ndarray):
             owner = owner.base
         if isinstance(owner, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
             owner.madvise(mmap.MADV_DONTNEED)
+            some = True
+    if some and _trim is not None:  # what was computed from them is gone, and left holes that nobody gives back
+        _trim(0)

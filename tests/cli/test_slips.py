@@ -120,6 +120,7 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
     take.unlink()
     told = run("init", take.parent)
     assert told.exit_code == 0 and "cam01 alone: one camera does not tell how far a person is" in told.stdout
+    assert "Write a second camera" in told.stdout
     told = run("track", take, "--out", tmp_path / "out")
     assert told.exit_code == 2 and "two cameras do" in told.stderr and "[[depth]]" in told.stderr
     take.with_name("calibration.toml").unlink()

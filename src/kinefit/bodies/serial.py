@@ -233,7 +233,7 @@ def _decoded(arrays: Mapping[str, NDArray], key: str, kind: type[_Kind]) -> tupl
         return ()
     try:
         return tuple(msgspec.json.decode(str(text), type=kind) for text in _array(arrays, key, (None,)))
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BodyError(f"{key} that cannot be read ({error})") from error
 
 

@@ -94,7 +94,10 @@ def smooth_results(
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
-    took_part = take.confidence / np.square(strength.sigma) * take.agreeing(strength.sigma)
+    took_part = take.agreeing(strength.sigma)
+    for some in stretches(len(took_part)):
+        took_part[some] *= take.confidence[some] / np.square(strength.sigma)
+    release(took_part, take.confidence)
     surfaces = False
     smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
     covariance = np.empty((body.tree.n_dofs,) * 2)
@@ -242,6 +245,7 @@ def _estimate(
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else enliven(take.part(whole), strength)
+        release(take.uv, take.confidence)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
@@ -266,6 +270,7 @@ def _solve(
             fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
+            release(take.uv, take.confidence)
             speeds.append(_speed_std(post, part.dt)[max(inside.start - 1, 0) : inside.stop - 1])
             for covariance in post.frames[inside]:
                 covariances.append(covariance[packed])

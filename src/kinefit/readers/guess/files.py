@@ -248,7 +248,7 @@ def _openpose_points(numbered: list[Path]) -> int | None:
     for path in numbered:
         try:
             people = decode(path.read_bytes()).people
-        except (msgspec.DecodeError, OSError):
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
             if not there:
                 return None
             continue
