@@ -48,14 +48,21 @@ def run() -> None:
         joint_girths.append(widths(both[0], body))
         print(
             f"  seed {seed}: in turn {found.iterations} iterations, {1e3 * found.rms:.2f} mm, radii "
-            f"{np.round(100 * r, 1)} % RMS, angles {np.round(a, 2)} deg; at once radii {np.round(100 * r2, 1)} %, "
+            f"{_told(r)} % of upper arm, forearm, hand, angles {np.round(a, 2)} deg; at once radii {_told(r2)} %, "
             f"angles {np.round(a2, 2)}", flush=True,
         )  # fmt: skip
     for name, r, w, a in (("at_once", joint_radii, joint_girths, joint_angles), ("in_turn", radii, girths, angles)):
-        figure(f"metaballs_radii_{name}", 100 * float(np.sqrt(np.mean(np.square(r)))), "% RMS", "<= 5")
+        of_limb, of_angle = np.sqrt(np.mean(np.square(r), axis=(0, 2))), np.sqrt(np.mean(np.square(a), axis=0))
+        for limb, value in zip(("upperarm", "forearm", "hand"), of_limb):
+            figure(f"metaballs_radii_{limb}_{name}", 100 * float(value), "% RMS", "<= 5")
         figure(f"metaballs_widths_{name}", 100 * float(np.median(w)), "% median of the worst", "<= 5")
-        figure(f"metaballs_angles_{name}", float(np.sqrt(np.mean(np.square(a)))), "deg RMS", "<= 2")
+        figure(f"metaballs_angles_arm_{name}", float(np.sqrt(np.mean(of_angle[:4] ** 2))), "deg RMS", "<= 2")
+        figure(f"metaballs_angles_hand_{name}", float(np.sqrt(np.mean(of_angle[4:] ** 2))), "deg RMS", "<= 2")
     _time()
+
+
+def _told(radii: NDArray) -> str:
+    return ", ".join(f"{v:.1f}" for v in 100 * np.sqrt(np.mean(radii**2, axis=1)))
 
 
 def arm(seed: int, frames: int, count: int) -> tuple[Body, list[NDArray], list[BodyState], list[BodyState]]:
@@ -89,10 +96,10 @@ def seen(body: Body, state: BodyState, count: int, rng: np.random.Generator) -> 
 
 
 def errors(found: Body, states, body: Body, truth) -> tuple[NDArray, NDArray]:  # type: ignore[no-untyped-def]
-    """RMS of the radii's logarithms along each axis over all balls, and of every joint angle [deg]."""
-    e = np.log(np.concatenate([a.radii / b.radii for a, b in zip(found.surfaces, body.surfaces)]))  # type: ignore[union-attr]
+    """RMS of the radii's logarithms of every limb along each axis (L, 3), and of every joint angle [deg]."""
+    e = np.log([a.radii / b.radii for a, b in zip(found.surfaces, body.surfaces)])  # type: ignore[union-attr]
     off = np.degrees([a.angles - b.angles for a, b in zip(states, truth)])
-    return np.sqrt(np.mean(e**2, axis=0)), np.sqrt(np.mean(off**2, axis=0))
+    return np.sqrt(np.mean(e**2, axis=1)), np.sqrt(np.mean(off**2, axis=0))
 
 
 def widths(found: Body, body: Body) -> float:
