@@ -94,7 +94,7 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
 
 
 def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, float]:
-    """RMS errors [deg] of the elbow's and wrist's angles, and of the upper arm's turn in the world."""
+    """RMS errors [deg] of the elbow's and wrist's angles, also without their means, and of the upper arm's turn."""
     from kinefit.cli import main
 
     motion, rig = moving_arm(seed, frames), cameras(size)
@@ -111,7 +111,9 @@ def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, floa
     found = read_motion(folder / "result" / "motion.npz")
     names = motion.body.tree.coordinates
     off = np.degrees(found.angles - motion.angles[: len(found)])
-    out = {name: float(np.sqrt(np.mean(off[:, names.index(name)] ** 2))) for name in names if "arm" not in name}
+    told_names = [name for name in names if "arm" not in name]
+    out = {name: float(np.sqrt(np.mean(off[:, names.index(name)] ** 2))) for name in told_names}
+    out |= {f"{name}_change": float(off[:, names.index(name)].std()) for name in told_names}
     turned = [_turn(a.state(k), b.state(k), motion) for a, b, k in ((found, motion, k) for k in range(len(found)))]
     return {"upperarm": float(np.sqrt(np.mean(np.square(turned)))), **out}
 

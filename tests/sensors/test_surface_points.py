@@ -108,7 +108,7 @@ def test_frames_that_are_none():
 
 
 def test_a_point_of_another_limb_is_let_go_and_given_anew():
-    state, other = posture(BODY, 0), posture(BODY, 1)
+    state, other = posture(BODY, 0), posture(BODY, 12)
     sensor = learnt(state)
     right = dict(sensor.anchors)
     arm = BODY.tree.segments.index("forearm_r")
