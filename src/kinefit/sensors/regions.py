@@ -30,6 +30,7 @@ from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_image import Coloured, kept
+from kinefit.sensors.region_parts import Drawn, Lines, Parts
 from kinefit.sensors.region_search import Seeker, region_starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -65,14 +66,14 @@ class RegionSensor(Sensor):
         self.colours = RegionColours.none(self.count, self.regions)
         self.ratios: Ratios | None = None
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
-        self._anchors: NDArray | None = None
+        self._parts: Parts | None = None
         self._seeker: Seeker | None = None
 
-    def anchors(self, scene: Scene) -> NDArray:
-        """(V,) the anchor of every vertex of the body's skin."""
-        if self._anchors is None:
-            self._anchors = spread_anchors(scene.surface.morphing.mesh.vertices, self.regions.anchors)
-        return self._anchors
+    def parts(self, scene: Scene) -> Parts:
+        """Parts of the body that have colours of their own."""
+        if self._parts is None:
+            self._parts = Parts(scene.body, scene.surface.morphing.mesh, self.regions.anchors, self.regions.parts)
+        return self._parts
 
     def seeker(self, scene: Scene) -> Seeker:
         """What draws a coarse mesh of the body."""
@@ -114,7 +115,7 @@ class RegionSensor(Sensor):
 
     def _know(self, measurement: RegionMeasurement, scene: Scene) -> None:
         self.colours = measurement.counted(scene, self.colours)
-        self.ratios = self.colours.ratios(self.regions)
+        self.ratios = self.colours.ratios(self.regions, self.parts(scene).of)
 
 
 class RegionMeasurement(Measurement):
@@ -145,6 +146,7 @@ class RegionMeasurement(Measurement):
         self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
+        self._lines: Lines | None = None
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -154,12 +156,12 @@ class RegionMeasurement(Measurement):
         return float(np.nanmax(np.abs(self._few(scene) - self._expected), initial=0.0))
 
     def rim(self, scene: Scene) -> Rim:
-        """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""
+        """The occluding contour at a scene's state, of parts before others too; kept for the state asked for last."""
         vertices, camera = scene.pose.vertices, scene.placed(self.of.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera:
             finder = scene.surface.rims(camera)
             rim = finder.find(
-                vertices, camera, spacing=self._spacing or 1.0, inner=False, stale=_STALE,
+                vertices, camera, spacing=self._spacing or 1.0, inner=self.of.parts(scene).count > 1, stale=_STALE,
                 close=self.of.settings.outline,
             )  # fmt: skip
             if not self._spacing:  # the first look tells how long the contour is
@@ -169,41 +171,39 @@ class RegionMeasurement(Measurement):
             self._last = vertices, camera, rim
         return self._last[2]
 
-    def _drawn(self, scene: Scene) -> tuple[NDArray, float, float, float]:
-        """The body as it was drawn last: its faces, and where they are in the image; see `kernels.count`."""
-        finder = scene.surface.rims(scene.placed(self.of.camera))
+    def _drawn(self, scene: Scene) -> Drawn:
+        """The body as it was drawn last."""
+        finder, parts = scene.surface.rims(scene.placed(self.of.camera)), self.of.parts(scene)
         w = finder.window
-        return finder.face, w.left, w.top, w.scale
-
-    def _anchor(self, scene: Scene, rim: Rim) -> NDArray:
-        """(N,) the anchor of every point of a contour."""
-        if not self.of.regions.anchors:
-            return np.zeros(len(rim), np.int64)
-        return self.of.anchors(scene)[rim.vertices[:, 0]]
+        return Drawn(finder.face, parts.label, w.left, w.top, w.scale, parts.joined)
 
     def counted(self, scene: Scene, before: RegionColours) -> RegionColours:
         """What is known of colours, with those of this image, the body being where a scene has it."""
         of, s, rim, image = self.of, self.of.regions, self.rim(scene), self.image
+        rim = rim.chosen(~rim.inner)
         if not len(rim) or image is None:
             return before
+        parts = of.parts(scene)
+        if not before.images:
+            before = RegionColours.none(of.count, s, parts.count)
         low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
         margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
         box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
-        counts = np.zeros((3, of.count))
-        kernels.count(image, of.bins, *drawn, box, *counts)
+        inside, outside = np.zeros((parts.count, of.count)), np.zeros((2, of.count))
+        kernels.count(image, of.bins, *drawn[:5], box, inside, *outside)
 
-        def lines(weight: NDArray, own: NDArray) -> None:
-            anchor = self._anchor(scene, rim)
-            kernels.count_lines(image, of.bins, rim.outline, anchor, s.half, *drawn, weight, own)
+        def lines(weight: NDArray, into: NDArray) -> None:
+            at = parts.lines(rim, drawn)
+            kernels.count_lines(image, of.bins, at.outline, at.anchor, s.half, *drawn, at.own, weight, into)
 
-        return before.blended(counts, lines, s)
+        return before.blended(inside, outside, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
         """(N, 2 half) log ratios along the normals of a contour, in samples of `step` pixels."""
         assert self.seen is not None
-        return self.seen.profiles(
-            rim.outline, self._anchor(scene, rim), self._drawn(scene), self.of.regions.half, step, _GUARD
-        )
+        drawn = self._drawn(scene)
+        self._lines = self.of.parts(scene).lines(rim, drawn)
+        return self.seen.profiles(self._lines, drawn, self.of.regions.half, step, _GUARD)
 
     def match(self, scene: Scene, reach: float) -> RegionMatched:
         """Where along its normals the contour of the body is."""
@@ -216,7 +216,7 @@ class RegionMeasurement(Measurement):
         place = np.array(rim.outline)
         place[:2] += told[0] * place[2:]
         # Errors are alike along a piece of the contour, of which several lines tell.
-        share = min(self._spacing / self._drawn(scene)[3] / s.alike, 1.0)
+        share = min(self._spacing / self._drawn(scene).scale / s.alike, 1.0)
         weight = np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
@@ -243,7 +243,7 @@ class RegionMeasurement(Measurement):
         contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
         T, focal = camera.T_camera_world, camera.matrix[0, 0]
         depth = max(float(np.median(scene.pose.vertices[::_FEW] @ T[2, :3])) + T[2, 3], 0.1)
-        spacing = self._spacing / self._drawn(scene)[3]
+        spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
         self.hidden = bool(out.hidden.all())
@@ -252,17 +252,13 @@ class RegionMeasurement(Measurement):
     def compact(self) -> RegionMeasurement:
         """Without the image: log ratios about the contour as it was drawn last."""
         out = copy(self)
-        if self.image is not None and self.seen is not None and self._last is not None:
-            rim = self._last[2]
-            anchor = np.zeros(len(rim), np.int64)
-            if self.of.regions.anchors and self.of._anchors is not None:
-                anchor = self.of._anchors[rim.vertices[:, 0]]
-            out.seen = kept(self.seen, rim.outline, anchor, _JUDGED * self.of.regions.half, self.of.regions.most)
-        out.image, out._last = None, None
+        if self.image is not None and self.seen is not None and self._lines is not None:
+            out.seen = kept(self.seen, self._lines, _JUDGED * self.of.regions.half, self.of.regions.most)
+        out.image, out._last, out._lines = None, None, None
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None}
+        return {**self.__dict__, "_last": None, "_lines": None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,14 +311,3 @@ class RegionMatched(Matched):
         away = np.sum(self.place[2:].T * (self.place[:2].T - uv), axis=1)
         seen = np.isfinite(away) & (self.weight > 0.0)
         return [by_segments(self.sensor, scene.body, away[seen], self.rim.segment[seen], "px")]
-
-
-def spread_anchors(vertices: NDArray, count: int) -> NDArray:
-    """(V,) the nearest of some vertices that are spread over all of them, each as far from the others as can be."""
-    away = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)
-    best, near = np.full(len(vertices), np.inf), np.zeros(len(vertices), np.int64)
-    for k in range(min(count, len(vertices))):
-        d = np.linalg.norm(vertices - vertices[int(np.argmax(away))], axis=1)
-        near[d < best] = k
-        away = best = np.minimum(best, d)
-    return near
