@@ -31,6 +31,7 @@ from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segm
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_image import Coloured, kept
 from kinefit.sensors.region_parts import Drawn, Lines, Parts
+from kinefit.sensors.region_seams import SPACING, Seams
 from kinefit.sensors.region_search import Seeker, region_starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -221,7 +222,22 @@ class RegionMeasurement(Measurement):
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
         spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
-        return RegionMatched(self, rim, place, weight, geman_mcclure(s.loss * spread))
+        loss = geman_mcclure(s.loss * spread)
+        seams = self._seams(scene, step)
+        return RegionMatched(self, rim, place, weight, loss, *seams)
+
+    def _seams(self, scene: Scene, step: int) -> tuple[Seams | None, NDArray, NDArray]:
+        """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
+        of, s, none = self.of, self.of.regions, np.zeros(0)
+        parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
+        if parts.count == 1 or seen is None or self.image is None:
+            return None, none, none
+        drawn = self._drawn(scene)
+        seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
+        told = np.empty((3, len(seams)))
+        kernels.places(seen.profiles(seams.lines, drawn, s.half, step, _GUARD), float(step), s.heat, told)
+        share = min(SPACING / drawn.scale / s.alike, 1.0)
+        return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
         """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
@@ -279,6 +295,9 @@ class RegionMatched(Matched):
     place: NDArray
     weight: NDArray
     loss: Loss
+    seams: Seams | None
+    off: NDArray
+    sure: NDArray
     of_points = False
 
     @property
@@ -288,18 +307,19 @@ class RegionMatched(Matched):
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
+        seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
         n, camera = len(self.rim), scene.placed(self.measurement.of.camera)
         numbers = np.arange(n)
         if not scene.surface.morphing.is_rigid:
             blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, (numbers, numbers), sigma=1.0)
-            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss)]
+            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss), *seams]
         data, segment, group = _kernels.buffers(n)
         used = _kernels_outlines.tangent_rows(
             camera.packed, np.ascontiguousarray(scene.pose.vertices), self.rim.vertices, self.rim.share,
             self.rim.segment, self.place, numbers, numbers, 1.0, data, segment, group,
         )  # fmt: skip
         data[7, :used] *= self.weight[group[:used]]
-        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss)]
+        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss), *seams]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
