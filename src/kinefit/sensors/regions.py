@@ -36,6 +36,7 @@ from kinefit.sensors.region_search import Seeker, region_starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
+_LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
@@ -44,7 +45,8 @@ _GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a
 # and at its end the loss is as it was; 1.5 (the deviation that a median stands for) let outliers in.
 _SPREAD = 0.5
 _JUDGED = 2  # [px] step of the lines by which a state is judged: they reach twice as far as the last ones of the fit
-_AGREES = 1.5  # [px] within which a line speaks for its segment, and within one deviation of the contour
+_AGREES = 1.5, 3.0  # [px], [deviations of the contour] within which a line speaks for its segment
+_ROOM = 4.0  # times as far judging lines reach at least: one that points anywhere agrees in a quarter of cases
 # Of rendered sequences in which nothing was reset, right poses have at most a third of such lines off in 97 %, wrong
 # ones more than that in 65 %: a wrong silhouette agrees along half of its contour by chance.
 _AGAINST = 2.0  # lines that agree, which one that does not outweighs
@@ -107,15 +109,20 @@ class RegionSensor(Sensor):
         """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
         if not isinstance(measurement, RegionMeasurement):
             return
-        if not sure or measurement.hidden:
+        told = measurement.evidence(scene)
+        parts, wrong = self.parts(scene), told.lost
+        seen = float((told.agreeing + told.contrary).sum())
+        if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
+            sure = float(told.agreeing.sum()) > _LEARNT * seen
+        if not sure or told.hidden.all():
             self.reach = _WIDE
             return
         off = 2.0 * measurement.off(scene)
         self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        self._know(measurement, scene)
+        self._know(measurement, scene, wrong)
 
-    def _know(self, measurement: RegionMeasurement, scene: Scene) -> None:
-        self.colours = measurement.counted(scene, self.colours)
+    def _know(self, measurement: RegionMeasurement, scene: Scene, wrong: NDArray | None = None) -> None:
+        self.colours = measurement.counted(scene, self.colours, wrong)
         self.ratios = self.colours.ratios(self.regions, self.parts(scene).of)
 
 
@@ -132,7 +139,6 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
-    hidden : whether nothing of the body was seen in the state that was judged last: its colours are not learnt there
     """
 
     settled = False
@@ -141,13 +147,13 @@ class RegionMeasurement(Measurement):
         self.sensor, self.time, self.of = of.name, frame.time, of
         self.image: NDArray | None = frame.image
         self.seen: Coloured | None = None
-        self.hidden = False
         self.reach, self._spacing = of.reach, 0.0
         camera = scene.placed(of.camera)
         self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self._lines: Lines | None = None
+        self._told: tuple[Rim, Evidence] | None = None
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -178,10 +184,13 @@ class RegionMeasurement(Measurement):
         w = finder.window
         return Drawn(finder.face, parts.label, w.left, w.top, w.scale, parts.joined)
 
-    def counted(self, scene: Scene, before: RegionColours) -> RegionColours:
-        """What is known of colours, with those of this image, the body being where a scene has it."""
+    def counted(self, scene: Scene, before: RegionColours, wrong: NDArray | None = None) -> RegionColours:
+        """What is known of colours, with those of this image, the body being where a scene has it.
+
+        Of segments that are `wrong` (S,) bool nothing is learnt.
+        """
         of, s, rim, image = self.of, self.of.regions, self.rim(scene), self.image
-        rim = rim.chosen(~rim.inner)
+        rim = rim.chosen(~rim.inner if wrong is None else ~(rim.inner | wrong[rim.segment]))
         if not len(rim) or image is None:
             return before
         parts = of.parts(scene)
@@ -197,6 +206,8 @@ class RegionMeasurement(Measurement):
             at = parts.lines(rim, drawn)
             kernels.count_lines(image, of.bins, at.outline, at.anchor, s.half, *drawn, at.own, weight, into)
 
+        if wrong is not None:
+            inside[parts.group[wrong]] = 0.0
         return before.blended(inside, outside, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
@@ -252,9 +263,12 @@ class RegionMeasurement(Measurement):
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
         rim, areas, camera = self.rim(scene), scene.surface.areas, scene.placed(self.of.camera)
-        told = np.empty((3, len(rim)))
-        kernels.places(self.profiles(scene, rim, _JUDGED), float(_JUDGED), self.of.regions.heat, told)
-        tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < max(_AGREES, self.of.sigma)
+        if self._told is not None and self._told[0] is rim:
+            return self._told[1]
+        told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
+        step = max(_JUDGED, math.ceil(_ROOM * agrees / self.of.regions.half))
+        kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, told)
+        tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < agrees
         agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))
         contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
         T, focal = camera.T_camera_world, camera.matrix[0, 0]
@@ -262,7 +276,7 @@ class RegionMeasurement(Measurement):
         spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self.hidden = bool(out.hidden.all())
+        self._told = rim, out
         return out
 
     def compact(self) -> RegionMeasurement:
@@ -270,11 +284,11 @@ class RegionMeasurement(Measurement):
         out = copy(self)
         if self.image is not None and self.seen is not None and self._lines is not None:
             out.seen = kept(self.seen, self._lines, _JUDGED * self.of.regions.half, self.of.regions.most)
-        out.image, out._last, out._lines = None, None, None
+        out.image, out._last, out._lines, out._told = None, None, None, None
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None, "_lines": None}
+        return {**self.__dict__, "_last": None, "_lines": None, "_told": None}
 
 
 @dataclass(frozen=True, eq=False)
