@@ -110,7 +110,8 @@ class FrameFit:
             for state in m.starts(scene, None if held is None else held[1], one):
                 other = self._fitted(scene.at(state), held, measurements)
                 also = evidence_of(other.scene, other.matched)
-                if sum(e.balance for e in also) > sum(e.balance for e in told):
+                better = m.better(other.scene, found.scene)
+                if sum(e.balance for e in also) > sum(e.balance for e in told) if better is None else better:
                     found, told = other, also
         return self._judged(found, held, told, known)
 

@@ -232,3 +232,24 @@ def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
                 if face[j, i] >= 0:
                     total += ratios[j, i]
         out[m] = total
+
+
+@jit
+def likelihood(image, bins, logs, face, label, left, top, scale):
+    """How much better a body as it was drawn explains an image than no body does: a sum of log ratios over pixels.
+
+    logs (G + 1, B) of the densities of each part's colours and, last, of what is around; face, label and so on as of
+    `count`. A pixel of the drawing that is larger than the image's counts as many.
+    """
+    total, height, width = 0.0, image.shape[0], image.shape[1]
+    around = len(logs) - 1
+    for j in range(face.shape[0]):
+        y = math.floor((j + 0.5) / scale - 0.5 + top + 0.5)
+        if not 0 <= y < height:
+            continue
+        for i in range(face.shape[1]):
+            x = math.floor((i + 0.5) / scale - 0.5 + left + 0.5)
+            if face[j, i] >= 0 and 0 <= x < width:
+                b = bins[_colour(image, y, x)]
+                total += logs[label[face[j, i]], b] - logs[around, b]
+    return total / (scale * scale)

@@ -29,6 +29,7 @@ from kinefit.observations import ColourFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_image import Coloured, kept
 from kinefit.sensors.region_parts import Drawn, Lines, Parts
 from kinefit.sensors.region_seams import SPACING, Seams
@@ -39,6 +40,7 @@ from kinefit.sensors.settings import TrackSettings
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
+_GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
 _STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
 _GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a state may be off its drawing
 # Of the median offset of lines, in deviations, that the loss takes for one: the fit then needs 5 steps in place of 6,
@@ -71,6 +73,8 @@ class RegionSensor(Sensor):
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
         self._seeker: Seeker | None = None
+        self._flips: Flips | None = None
+        self._flipped = -np.inf  # [s] when limbs were mirrored last
 
     def parts(self, scene: Scene) -> Parts:
         """Parts of the body that have colours of their own."""
@@ -84,6 +88,21 @@ class RegionSensor(Sensor):
             mesh = scene.surface.morphing.mesh
             self._seeker = Seeker(mesh.vertices, mesh.faces)
         return self._seeker
+
+    def flips(self, scene: Scene) -> Flips:
+        """Limbs of the body that may be mirrored."""
+        if self._flips is None:
+            mesh = scene.surface.morphing.mesh
+            count = np.maximum(np.bincount(mesh.segment, minlength=len(scene.body.tree.segments)), 1)
+            sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
+            self._flips = Flips(scene.body, np.array(sums).T / count[:, None] - scene.body.tree.rest)
+        return self._flips
+
+    def due(self, time: float) -> bool:
+        """Whether limbs are to be mirrored again at a time [s]."""
+        late = not abs(time - self._flipped) < self.settings.search_every - 1e-6
+        self._flipped = time if late else self._flipped
+        return late
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
         """The image with what is known of colours; before anything is known they are those at the scene's state.
@@ -154,6 +173,7 @@ class RegionMeasurement(Measurement):
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self._lines: Lines | None = None
         self._told: tuple[Rim, Evidence] | None = None
+        self._judged: BodyState | None = None
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -251,18 +271,39 @@ class RegionMeasurement(Measurement):
         return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
-        of, seen = self.of, self.seen
+        """Where colours alone show the body, if it is expected too roughly, or not where it was found; limbs mirrored."""
+        of, seen, camera = self.of, self.seen, scene.placed(self.of.camera)
         if self.image is None or seen is None or not of.settings.search:
             return ()
-        return region_starts(
-            scene, scene.placed(of.camera), of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
+        found = region_starts(
+            scene, camera, of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
             of.regions.search,
         )  # fmt: skip
+        if found or information is None or self._judged is None or not of.due(self.time):
+            return found
+        if any(m.depth_image() is not None for m in scene.measurements):
+            return found
+        return of.flips(scene).near(scene.state, information, self._judged, camera)[: of.regions.flips]
+
+    def better(self, new: Scene, old: Scene) -> bool | None:
+        """Of a body of parts: whether the colours of all its pixels say so."""
+        if self.of.parts(new).count == 1 or self.image is None:
+            return None
+        gain = self._explained(new) - self._explained(old)
+        self._last = None  # what was drawn last is neither
+        return gain > _GAIN
+
+    def _explained(self, scene: Scene) -> float:
+        """By how much better the body where a scene has it explains the image than no body does, in logarithms."""
+        assert self.seen is not None
+        camera = scene.placed(self.of.camera)
+        scene.surface.rims(camera).find(scene.pose.vertices, camera, spacing=_WIDE, close=self.of.settings.outline)
+        return kernels.likelihood(self.seen.image, self.seen.bins, self.seen.ratios.logs, *self._drawn(scene)[:5])
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
         rim, areas, camera = self.rim(scene), scene.surface.areas, scene.placed(self.of.camera)
+        self._judged = scene.state
         if self._told is not None and self._told[0] is rim:
             return self._told[1]
         told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
