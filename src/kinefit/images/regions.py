@@ -218,7 +218,7 @@ class Ratios:
 
     @property
     def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float, float]:
-        """As kernels take them."""
+        """As `kernels.profiles` takes them."""
         return self.table, self.own, self.total, self.general, self.of, self.floor, self.most
 
     def at(self, anchor: NDArray, bins: NDArray) -> NDArray:

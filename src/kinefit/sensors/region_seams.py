@@ -9,10 +9,12 @@ the pixel along it, it moves by α a·dx_a + β b·dx_b.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.tree import KinematicTree
 from kinefit.correspondences.rims import RimFinder
 from kinefit.geometry.camera import Camera
 from kinefit.losses import Loss
@@ -83,9 +85,8 @@ class Seams:
             x = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), self.points[k]) + f[:, 9:]
             moved += np.sum(self.pulls[k] * (x - self.at), axis=1)
             wrench = np.concatenate([self.pulls[k], np.cross(x - state.T_world_root[:3, 3], self.pulls[k])], axis=1)
-            for segment in np.unique(s):
-                own = s == segment
-                J[own] += wrench[own] @ tree.segment_jacobian(screws, int(segment))
+            J[:, :6] += wrench
+            J[:, 6:] += (wrench @ screws.T) * _moved_by(tree)[s]
         size = np.linalg.norm(self.pulls.sum(axis=0), axis=1)
         return DofRows(J / size[:, None], (off - moved) / size, weight * size**2, np.arange(len(self)), loss)
 
@@ -93,3 +94,13 @@ class Seams:
 def _local(scene: Scene, segment: NDArray, x: NDArray) -> NDArray:
     f = scene.frames[segment]
     return np.einsum("nji,nj->ni", f[:, :9].reshape(-1, 3, 3), x - f[:, 9:])
+
+
+@lru_cache(maxsize=8)
+def _moved_by(tree: KinematicTree) -> NDArray:
+    """(S, D) 1 where a coordinate moves a segment, else 0."""
+    out = np.zeros((len(tree.segments), tree.n_dofs - 6))
+    for s, last in enumerate(tree.last_dof):
+        chain = tree.chain[last, : tree.depth[last] + 1]
+        out[s, chain[chain >= 6] - 6] = 1.0
+    return out

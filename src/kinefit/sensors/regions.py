@@ -38,6 +38,9 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
+# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
+# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
+_FIRST, _OFTEN = 10, 0.05
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -73,6 +76,7 @@ class RegionSensor(Sensor):
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
         self._seeker: Seeker | None = None
+        self._learnt = -np.inf  # [s] when colours were blended in last
         self._flips: Flips | None = None
         self._flipped = -np.inf  # [s] when limbs were mirrored last
 
@@ -138,7 +142,9 @@ class RegionSensor(Sensor):
             return
         off = 2.0 * measurement.off(scene)
         self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        self._know(measurement, scene, wrong)
+        if parts.count == 1 or self.colours.images < _FIRST or abs(measurement.time - self._learnt) > _OFTEN:
+            self._know(measurement, scene, wrong)
+            self._learnt = measurement.time
 
     def _know(self, measurement: RegionMeasurement, scene: Scene, wrong: NDArray | None = None) -> None:
         self.colours = measurement.counted(scene, self.colours, wrong)
@@ -277,7 +283,7 @@ class RegionMeasurement(Measurement):
             return ()
         found = region_starts(
             scene, camera, of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
-            of.regions.search,
+            of.regions.search, rigid=len(scene.body.tree.segments) == 1,
         )  # fmt: skip
         if found or information is None or self._judged is None or not of.due(self.time):
             return found
