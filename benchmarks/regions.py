@@ -6,6 +6,7 @@ from benchmarks.figures import run_parts
 
 PARTS = {
     "regions_cat": "a real hand-held object before clutter, followed by its mesh",
+    "regions_body10": "a rendered body of ten parts in colour and depth",
     "regions_rendered": "rendered objects in the manner of RBOT: moving light, noise, an occluder, larger steps",
 }
 

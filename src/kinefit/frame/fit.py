@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_closures
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
-from kinefit.frame.prediction import belief
+from kinefit.frame.prediction import belief, forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
 from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
@@ -29,6 +29,7 @@ from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
+_LEAP = 4.0  # deviations of a prediction, beyond which a start is not held by it
 _OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
 _ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wide: the next one begins there
 
@@ -47,12 +48,15 @@ class Fitted:
     ----------
     seen : (D,) bool, coordinates that this frame's measurements observe
     known : (D,) bool, those, and what was known before and is not lost now
+    released : (n,) bool, degrees of freedom that were found where their prediction had them not, and so do not go on
+        as they went; None where there are none
     """
 
     result: FrameResult
     filtered: NDArray
     seen: NDArray
     known: NDArray
+    released: NDArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +110,19 @@ class FrameFit:
             gain = found.cost - other.cost if every else sum(e.balance for e in also) - sum(e.balance for e in told)
             if gain > 0.0:
                 found, told = other, also
+        released: NDArray | None = None
         for m, one in zip(measurements, list(told)):
             for state in m.starts(scene, None if held is None else held[1], one):
-                other = self._fitted(scene.at(state), held, measurements)
+                free = None if held is None else _leapt(held, state)
+                let = held if held is None or free is None else (held[0], forgetting(held[1], free))
+                other = self._fitted(scene.at(state), let, measurements)
                 also = evidence_of(other.scene, other.matched)
                 better = m.better(other.scene, found.scene)
                 if sum(e.balance for e in also) > sum(e.balance for e in told) if better is None else better:
-                    found, told = other, also
-        return self._judged(found, held, told, known)
+                    found, told, released = other, also, free
+        if held is not None and released is not None:
+            held = held[0], forgetting(held[1], released)
+        return replace(self._judged(found, held, told, known), released=released)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
         settled = all(m.settled for m in measurements)
@@ -336,6 +345,14 @@ def weaker(rows: AnyRows, factor: float) -> AnyRows:
     if isinstance(rows, Rows):
         return rows.weaker(factor)
     return replace(rows, weight=rows.weight / factor**2)
+
+
+def _leapt(held: Held, state: BodyState) -> NDArray | None:
+    """(n,) bool: angles that a start has changed by more than the prediction allows; None where there are none."""
+    off, std = held[0].difference(state), np.sqrt(np.diag(inverse(held[1])))
+    out = np.abs(off) > _LEAP * std
+    out[:6] = False
+    return out if out.any() else None
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

@@ -23,6 +23,7 @@ _REACHED = 0.03  # [m] from where it should be to where the joints' limits let a
 _SIGMA = 0.005  # [m] of the places of ends, while a limb is turned
 _FREE, _HELD = 3.0, 1e-3  # [rad] or [m] standard deviations of a limb's coordinates while it is turned, and of others
 _LIKELY = 30.0  # squared distance from the prediction, in its variances, beyond which a flip is not looked at
+_ALONG, _TWISTED = 0.9, 0.4  # cosine of an axis with a segment's length; [rad] of a twist that is worth a look
 _STEPS = 10  # of the fit that turns a limb
 
 
@@ -54,6 +55,23 @@ class Flips:
             if square < _LIKELY:
                 out.append((square, other))
         return [other for _, other in sorted(out, key=lambda pair: pair[0])]
+
+    def untwisted(self, state: BodyState, limb: NDArray) -> list[BodyState]:
+        """The state with the last segment of a limb (segments) turned back about its own length, if that is far.
+
+        A limb that is round about its length hardly shows its twist, and may turn to its joint's end unnoticed.
+        """
+        tree, out = self.body.tree, []
+        for s in limb:
+            if len(self._limbs[s]):
+                continue
+            along = self._ends.points[s] / max(float(np.linalg.norm(self._ends.points[s])), 1e-9)
+            for d in range(tree.dof_start[s], tree.dof_start[s + 1]):
+                if abs(tree.axes[d] @ along) > _ALONG and abs(state.angles[d] - tree.usual[d]) > _TWISTED:
+                    angles = np.array(state.angles)
+                    angles[d] = tree.usual[d]
+                    out.append(BodyState(state.T_world_root, angles))
+        return out
 
     def of(self, state: BodyState, camera: Camera) -> Iterator[BodyState]:
         """States in which one segment is mirrored in depth, with all that hangs on it shifted, or mirrored as well."""

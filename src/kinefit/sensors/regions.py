@@ -31,6 +31,7 @@ from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segm
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_image import Coloured, kept
+from kinefit.sensors.region_limbs import Limbs
 from kinefit.sensors.region_parts import Drawn, Lines, Parts
 from kinefit.sensors.region_seams import SPACING, Seams
 from kinefit.sensors.region_search import Seeker, region_starts
@@ -78,6 +79,8 @@ class RegionSensor(Sensor):
         self._seeker: Seeker | None = None
         self._learnt = -np.inf  # [s] when colours were blended in last
         self._flips: Flips | None = None
+        self._limbs: Limbs | None = None
+        self._turn = 0
         self._flipped = -np.inf  # [s] when limbs were mirrored last
 
     def parts(self, scene: Scene) -> Parts:
@@ -101,6 +104,18 @@ class RegionSensor(Sensor):
             sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
             self._flips = Flips(scene.body, np.array(sums).T / count[:, None] - scene.body.tree.rest)
         return self._flips
+
+    def limbs(self, scene: Scene) -> Limbs:
+        """Limbs of the body that may be sought."""
+        if self._limbs is None:
+            self._limbs = Limbs(scene.body, scene.surface.morphing.mesh, self.parts(scene).label)
+        return self._limbs
+
+    def turn(self, told: Evidence, limbs: Limbs) -> int:
+        """Which limb is to be sought: one that is lost, else each in its turn."""
+        self._turn += 1
+        poor = [k for k, limb in enumerate(limbs.segments) if (told.quality[limb] < 0.5).any()]
+        return poor[self._turn % len(poor)] if poor else self._turn % len(limbs.segments)
 
     def due(self, time: float) -> bool:
         """Whether limbs are to be mirrored again at a time [s]."""
@@ -289,7 +304,12 @@ class RegionMeasurement(Measurement):
             return found
         if any(m.depth_image() is not None for m in scene.measurements):
             return found
-        return of.flips(scene).near(scene.state, information, self._judged, camera)[: of.regions.flips]
+        flips = list(of.flips(scene).near(scene.state, information, self._judged, camera))
+        limbs = of.limbs(scene)
+        limb = of.turn(told, limbs)
+        sought = limbs.sought(limb, self._judged, list(of.flips(scene).of(self._judged, camera)), seen, camera)
+        leapt = [sought] if np.abs(sought.angles - self._judged.angles).max() > 0.0 else []
+        return [*flips[: of.regions.flips], *leapt, *of.flips(scene).untwisted(self._judged, limbs.segments[limb])]
 
     def better(self, new: Scene, old: Scene) -> bool | None:
         """Of a body of parts: whether the colours of all its pixels say so."""
