@@ -115,8 +115,8 @@ def look_up(image, bins, table, own, total, general, inner, floor, most, anchor,
 
 @jit
 def profiles(
-    image, bins, table, logs, anchor, contour, face, label, left, top, scale, joined, own, beyond, half, step, guard, most,
-    out,
+    image, bins, table, logs, anchor, contour, face, label, left, top, scale, joined, own, beyond, half, step, guard,
+    most, out,
 ):  # fmt: skip
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 

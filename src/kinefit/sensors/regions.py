@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.correspondences import _kernels, _kernels_outlines
 from kinefit.correspondences.morphed import morphed_outline_rows
 from kinefit.correspondences.rims import Rim
@@ -58,11 +59,13 @@ class RegionSensor(Sensor):
     ----------
     camera : Camera, whose name frames bear; the sensor's own is "region CAMERA".
     sigma : float [px] standard deviation of the contour, shape of the body included, in the camera's image.
+        None for `TrackSettings.region` of a body of meshes, and `shape` of one of simple shapes where it is first seen.
     settings : TrackSettings
     """
 
-    def __init__(self, camera: Camera, sigma: float, settings: TrackSettings) -> None:
-        self.name, self.camera, self.sigma = f"region {camera.name}", camera, sigma
+    def __init__(self, camera: Camera, sigma: float | None, settings: TrackSettings) -> None:
+        self.name, self.camera = f"region {camera.name}", camera
+        self.sigma, self._stated = settings.region if sigma is None else sigma, sigma is not None
         self.settings, self.regions = settings, settings.regions
         self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
         self.colours = RegionColours.none(self.count, self.regions)
@@ -98,6 +101,10 @@ class RegionSensor(Sensor):
             problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
             raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
         m = RegionMeasurement(self, frame, scene)
+        if not self._stated:
+            self._stated = True
+            if scene.body.skin is not None or any(isinstance(s, TaperedCylinder) for s in scene.body.surfaces):
+                self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
         if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
@@ -156,6 +163,12 @@ class RegionMeasurement(Measurement):
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+
+    def pixels_per_metre(self, scene: Scene) -> float:
+        """[px/m] at the body's distance."""
+        camera = scene.placed(self.of.camera)
+        z = float(np.median(scene.pose.vertices[::_FEW] @ camera.T_camera_world[2, :3])) + camera.T_camera_world[2, 3]
+        return float(camera.matrix[0, 0]) / max(z, 0.1)
 
     def off(self, scene: Scene) -> float:
         """[px] how far the body is from where it was expected, at most."""
@@ -246,7 +259,7 @@ class RegionMeasurement(Measurement):
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas, camera = self.rim(scene), scene.surface.areas, scene.placed(self.of.camera)
+        rim, areas = self.rim(scene), scene.surface.areas
         if self._told is not None and self._told[0] is rim:
             return self._told[1]
         told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
@@ -255,10 +268,8 @@ class RegionMeasurement(Measurement):
         tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < agrees
         agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))
         contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
-        T, focal = camera.T_camera_world, camera.matrix[0, 0]
-        depth = max(float(np.median(scene.pose.vertices[::_FEW] @ T[2, :3])) + T[2, 3], 0.1)
         spacing = self._spacing / self._drawn(scene).scale
-        whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
+        whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
         self._told = rim, out
         return out
