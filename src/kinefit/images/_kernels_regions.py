@@ -105,8 +105,8 @@ def _found(table, own, total, general, inner, floor, most, a, b):
 
 @jit
 def profiles(
-    image, bins, table, counts, total, general, inner, floor, most, logs, anchor, contour, face, label, left, top, scale,
-    joined, own, beyond, half, step, guard, out,
+    image, bins, table, counts, total, general, inner, floor, most, logs, anchor, contour, face, label, left, top,
+    scale, joined, own, beyond, half, step, guard, out,
 ):  # fmt: skip
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 

@@ -36,7 +36,7 @@ def parzen_density(count: NDArray) -> NDArray:
 
 def mixture_density(count: NDArray) -> NDArray:
     """The same of a mixture of Gaussians, fitted by expectation and maximisation."""
-    every = (np.stack(np.indices(_GRID), axis=-1).reshape(-1, 3) + 0.5) * _CELL
+    every = (np.indices(_GRID).reshape(3, -1).T + 0.5) * _CELL
     used = np.flatnonzero(count)
     x, n, share = every[used], count[used][:, None], np.zeros((len(used), _GAUSSIANS))
     of = np.minimum(np.cumsum(n) / max(n.sum(), 1.0), 0.999) * _GAUSSIANS  # to begin with equal numbers by lightness

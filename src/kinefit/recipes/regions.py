@@ -7,8 +7,8 @@
    squares (eqs. 6, 7).
 4. Again, until the pose's average change over up to three iterations is below ε. Energy (8) is told, not minimised.
 
-The tracker (`[[region]]` in a take) beside it takes the likelihood of all places along a line in place of a sign, counts
-colours near each place of the contour and by parts of the body, weighs outliers down, predicts, and judges.
+The tracker (`[[region]]` in a take) beside it takes the likelihood of all places along a line in place of a sign,
+counts colours near each place of the contour and by parts of the body, weighs outliers down, predicts, and judges.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.correspondences import _kernels, _kernels_outlines
 from kinefit.correspondences.morphed import morphed_outline_rows
 from kinefit.correspondences.rims import Rim
@@ -29,12 +30,10 @@ from kinefit.observations import ColourFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_image import Coloured, kept
-from kinefit.sensors.region_limbs import Limbs
 from kinefit.sensors.region_parts import Drawn, Lines, Parts
 from kinefit.sensors.region_seams import SPACING, Seams
-from kinefit.sensors.region_search import Seeker, region_starts
+from kinefit.sensors.region_starts import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
@@ -65,23 +64,21 @@ class RegionSensor(Sensor):
     ----------
     camera : Camera, whose name frames bear; the sensor's own is "region CAMERA".
     sigma : float [px] standard deviation of the contour, shape of the body included, in the camera's image.
+        None for `TrackSettings.region` of a body of meshes, and `shape` of one of simple shapes where it is first seen.
     settings : TrackSettings
     """
 
-    def __init__(self, camera: Camera, sigma: float, settings: TrackSettings) -> None:
-        self.name, self.camera, self.sigma = f"region {camera.name}", camera, sigma
+    def __init__(self, camera: Camera, sigma: float | None, settings: TrackSettings) -> None:
+        self.name, self.camera = f"region {camera.name}", camera
+        self.sigma, self._stated = settings.region if sigma is None else sigma, sigma is not None
         self.settings, self.regions = settings, settings.regions
         self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
         self.colours = RegionColours.none(self.count, self.regions)
         self.ratios: Ratios | None = None
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
-        self._seeker: Seeker | None = None
+        self._starts: Starts | None = None
         self._learnt = -np.inf  # [s] when colours were blended in last
-        self._flips: Flips | None = None
-        self._limbs: Limbs | None = None
-        self._turn = 0
-        self._flipped = -np.inf  # [s] when limbs were mirrored last
 
     def parts(self, scene: Scene) -> Parts:
         """Parts of the body that have colours of their own."""
@@ -89,39 +86,11 @@ class RegionSensor(Sensor):
             self._parts = Parts(scene.body, scene.surface.morphing.mesh, self.regions.anchors, self.regions.parts)
         return self._parts
 
-    def seeker(self, scene: Scene) -> Seeker:
-        """What draws a coarse mesh of the body."""
-        if self._seeker is None:
-            mesh = scene.surface.morphing.mesh
-            self._seeker = Seeker(mesh.vertices, mesh.faces)
-        return self._seeker
-
-    def flips(self, scene: Scene) -> Flips:
-        """Limbs of the body that may be mirrored."""
-        if self._flips is None:
-            mesh = scene.surface.morphing.mesh
-            count = np.maximum(np.bincount(mesh.segment, minlength=len(scene.body.tree.segments)), 1)
-            sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
-            self._flips = Flips(scene.body, np.array(sums).T / count[:, None] - scene.body.tree.rest)
-        return self._flips
-
-    def limbs(self, scene: Scene) -> Limbs:
-        """Limbs of the body that may be sought."""
-        if self._limbs is None:
-            self._limbs = Limbs(scene.body, scene.surface.morphing.mesh, self.parts(scene).label)
-        return self._limbs
-
-    def turn(self, told: Evidence, limbs: Limbs) -> int:
-        """Which limb is to be sought: one that is lost, else each in its turn."""
-        self._turn += 1
-        poor = [k for k, limb in enumerate(limbs.segments) if (told.quality[limb] < 0.5).any()]
-        return poor[self._turn % len(poor)] if poor else self._turn % len(limbs.segments)
-
-    def due(self, time: float) -> bool:
-        """Whether limbs are to be mirrored again at a time [s]."""
-        late = not abs(time - self._flipped) < self.settings.search_every - 1e-6
-        self._flipped = time if late else self._flipped
-        return late
+    def starts(self, scene: Scene) -> Starts:
+        """What the body is sought with."""
+        if self._starts is None:
+            self._starts = Starts(scene, self.parts(scene).label, self.settings)
+        return self._starts
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
         """The image with what is known of colours; before anything is known they are those at the scene's state.
@@ -137,6 +106,10 @@ class RegionSensor(Sensor):
             problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
             raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
         m = RegionMeasurement(self, frame, scene)
+        if not self._stated:
+            self._stated = True
+            if scene.body.skin is not None or any(isinstance(s, TaperedCylinder) for s in scene.body.surfaces):
+                self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
         if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
@@ -198,6 +171,12 @@ class RegionMeasurement(Measurement):
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+
+    def pixels_per_metre(self, scene: Scene) -> float:
+        """[px/m] at the body's distance."""
+        camera = scene.placed(self.of.camera)
+        z = float(np.median(scene.pose.vertices[::_FEW] @ camera.T_camera_world[2, :3])) + camera.T_camera_world[2, 3]
+        return float(camera.matrix[0, 0]) / max(z, 0.1)
 
     def off(self, scene: Scene) -> float:
         """[px] how far the body is from where it was expected, at most."""
@@ -282,7 +261,7 @@ class RegionMeasurement(Measurement):
         """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
         of, s, none = self.of, self.of.regions, np.zeros(0)
         parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
-        if parts.count == 1 or seen is None or self.image is None:
+        if parts.count == 1 or seen is None or self.image is None or not scene.surface.morphing.is_rigid:
             return None, none, none
         drawn = self._drawn(scene)
         seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
@@ -292,28 +271,26 @@ class RegionMeasurement(Measurement):
         return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Where colours alone show the body, if it is expected too roughly, or not where it was found; limbs mirrored."""
-        of, seen, camera = self.of, self.seen, scene.placed(self.of.camera)
+        """Where colours alone show the body, if it is expected too roughly, or not where it was found.
+
+        Of a body of parts that nothing else was measured of, also where its limbs may be.
+        """
+        of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
         if self.image is None or seen is None or not of.settings.search:
             return ()
-        found = region_starts(
-            scene, camera, of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
-            of.regions.search, rigid=len(scene.body.tree.segments) == 1,
-        )  # fmt: skip
-        if found or information is None or self._judged is None or not of.due(self.time):
-            return found
-        if any(m.depth_image() is not None for m in scene.measurements):
-            return found
-        flips = list(of.flips(scene).near(scene.state, information, self._judged, camera))
-        limbs = of.limbs(scene)
-        limb = of.turn(told, limbs)
-        sought = limbs.sought(limb, self._judged, list(of.flips(scene).of(self._judged, camera)), seen, camera)
-        leapt = [sought] if np.abs(sought.angles - self._judged.angles).max() > 0.0 else []
-        return [*flips[: of.regions.flips], *leapt, *of.flips(scene).untwisted(self._judged, limbs.segments[limb])]
+        whole = of.starts(scene).whole(scene, camera, seen, information, told)
+        if whole or information is None or found is None or not self._alone(scene):
+            return whole
+        return of.starts(scene).limbs(scene, camera, seen, information, told, found, self.time)
+
+    def _alone(self, scene: Scene) -> bool:
+        """Whether nothing else was measured of a body of rigid parts: its colours alone then tell where limbs are."""
+        rigid = scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1
+        return rigid and len(scene.measurements) == 1
 
     def better(self, new: Scene, old: Scene) -> bool | None:
         """Of a body of parts: whether the colours of all its pixels say so."""
-        if self.of.parts(new).count == 1 or self.image is None:
+        if self.image is None or not self._alone(new):
             return None
         gain = self._explained(new) - self._explained(old)
         self._last = None  # what was drawn last is neither
@@ -328,7 +305,7 @@ class RegionMeasurement(Measurement):
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas, camera = self.rim(scene), scene.surface.areas, scene.placed(self.of.camera)
+        rim, areas = self.rim(scene), scene.surface.areas
         self._judged = scene.state
         if self._told is not None and self._told[0] is rim:
             return self._told[1]
@@ -338,10 +315,8 @@ class RegionMeasurement(Measurement):
         tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < agrees
         agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))
         contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
-        T, focal = camera.T_camera_world, camera.matrix[0, 0]
-        depth = max(float(np.median(scene.pose.vertices[::_FEW] @ T[2, :3])) + T[2, 3], 0.1)
         spacing = self._spacing / self._drawn(scene).scale
-        whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
+        whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
         self._told = rim, out
         return out
