@@ -2,8 +2,8 @@
 
 `KINEFIT_SCENE` names the folder with `body10/` and `body10occl/`, written by the scene's own generator. ADD is the mean
 distance of a part's vertices from their true place; a part is lost above 100 mm and found below 50 mm. As with M3T,
-tracking starts at the truth. Settings (`SETTINGS`, `SIGMA`) were chosen on the generator's seed 7; figures are to be told
-of another seed and motion.
+tracking starts at the truth. Settings (`SETTINGS`, `SIGMA`) were chosen on the generator's seed 7; figures are to be
+told of another seed and motion.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker
 
 BOTH, COLOUR, DEPTH = ("depth", "region"), ("region",), ("depth",)
-# Ten meshes that are exact to parts of a millimetre: contours are alike over few pixels only, and there are many of them.
+# Ten meshes that are exact to parts of a millimetre: errors of contours are alike over few pixels only, and small.
 SETTINGS = TrackSettings(regions=RegionSettings(lines=400, alike=8.0))
 SIGMA = {"region depth": 0.25}  # [px]
 _GOALS = (

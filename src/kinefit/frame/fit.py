@@ -15,7 +15,7 @@ from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.prediction import belief, forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
-from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
+from kinefit.frame.trust import forgotten, holding, leapt, left_out, levered, moving, observed, unseen
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
@@ -29,7 +29,6 @@ from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
-_LEAP = 4.0  # deviations of a prediction, beyond which a start is not held by it
 _OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
 _ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wide: the next one begins there
 
@@ -113,16 +112,13 @@ class FrameFit:
         released: NDArray | None = None
         for m, one in zip(measurements, list(told)):
             for state in m.starts(scene, None if held is None else held[1], one):
-                free = None if held is None else _leapt(held, state)
-                let = held if held is None or free is None else (held[0], forgetting(held[1], free))
-                other = self._fitted(scene.at(state), let, measurements)
+                free = None if held is None else leapt(*held, state)
+                other = self._fitted(scene.at(state), _without(held, free), measurements)
                 also = evidence_of(other.scene, other.matched)
                 better = m.better(other.scene, found.scene)
                 if sum(e.balance for e in also) > sum(e.balance for e in told) if better is None else better:
                     found, told, released = other, also, free
-        if held is not None and released is not None:
-            held = held[0], forgetting(held[1], released)
-        return replace(self._judged(found, held, told, known), released=released)
+        return replace(self._judged(found, _without(held, released), told, known), released=released)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
         settled = all(m.settled for m in measurements)
@@ -347,12 +343,8 @@ def weaker(rows: AnyRows, factor: float) -> AnyRows:
     return replace(rows, weight=rows.weight / factor**2)
 
 
-def _leapt(held: Held, state: BodyState) -> NDArray | None:
-    """(n,) bool: angles that a start has changed by more than the prediction allows; None where there are none."""
-    off, std = held[0].difference(state), np.sqrt(np.diag(inverse(held[1])))
-    out = np.abs(off) > _LEAP * std
-    out[:6] = False
-    return out if out.any() else None
+def _without(held: Held | None, free: NDArray | None) -> Held | None:
+    return held if held is None or free is None else (held[0], forgetting(held[1], free))
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

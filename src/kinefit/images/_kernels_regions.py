@@ -115,9 +115,10 @@ def profiles(
     counts (2, A, B) of pixels inside and outside near each anchor, and general (G + 1, B) of each part of the body, and
     last of what is outside, of which anchors have the parts inner (A,); both divided by total (2, A), and `floor` added
     to both densities. Where the anchor is -1 the point lies before another part of the body, and the ratio is that of
-    both parts, of whose densities the logarithms are logs (G + 1, B). face (h, w) is the body as drawn, label (T,) the part of each face, see `count`. Where a line leaves
-    what is `joined` (G + 1, G + 1, the last one what is around the body) with its point's part own (N,) inside, or
-    beyond (N,) outside, it tells nothing any more (0); `guard` [px] about the contour always tell.
+    both parts, of whose densities the logarithms are logs (G + 1, B). face (h, w) is the body as drawn, label (T,) the
+    part of each face, see `count`. Where a line leaves what is `joined` (G + 1, G + 1, the last one what is around the
+    body) with its point's part own (N,) inside, or beyond (N,) outside, it tells nothing any more (0); `guard` [px]
+    about the contour always tell.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):

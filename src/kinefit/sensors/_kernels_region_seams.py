@@ -15,8 +15,8 @@ def borders(face, depth, segment, part, gap, every, out):
     """Pairs of neighbouring pixels of two parts that meet: how many were written.
 
     face, depth (h, w) [m] as drawn; segment, part (T,) of each face: the pair's parts differ, and their depths do by
-    `gap` [m] at most. One in `every` such pairs is kept: out (N, 6) is face one, face two (of the segment with the higher
-    number first), column and row between them, and the direction from the first to the second.
+    `gap` [m] at most. One in `every` such pairs is kept: out (N, 6) is face one, face two (of the segment with the
+    higher number first), column and row between them, and the direction from the first to the second.
     """
     height, width = face.shape
     n, seen = 0, 0
@@ -57,10 +57,10 @@ def _plane(vertices, faces, f):
 
 @jit
 def seams(camera, vertices, faces, found, uv, ray, least, outline, point, pulls):
-    """Points of the curves in which triangles of two parts cut each other: how many of `found` (N, 6) were kept, in front.
+    """Points of the curves in which triangles of two parts cut each other: how many of `found` (N, 6) were kept.
 
-    camera packed; vertices (V, 3) [m] in the world; uv (N, 2) [px] where the curve is about, ray (N, 3) [m] the point of
-    the surface there. Planes at a smaller angle than its sine `least` are left out. outline (4, N): pixel and unit
+    camera packed; vertices (V, 3) [m] in the world; uv (N, 2) [px] where the curve is about, ray (N, 3) [m] the point
+    of the surface there. Planes at a smaller angle than its sine `least` are left out. outline (4, N): pixel and unit
     normal, away from the first part; point (N, 3) [m]; pulls (2, N, 3) [px/m]: the seam moves along its normal by
     pulls[0] · dx of the first part's point and pulls[1] · dx of the second part's.
     """

@@ -83,7 +83,7 @@ class Flips:
         for s in np.flatnonzero(leans & (self.body.tree.parents >= 0)):
             below = self._below(int(s))
             targets = np.array(ends)
-            targets[[s, *below]] += shift[s]
+            targets[[int(s), *below]] += shift[s]
             yield from self._turned(state, int(s), below, targets)
             if len(below) and leans[below].any():
                 targets = targets.copy()

@@ -38,8 +38,8 @@ class Coloured:
         """(N, 2 half) log ratios along the normals of a contour; see `kernels.profiles`."""
         out, r = np.empty((len(lines.anchor), 2 * half)), self.ratios
         kernels.profiles(
-            self.image, self.bins, *r.packed, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond, half,
-            step, guard, out,
+            self.image, self.bins, *r.packed, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond,
+            half, step, guard, out,
         )  # fmt: skip
         return out
 

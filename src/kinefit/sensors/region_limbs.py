@@ -1,8 +1,8 @@
 """A limb is sought where the colours of a body's parts show it: poses are drawn, and what each explains is summed.
 
-With the densities of all parts fixed, an image's likelihood under a pose is, but for a constant, the sum over all pixels
-of the logarithm of p_k / p, with p_k of the part that is drawn at a pixel and p of what is around the body (P3, eq. 8,
-for several regions). It needs no correspondences, and tells poses apart whose contours all agree with some edge.
+With the densities of all parts fixed, an image's likelihood under a pose is, but for a constant, the sum over all
+pixels of the logarithm of p_k / p, with p_k of the part that is drawn at a pixel and p of what is around the body (P3,
+eq. 8, for several regions). It needs no correspondences, and tells poses apart whose contours all agree with some edge.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Seams: where parts of different colours run into each other, a sleeve's end at an elbow, a robot's link in the next.
 
 No contour shows how far a limb that points at the camera reaches; the seam at its joint does. It is the curve in which
-the surfaces of two parts cut each other, and it moves with both: a point of it stays on both surfaces, so that with the
-normals a and b of these, moving by dx_a and dx_b, and the seam's normal in the image, g = α a + β b as the derivative of
-the pixel along it, it moves by α a·dx_a + β b·dx_b.
+the surfaces of two parts cut each other, and it moves with both: a point of it stays on both surfaces. With a and b the
+normals of these, which move by dx_a and dx_b there, and with g = α a + β b the derivative of the pixel along the seam's
+normal in the image, the seam moves by α a·dx_a + β b·dx_b.
 """
 
 from __future__ import annotations
