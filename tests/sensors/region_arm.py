@@ -1,4 +1,4 @@
-"""An arm of three parts of different colours, each an OBJ file, painted before a patterned wall, for tests of regions."""
+"""An arm of three coloured parts, each an OBJ file, painted before a patterned wall, for tests of regions."""
 
 import tempfile
 from functools import cache

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.images._kernels_regions import UNKNOWN
 
+_THIN = 10.0  # [counted pixels] that the whole body's colours weigh as much as in those of a part: few for a hand
 _FLOOR = 0.02  # share of both densities that is even over all colours: paint that was not seen yet, noise, reflections
 
 
@@ -172,7 +173,7 @@ class RegionColours:
         n, outside = self.inside.shape[1], s.far * self.far + (1 - s.far) * self.near
         total = self.pixels.sum()
         body = self.pixels @ self.inside / total if total > 0.0 else np.full(n, 1.0 / n)
-        parts = (self.pixels[:, None] * self.inside + s.spread * body) / (self.pixels + s.spread)[:, None]
+        parts = (self.pixels[:, None] * self.inside + _THIN * body) / (self.pixels + _THIN)[:, None]
         general, floor = np.concatenate([parts, outside[None]]), _FLOOR / n
 
         def ratio(inside: NDArray) -> NDArray:

@@ -38,6 +38,7 @@ _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it
 # A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
 # after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
 _FIRST, _OFTEN = 10, 0.05
+_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -118,10 +119,10 @@ class RegionSensor(Sensor):
         if not isinstance(measurement, RegionMeasurement):
             return
         told = measurement.evidence(scene)
-        parts, wrong = self.parts(scene), told.lost
+        parts, wrong = self.parts(scene), told.lost | told.hidden
         seen = float((told.agreeing + told.contrary).sum())
         if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
-            sure = float(told.agreeing.sum()) > _LEARNT * seen
+            sure = float(told.agreeing.sum()) > _LEARNT * seen and measurement.clear > _CLEAR
         if not sure or told.hidden.all():
             self.reach = _WIDE
             return
@@ -149,6 +150,7 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
+    clear : share of the outline's lines that tell anything at the state that was judged last
     """
 
     settled = False
@@ -165,6 +167,7 @@ class RegionMeasurement(Measurement):
         self._lines: Lines | None = None
         self._told: tuple[Rim, Evidence] | None = None
         self._judged: BodyState | None = None
+        self.clear = 0.0
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -183,10 +186,11 @@ class RegionMeasurement(Measurement):
         """The occluding contour at a scene's state, of parts before others too; kept for the state asked for last."""
         vertices, camera = scene.pose.vertices, scene.placed(self.of.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera:
-            finder = scene.surface.rims(camera)
+            finder, others = scene.surface.rims(camera), [s for s in scene.others if s.body.surfaces]
             rim = finder.find(
-                vertices, camera, spacing=self._spacing or 1.0, inner=self.of.parts(scene).count > 1, stale=_STALE,
-                close=self.of.settings.outline,
+                vertices, camera, spacing=self._spacing or 1.0, inner=self.of.parts(scene).count > 1,
+                stale=0.0 if others and self._last is None else _STALE, close=self.of.settings.outline,
+                others=[(s.pose.vertices, s.surface.morphing.mesh.faces) for s in others],
             )  # fmt: skip
             if not self._spacing:  # the first look tells how long the contour is
                 self._spacing = max(len(rim) / self.of.regions.lines, 1.0)
@@ -315,7 +319,7 @@ class RegionMeasurement(Measurement):
         spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self._told = rim, out
+        self._told, self.clear = (rim, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
         return out
 
     def compact(self) -> RegionMeasurement:
