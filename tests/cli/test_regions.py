@@ -1,10 +1,15 @@
 """A real hand-held object by its colours, through the command."""
 
+import cv2
 import numpy as np
+import pytest
 from click.testing import CliRunner
 
-from kinefit import read_motion
+from kinefit import read_calibration, read_motion
+from kinefit.bodies import BodyState
+from kinefit.bodies.surfaces import body_mesh
 from kinefit.cli import main
+from kinefit.rendering import render_body, scaled
 
 FRAMES = 9
 
@@ -38,3 +43,36 @@ def test_a_real_object_is_followed_by_its_mesh(tmp_path, data_dir):
     assert np.degrees(turn).max() < 10.0 and np.degrees(np.median(turn)) < 6.0  # the truth is good to some degrees here
     assert motion.quality.min() > 0.4
     assert list((tmp_path / "out" / "overlays").glob("*.mp4"))
+
+
+@pytest.mark.slow
+def test_a_real_person_is_followed_by_colours_after_the_first_frame(tmp_path, data_dir):
+    """Two cameras, keypoints of the first frame alone, no masks."""
+    folder = data_dir("video_balancing_4cam")
+    text = "[take]\nheight = 1.75\nframes = [0, 4]\n"
+    text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
+    for camera in ("cam03", "cam04"):
+        text += (
+            f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n[[region]]\ncamera = "{camera}"\n'
+            f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/openpose_json/{camera}"\nset = "BODY_25B"\n'
+            'frames = [0, 1]\n'
+        )
+    (tmp_path / "take.toml").write_text(text)
+    told = CliRunner().invoke(
+        main, ["track", str(tmp_path / "take.toml"), "-o", str(tmp_path / "out"), "--formats", "motion", "--no-report",
+               "--no-overlays"],
+    )  # fmt: skip
+    assert told.exit_code == 0, told.output
+    motion = read_motion(tmp_path / "out" / "motion.npz")
+    assert motion.quality.min() > 0.6
+    mesh, shares = body_mesh(motion.body), []
+    for camera in read_calibration(folder / "Calib_refined_static.toml", unit="m"):
+        if camera.name not in ("cam03", "cam04"):
+            continue
+        small = scaled(camera, 0.25)
+        state = BodyState(motion.Ts_world_root[3], motion.angles[3])
+        seen = render_body(motion.body, state, small, mesh=mesh).seen
+        mask = cv2.imread(str(folder / "person_masks" / camera.name / "003.png"), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.resize(mask, small.size, interpolation=cv2.INTER_AREA) > 127
+        shares.append((seen & mask).sum() / (seen | mask).sum())
+    assert min(shares) > 0.8

@@ -11,6 +11,10 @@ RANDOM = np.random.default_rng(4)
 IMAGE = RANDOM.integers(0, 256, (60, 80, 3), dtype=np.uint8)
 FACE = np.full((40, 50), -1, np.int32)
 FACE[10:30, 12:35] = 7
+FACE[10:30, 24:35] = 8
+FACE[20:26, 33:44] = -2  # something else
+LABEL = np.array([0] * 8 + [1])  # part of each triangle
+JOINED = np.eye(3, dtype=bool)
 WINDOW = (5.0, 8.0, 0.8)  # left, top, scale
 
 
@@ -23,7 +27,8 @@ def drawn(x, y):
     left, top, scale = WINDOW
     i, j = np.floor((x - left + 0.5) * scale).astype(int), np.floor((y - top + 0.5) * scale).astype(int)
     ok = (i >= 0) & (i < FACE.shape[1]) & (j >= 0) & (j < FACE.shape[0])
-    return ok & (FACE[np.clip(j, 0, FACE.shape[0] - 1), np.clip(i, 0, FACE.shape[1] - 1)] >= 0)
+    face = np.where(ok, FACE[np.clip(j, 0, FACE.shape[0] - 1), np.clip(i, 0, FACE.shape[1] - 1)], -1)
+    return np.where(face >= 0, LABEL[face], face)
 
 
 @pytest.mark.parametrize("space", ["lab", "rgb"])
@@ -48,18 +53,18 @@ def test_bins_in_lab_follow_lab():
 def test_pixels_are_counted_where_they_lie():
     bins, count = colour_bins("rgb", 8)
     box = np.array([4, 6, 70, 55])
-    told = np.zeros((3, count))
-    kernels.count(IMAGE, bins, FACE, *WINDOW, box, *told)
-    expected, of = np.zeros((3, count)), bins[number(IMAGE)]
+    told = np.zeros((4, count))
+    kernels.count(IMAGE, bins, FACE, LABEL, *WINDOW, box, told[:2], *told[2:])
+    expected, of = np.zeros((4, count)), bins[number(IMAGE)]
     for y in range(60):
         for x in range(80):
             near = box[0] <= x < box[2] and box[1] <= y < box[3]
             if not near and y % 6 == 0 and x % 6 == 0:
-                expected[2, of[y, x]] += 1
+                expected[3, of[y, x]] += 1
             if near and (y - box[1]) % 3 == 0 and (x - box[0]) % 3 == 0:
                 here = drawn(np.array([x, x - 2, x + 2, x, x]), np.array([y, y, y, y - 2, y + 2]))
-                if (here == here[0]).all():
-                    expected[0 if here[0] else 1, of[y, x]] += 1
+                if (here == here[0]).all() and here[0] > -2:
+                    expected[here[0] if here[0] >= 0 else 2, of[y, x]] += 1
     np.testing.assert_array_equal(told, expected)
     assert (expected.sum(axis=1) > 10).all()
 
@@ -72,11 +77,18 @@ def contour(count=30):
 
 def test_profiles_are_sums_of_log_ratios_along_the_normals():
     bins, count = colour_bins("rgb", 8)
-    lines, anchor = contour(), RANDOM.integers(0, 3, 30)
-    table = RANDOM.normal(size=(3, count)).astype(np.float32)
-    half, step, guard = 5, 2, 3.0
+    lines, anchor = contour(), RANDOM.integers(-1, 3, 30)
+    own, beyond = RANDOM.integers(0, 2, 30), np.full(30, -1)
+    beyond[anchor < 0] = 1 - own[anchor < 0]
+    table, logs = RANDOM.normal(size=(3, count)).astype(np.float32), RANDOM.normal(size=(2, count)).astype(np.float32)
+    half, step, guard, most = 5, 2, 3.0, 1.5
     out = np.empty((30, 2 * half))
-    kernels.profiles(IMAGE, bins, table, anchor, lines, FACE, *WINDOW, half, step, guard, out)
+    known = np.zeros((2, 3, 1), np.float32), np.ones((2, 3)), np.zeros((2, count)), np.zeros(3, np.int64), 0.0, most
+    kernels.profiles(
+        IMAGE, bins, table, *known, logs, anchor, lines, FACE, LABEL, *WINDOW, JOINED, own, beyond, half, step, guard,
+        out,
+    )  # fmt: skip
+    between = np.clip(logs[own] - logs[beyond], -most, most)
     expected = np.zeros_like(out)
     for p in range(30):
         for side in (0, 1):
@@ -88,10 +100,11 @@ def test_profiles_are_sums_of_log_ratios_along_the_normals():
                     x, y = lines[0, p] + s * lines[2, p], lines[1, p] + s * lines[3, p]
                     i, j = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
                     outside = not (0 <= i < 80 and 0 <= j < 60)
-                    other = abs(s) > guard and bool(drawn(np.array(x), np.array(y))) == (side == 1)
+                    other = abs(s) > guard and drawn(np.array(x), np.array(y)) != (beyond if side else own)[p]
                     ended = ended or outside or other
                     if not ended:
-                        expected[p, k] += table[anchor[p], bins[number(IMAGE)[j, i]]]
+                        row = between[p] if anchor[p] < 0 else table[anchor[p]]
+                        expected[p, k] += row[bins[number(IMAGE)[j, i]]]
     np.testing.assert_allclose(out, expected, atol=1e-5)
 
 
@@ -138,25 +151,30 @@ def statistics(own=True):
     def lines(weight, into):
         into += weight.astype(np.float32)[:, None, None] * counts[:2, None].astype(np.float32)
 
-    return s, counts, lines, RegionColours.none(count, s).blended(counts, lines, s)
+    return s, counts, lines, RegionColours.none(count, s).blended(counts[:1], counts[1:], lines, s)
 
 
 def test_the_first_images_count_alike():
     s, counts, lines, colours = statistics()
-    np.testing.assert_allclose(colours.inside, counts[0] / counts[0].sum())
+    np.testing.assert_allclose(colours.inside[0], counts[0] / counts[0].sum())
+    ones = 0.0 * counts + 1.0
     for _ in range(4):
-        colours = colours.blended(0.0 * counts + 1.0, lines, s)
+        colours = colours.blended(ones[:1], ones[1:], lines, s)
     even = 1.0 / counts.shape[1]
     rate = [1 / 2, 1 / 3, 1 / 4, 1 / 5]
     left = np.prod([1 - max(r, s.rate) for r in rate])
-    np.testing.assert_allclose(colours.inside - even, left * (counts[0] / counts[0].sum() - even), atol=1e-12)
+    np.testing.assert_allclose(colours.inside[0] - even, left * (counts[0] / counts[0].sum() - even), atol=1e-12)
 
 
 def test_ratios_are_found_when_they_are_asked_for():
     s, _, _, colours = statistics()
     ratios, (bins, _) = colours.ratios(s), colour_bins(s.space, s.levels)
     lines, anchor = contour(), RANDOM.integers(0, 3, 30)
-    kernels.look_up(IMAGE, bins, *ratios.packed, anchor, lines, 8)
+    own = np.zeros(30, np.int64), np.full(30, -1)
+    kernels.profiles(
+        IMAGE, bins, *ratios.packed, ratios.logs, anchor, lines, FACE, LABEL, *WINDOW, JOINED, *own, 8, 1, 3.0,
+        np.empty((30, 16)),
+    )  # fmt: skip
     a, b = np.nonzero(ratios.table < kernels.UNKNOWN)
     assert 50 < len(a) < ratios.table.size
     np.testing.assert_allclose(ratios.table[a, b], ratios.at(a, b), atol=1e-5)
@@ -167,3 +185,19 @@ def test_one_statistic_of_the_whole_body_is_an_option():
     s, _, _, colours = statistics(own=False)
     ratios = colours.ratios(s)
     np.testing.assert_array_equal(ratios.table, ratios.whole[None])
+
+
+def test_a_part_that_is_hidden_keeps_its_colours_and_one_never_seen_has_the_bodys():
+    s, counts, lines, _ = statistics()
+    parts = RANDOM.integers(0, 50, (3, counts.shape[1])).astype(float)
+    parts[2] = 0.0
+    first = RegionColours.none(counts.shape[1], s, 3).blended(parts, counts[1:], lines, s)
+    later = first.blended(parts * [[1.0], [0.0], [0.0]], counts[1:], lines, s)
+    np.testing.assert_array_equal(later.inside[1], first.inside[1])
+    assert list(later.times) == [2, 1, 0]
+    ratios = later.ratios(s, np.array([0, 1, 2]))
+    body = later.pixels @ later.inside / later.pixels.sum()
+    np.testing.assert_allclose(ratios.general[2], s.spread * body)
+    bins = np.arange(5)
+    told = ratios.between(np.zeros(5, int), np.ones(5, int), bins)
+    np.testing.assert_allclose(told, np.clip(ratios.logs[0, :5] - ratios.logs[1, :5], -s.most, s.most))

@@ -85,7 +85,7 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, i
 
     Edges between a face that looks at the camera and one that does not are the rims; points are put on them `spacing`
     [px] apart. The images of depth and faces tell whether such a point is seen, and what lies behind: nothing (OUTER),
-    or something farther away than `apart` [m] (INNER).
+    or something farther away than `apart` [m] (INNER). Beside what is not the body, face below -1, there are none.
 
     x (V, 3) [m] in the camera's frame and uv (V, 2) [px] of the vertices; faces (T, 3) with label (T,); edges (E, 2)
     with the faces on both sides (E, 2), -1 for none; depth, face (H, W) as drawn; near [m] by which the surface just
@@ -138,7 +138,7 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, i
             z = 1.0 / ((1.0 - t) / x[i, 2] + t / x[j, 2])
             inside, outside = depth[q, p], depth[w, r]
             allowed = 3.0 * near if label[face[q, p]] == label[own] else near
-            if inside < z - allowed or inside > z + near:
+            if inside < z - allowed or inside > z + near or face[w, r] < -1:
                 continue
             if face[w, r] >= 0 and (not inner or outside < z + apart):
                 continue

@@ -7,6 +7,7 @@ and triangle of every pixel, tells whether it is seen, and what is behind it: no
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -21,8 +22,7 @@ from kinefit.rendering import Canvas, Raster
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
 _APART = 0.03  # [m] depth behind a rim from which it is the outline of one part before another, and no crease
-
-
+_OTHER = -2  # in an image of triangles, where there are those of another body
 _MARGIN = 4.0  # [px] of a window about the body
 _CELL = 32  # [px] by which windows grow, so that few canvases serve all of them
 
@@ -148,9 +148,15 @@ class RimFinder:
         assert self._last is not None
         return self._last[2].face
 
+    @property
+    def depth(self) -> NDArray:
+        """(h, w) float32 [m] along the optical axis, of the same window, inf for none."""
+        assert self._last is not None
+        return self._last[2].depth
+
     def find(
         self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
-        close: int | None = None,
+        close: int | None = None, others: Sequence[tuple[NDArray, NDArray]] = (),
     ) -> Rim:  # fmt: skip
         """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world.
 
@@ -162,6 +168,8 @@ class RimFinder:
             with `close`, than all of them together.
         close : int [px], optional
             Only the part of the image that the body fills is drawn, so many pixels wide at most; see `window`.
+        others : vertices (W, 3) [m] in the world and faces (U, 3) of other bodies
+            The body is not seen behind them, has no outline beside them, and the virtual image has -2 where they are.
         """
         x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
@@ -179,6 +187,11 @@ class RimFinder:
             fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
             cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
             drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
+            for vertices, faces in others:
+                there = np.empty((len(vertices), 3))
+                kernels.seen(camera.packed, np.ascontiguousarray(vertices), there, np.empty((len(vertices), 2)))
+                other = Canvas(w.size).draw(there, np.ascontiguousarray(faces, np.int32), fx, fy, cx, cy, cull=True)
+                drawn.face[(other.face >= 0) & (other.depth < drawn.depth)] = _OTHER
             self._last = camera, uv, drawn, w
             self.window = w
         if close is not None:

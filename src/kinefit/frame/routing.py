@@ -187,7 +187,7 @@ class Sensors:
         return ImageLineSensor(own, self.sigma.get(own, s.line), s.loss, s.near)
 
     def _region(self, name: str) -> RegionSensor:
-        return RegionSensor(self.rig[name], self.sigma.get(f"region {name}", self.settings.region), self.settings)
+        return RegionSensor(self.rig[name], self.sigma.get(f"region {name}"), self.settings)
 
     def _silhouette(self, name: str) -> SilhouetteSensor:
         sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)

@@ -23,37 +23,48 @@ def _colour(image, j, i):
 
 
 @jit
-def count(image, bins, face, left, top, scale, box, inside, near, far):
-    """Add pixels of an image (H, W, 3) uint8 to the histograms (B,) of inside, near and far outside: one in nine.
+def count(image, bins, face, label, left, top, scale, box, inside, near, far):
+    """Add pixels of an image (H, W, 3) uint8 to the histograms inside (G, B), near and far outside (B,): one in nine.
 
-    face (h, w) is the body as drawn in a window of the image, -1 where it is not: pixel (x, y) of the image lies at
-    ((x - left + 0.5) scale, (y - top + 0.5) scale). Pixels at its edge count for neither. box: left, top, right, bottom
-    [px] of what is near; of what is far one pixel in 36 is looked at.
+    face (h, w) is the body as drawn in a window of the image, below 0 where it is not: pixel (x, y) of the image lies
+    at ((x - left + 0.5) scale, (y - top + 0.5) scale). label (T,) of each face: the part of the body that it belongs
+    to. Pixels at the edge of a part count for none. box: left, top, right, bottom [px] of what is near; of what is far
+    one pixel in 36 is looked at.
     """
     height, width = image.shape[:2]
     for y in range(0, height, 6):
         for x in range(0, width, 6):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
                 far[bins[_colour(image, y, x)]] += 1.0
+    beside = math.ceil(2.0 * scale) + 1
     for y in range(max(box[1], 0), min(box[3], height), 3):
+        j = math.floor((y - top + 0.5) * scale)
         for x in range(max(box[0], 0), min(box[2], width), 3):
-            here = _drawn(face, x, y, left, top, scale)
-            if _drawn(face, x - 2, y, left, top, scale) != here or _drawn(face, x + 2, y, left, top, scale) != here:
+            i = math.floor((x - left + 0.5) * scale)
+            if not (-beside <= i < face.shape[1] + beside and -beside <= j < face.shape[0] + beside):
+                near[bins[_colour(image, y, x)]] += 1.0
                 continue
-            if _drawn(face, x, y - 2, left, top, scale) != here or _drawn(face, x, y + 2, left, top, scale) != here:
+            here = part(face, label, x, y, left, top, scale)
+            if part(face, label, x - 2, y, left, top, scale) != here:
                 continue
-            if here:
-                inside[bins[_colour(image, y, x)]] += 1.0
-            else:
+            if part(face, label, x + 2, y, left, top, scale) != here:
+                continue
+            if part(face, label, x, y - 2, left, top, scale) != here:
+                continue
+            if part(face, label, x, y + 2, left, top, scale) != here:
+                continue
+            if here >= 0:
+                inside[here, bins[_colour(image, y, x)]] += 1.0
+            elif here == -1:
                 near[bins[_colour(image, y, x)]] += 1.0
 
 
 @jit
-def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, weight, own):
-    """Add the pixels along the normals of a contour (4, N) to the histograms own (2, A, B) of its points' anchors (N,).
+def count_lines(image, bins, contour, anchor, reach, face, label, left, top, scale, joined, own, weight, counts):
+    """Add the pixels along the normals of a contour (4, N) to the histograms (2, A, B) of its points' anchors (N,).
 
     weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for
-    neither. face, left, top, scale as of `count`.
+    neither. face, label, left, top, scale as of `count`, joined and own (N,) as of `profiles`.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -61,60 +72,60 @@ def count_lines(image, bins, contour, anchor, reach, face, left, top, scale, wei
         a_ = anchor[p]
         for side in range(2):
             sign = 1.0 if side else -1.0
+            stays = -1 if side else own[p]
             for k in range(2, reach + 2):
                 x, y = u + sign * k * a, v + sign * k * b
                 i, j = math.floor(x + 0.5), math.floor(y + 0.5)
                 if not (0 <= i < width and 0 <= j < height):
                     break
-                if _drawn(face, x, y, left, top, scale) == (side == 1):
+                here = part(face, label, x, y, left, top, scale)
+                if here < -1 or not joined[stays, here]:
                     break
-                bin_ = bins[_colour(image, j, i)]
-                own[side, a_, bin_] += weight[side]
+                counts[side, a_, bins[_colour(image, j, i)]] += weight[side]
 
 
 @jit
-def _drawn(face, x, y, left, top, scale):
-    """Whether the body was drawn at a pixel (x, y) of the image."""
+def part(face, label, x, y, left, top, scale):
+    """Part of the body that was drawn at a pixel (x, y) of the image: -1 where none was, -2 where something else is."""
     i, j = math.floor((x - left + 0.5) * scale), math.floor((y - top + 0.5) * scale)
-    return 0 <= i < face.shape[1] and 0 <= j < face.shape[0] and face[j, i] >= 0
+    if not (0 <= i < face.shape[1] and 0 <= j < face.shape[0]):
+        return -1
+    f = face[j, i]
+    return label[f] if f >= 0 else f
 
 
 @jit
-def look_up(image, bins, table, own, total, general, floor, most, anchor, contour, reach):
-    """Find the log ratios of all colours within `reach` [px] of a contour (4, N) that are UNKNOWN in a table (A, B).
-
-    own (2, A, B) pixels counted inside and outside near each anchor, general (2, B) of the body as a whole, both
-    divided by total (2, A); to both densities `floor` is added; ratios lie between -most and most.
-    """
-    height, width = image.shape[:2]
-    for p in range(contour.shape[1]):
-        u, v, x, y, a = contour[0, p], contour[1, p], contour[2, p], contour[3, p], anchor[p]
-        for k in range(-reach, reach):
-            i, j = math.floor(u + (k + 0.5) * x + 0.5), math.floor(v + (k + 0.5) * y + 0.5)
-            if not (0 <= i < width and 0 <= j < height):
-                continue
-            b = bins[_colour(image, j, i)]
-            if table[a, b] == UNKNOWN:
-                inside = (own[0, a, b] + general[0, b]) / total[0, a] + floor
-                told = math.log(inside / ((own[1, a, b] + general[1, b]) / total[1, a] + floor))
-                table[a, b] = most if told > most else -most if told < -most else told
+def _found(table, own, total, general, inner, floor, most, a, b):
+    """Log ratio of a bin near an anchor, which a table (A, B) keeps from now on; see `profiles`."""
+    inside = (own[0, a, b] + general[inner[a], b]) / total[0, a] + floor
+    told = math.log(inside / ((own[1, a, b] + general[len(general) - 1, b]) / total[1, a] + floor))
+    table[a, b] = most if told > most else -most if told < -most else told
+    return table[a, b]
 
 
 @jit
-def profiles(image, bins, table, anchor, contour, face, left, top, scale, half, step, guard, out):
+def profiles(
+    image, bins, table, counts, total, general, inner, floor, most, logs, anchor, contour, face, label, left, top,
+    scale, joined, own, beyond, half, step, guard, out,
+):  # fmt: skip
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 
     Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log
-    ratios, of which a point has the row of its anchor (N,); `look_up` must have found them. face (h, w) is the body as
-    drawn, see `count`: where a line has left the body on its other side, or met it again, it tells nothing any more
-    (0); `guard` [px] about the contour always tell.
+    ratios between -most and most, of which a point has the row of its anchor (N,). What is UNKNOWN in it is found from
+    counts (2, A, B) of pixels inside and outside near each anchor, and general (G + 1, B) of each part of the body, and
+    last of what is outside, of which anchors have the parts inner (A,); both divided by total (2, A), and `floor` added
+    to both densities. Where the anchor is -1 the point lies before another part of the body, and the ratio is that of
+    both parts, of whose densities the logarithms are logs (G + 1, B). face (h, w) is the body as drawn, label (T,) the
+    part of each face, see `count`. Where a line leaves what is `joined` (G + 1, G + 1, the last one what is around the
+    body) with its point's part own (N,) inside, or beyond (N,) outside, it tells nothing any more (0); `guard` [px]
+    about the contour always tell.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
         u, v, a, b = contour[0, p], contour[1, p], contour[2, p], contour[3, p]
         a_ = anchor[p]
         for side in range(2):
-            ended = False
+            ended, stays = False, beyond[p] if side else own[p]
             for q in range(half):
                 k = half + q if side else half - 1 - q
                 told = 0.0
@@ -126,10 +137,20 @@ def profiles(image, bins, table, anchor, contour, face, left, top, scale, half, 
                         if not (0 <= i < width and 0 <= j < height):
                             ended = True
                             break
-                        if abs(s) > guard and _drawn(face, x, y, left, top, scale) == (side == 1):
-                            ended = True
-                            break
-                        told += table[a_, bins[_colour(image, j, i)]]
+                        if abs(s) > guard:
+                            here = part(face, label, x, y, left, top, scale)
+                            if here < -1 or not joined[stays, here]:
+                                ended = True
+                                break
+                        c = bins[_colour(image, j, i)]
+                        if a_ >= 0:
+                            t = table[a_, c]
+                            if t == UNKNOWN:
+                                t = _found(table, counts, total, general, inner, floor, most, a_, c)
+                            told += t
+                        else:
+                            t = logs[own[p], c] - logs[beyond[p], c]
+                            told += most if t > most else -most if t < -most else t
                 out[p, k] = told
 
 
@@ -207,3 +228,24 @@ def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
                 if face[j, i] >= 0:
                     total += ratios[j, i]
         out[m] = total
+
+
+@jit
+def likelihood(image, bins, logs, face, label, left, top, scale):
+    """How much better a body as it was drawn explains an image than no body does: a sum of log ratios over pixels.
+
+    logs (G + 1, B) of the densities of each part's colours and, last, of what is around; face, label and so on as of
+    `count`. A pixel of the drawing that is larger than the image's counts as many.
+    """
+    total, height, width = 0.0, image.shape[0], image.shape[1]
+    around = len(logs) - 1
+    for j in range(face.shape[0]):
+        y = math.floor((j + 0.5) / scale - 0.5 + top + 0.5)
+        if not 0 <= y < height:
+            continue
+        for i in range(face.shape[1]):
+            x = math.floor((i + 0.5) / scale - 0.5 + left + 0.5)
+            if face[j, i] >= 0 and 0 <= x < width:
+                b = bins[_colour(image, y, x)]
+                total += logs[label[face[j, i]], b] - logs[around, b]
+    return total / (scale * scale)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.images._kernels_regions import UNKNOWN
 
+_THIN = 10.0  # [counted pixels] that the whole body's colours weigh as much as in those of a part: few for a hand
 _FLOOR = 0.02  # share of both densities that is even over all colours: paint that was not seen yet, noise, reflections
 
 
@@ -57,8 +58,11 @@ class RegionSettings:
     ----------
     space : "lab" or "rgb", in which colours are binned
     levels : int, bins along each of the three axes
+    parts : bool
+        Whether colours are counted apart for every segment of the body, left and right together: skin, shirt,
+        trousers. Contours of one before another are then looked at, too, where their colours differ.
     anchors : int
-        Points of the surface near which colours are counted apart; 0 for one statistic of the whole body.
+        Points of the surface near which colours are counted apart; 0 for one statistic of each part alone.
     spread : float [pixels]
         The whole body's statistics weigh as much as so many pixels counted near an anchor.
     rate, near_rate : float in 0..1
@@ -78,11 +82,13 @@ class RegionSettings:
     alike : float [px] of the contour along which errors are alike: as many measurements count as there are such pieces
     lines : int, contour points, about
     loss : float [standard deviations] scale of the robust loss
+    flips : int, mirrored limbs that a fit is begun at, every `TrackSettings.search_every`
     search : SearchSettings
     """
 
     space: Literal["lab", "rgb"] = "lab"
     levels: int = 20
+    parts: bool = True
     anchors: int = 40
     spread: float = 100.0
     rate: float = 0.05
@@ -96,6 +102,7 @@ class RegionSettings:
     alike: float = 15.0
     lines: int = 200
     loss: float = 2.0
+    flips: int = 2
     search: SearchSettings = field(default_factory=SearchSettings)
 
 
@@ -121,8 +128,11 @@ class RegionColours:
 
     Parameters
     ----------
-    inside, near, far : (B,) of the body, of what is near it, of the whole image but the body
+    inside : (G, B) of each part of the body
+    near, far : (B,) of what is near the body, of the whole image but the body
     own : (2, A, B) float32 pixels counted inside and outside near each anchor, older ones weighing less
+    pixels : (G,) counted of each part, a mean over time
+    times : (G,) int, in how many images each part was counted
     images : int, how many went in
     """
 
@@ -130,36 +140,55 @@ class RegionColours:
     near: NDArray
     far: NDArray
     own: NDArray
+    pixels: NDArray
+    times: NDArray
     images: int = 1
 
-    def blended(self, counts: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
-        """With the pixels (3, B) counted in a new image, and those that `lines` counts near the anchors."""
+    def blended(self, inside: NDArray, outside: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
+        """With the pixels of each part (G, B) and outside (2, B) of a new image, and those `lines` counts near anchors.
+
+        A part of which nothing was counted, as it is hidden, stays as it was.
+        """
         share = 1.0 / (self.images + 1)
         rates = np.maximum(np.array([s.rate, s.near_rate]), share)
         own = self.own * (1.0 - rates).astype(np.float32)[:, None, None]
         if own.shape[1]:
             lines(rates, own)
-        old = self.inside, self.near, self.far
-        body, near, far = ((1 - r) * a + r * _density(b) for r, a, b in zip(rates[[0, 1, 1]], old, counts))
-        return RegionColours(body, near, far, own, self.images + 1)
+        near, far = ((1 - rates[1]) * a + rates[1] * _density(b) for a, b in zip((self.near, self.far), outside))
+        total = inside.sum(axis=1)
+        rate = np.where(total > 0.0, np.maximum(s.rate, 1.0 / (self.times + 1)), 0.0)
+        density = inside / np.maximum(total, 1.0)[:, None]
+        body = (1.0 - rate)[:, None] * self.inside + rate[:, None] * density
+        pixels = (1.0 - rate) * self.pixels + rate * total
+        return RegionColours(body, near, far, own, pixels, self.times + (total > 0.0), self.images + 1)
 
     @classmethod
-    def none(cls, bins: int, s: RegionSettings) -> RegionColours:
+    def none(cls, bins: int, s: RegionSettings, parts: int = 1) -> RegionColours:
         """Before the first image."""
-        none = np.zeros(bins)
-        return cls(none, none, none, np.zeros((2, s.anchors, bins), np.float32), 0)
+        none, own = np.zeros(bins), np.zeros((2, s.anchors, bins), np.float32)
+        return cls(np.zeros((parts, bins)), none, none, own, np.zeros(parts), np.zeros(parts, np.int64), 0)
 
-    def ratios(self, s: RegionSettings) -> Ratios:
-        """Log ratios inside to outside."""
-        n, outside = len(self.inside), s.far * self.far + (1 - s.far) * self.near
-        floor, general = _FLOOR / n, np.stack([self.inside, outside])
-        told = np.log((general[0] + floor) / (general[1] + floor))
-        whole = np.ascontiguousarray(np.clip(told, -s.most, s.most), np.float32)
+    def ratios(self, s: RegionSettings, of: NDArray | None = None) -> Ratios:
+        """Log ratios inside to outside; `of` (A,) the part of the body that each anchor lies on, default the first."""
+        n, outside = self.inside.shape[1], s.far * self.far + (1 - s.far) * self.near
+        total = self.pixels.sum()
+        body = self.pixels @ self.inside / total if total > 0.0 else np.full(n, 1.0 / n)
+        parts = (self.pixels[:, None] * self.inside + _THIN * body) / (self.pixels + _THIN)[:, None]
+        general, floor = np.concatenate([parts, outside[None]]), _FLOOR / n
+
+        def ratio(inside: NDArray) -> NDArray:
+            told = np.log((inside + floor) / (outside + floor))
+            return np.ascontiguousarray(np.clip(told, -s.most, s.most), np.float32)
+
+        whole, logs = ratio(body), np.log(general + floor).astype(np.float32)
         if not s.anchors:
-            return Ratios(whole, whole[None], np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), general, floor, s.most)
+            every = np.arange(len(parts))
+            none = np.zeros((2, len(parts), 1), np.float32), np.ones((2, len(parts)))
+            return Ratios(whole, ratio(parts), *none, general, every, floor, s.most, logs)
+        of = np.zeros(s.anchors, np.int64) if of is None else of
         table = np.full(self.own.shape[1:], UNKNOWN, np.float32)
-        total = self.own.sum(axis=2).astype(float) + s.spread
-        return Ratios(whole, table, self.own, total, s.spread * general, floor, s.most)
+        counted = self.own.sum(axis=2).astype(float) + s.spread
+        return Ratios(whole, table, self.own, counted, s.spread * general, of, floor, s.most, logs)
 
 
 CountLines = Callable[[NDArray, NDArray], None]
@@ -174,7 +203,8 @@ class Ratios:
     ----------
     whole : (B,) float32 of the body as a whole
     table : (A, B) float32 at each anchor, UNKNOWN where it was not asked for yet
-    own, total, general, floor, most : what they are found from
+    own, total, general, of, floor, most : what they are found from
+    logs : (G + 1, B) float32 logarithms of the densities of each part and, last, of what is around
     """
 
     whole: NDArray
@@ -182,24 +212,35 @@ class Ratios:
     own: NDArray
     total: NDArray
     general: NDArray
+    of: NDArray
     floor: float
     most: float
+    logs: NDArray
 
     @property
-    def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, float, float]:
-        """As kernels take them."""
-        return self.table, self.own, self.total, self.general, self.floor, self.most
+    def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float, float]:
+        """As `kernels.profiles` takes them."""
+        return self.table, self.own, self.total, self.general, self.of, self.floor, self.most
 
     def at(self, anchor: NDArray, bins: NDArray) -> NDArray:
         """(N,) of bins (N,) at anchors (N,)."""
-        inside, outside = ((self.own[k, anchor, bins] + self.general[k, bins]) / self.total[k, anchor] for k in (0, 1))
+        if self.own.shape[2] == 1:
+            return np.asarray(self.table[anchor, bins])
+        rows = self.of[anchor], -1
+        inside, outside = (
+            (self.own[k, anchor, bins] + self.general[row, bins]) / self.total[k, anchor] for k, row in enumerate(rows)
+        )
         return np.clip(np.log((inside + self.floor) / (outside + self.floor)), -self.most, self.most)
+
+    def between(self, own: NDArray, beyond: NDArray, bins: NDArray) -> NDArray:
+        """(N,) of bins (N,) where parts own (N,) lie before parts beyond (N,)."""
+        return np.clip(self.logs[own, bins] - self.logs[beyond, bins], -self.most, self.most)
 
     @classmethod
     def of_table(cls, table: NDArray) -> Ratios:
         """Of a table (1, B) in which all is known."""
-        none = np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), np.zeros((2, table.shape[1]))
-        return cls(table[0], table, *none, 0.0, 0.0)
+        none = np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), np.zeros((2, table.shape[1])), np.zeros(1, np.int64)
+        return cls(table[0], table, *none, 0.0, 0.0, np.zeros_like(table))
 
 
 def _density(counts: NDArray) -> NDArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios
+from kinefit.sensors.region_parts import Drawn, Lines
 
 _LEVELS = 127  # of a log ratio that is kept, to either side of 0
 # A map that is kept is drawn as an image whose colours are numbers of levels, so that one kernel looks at both.
@@ -33,14 +34,13 @@ class Coloured:
     bins: NDArray
     ratios: Ratios
 
-    def profiles(
-        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
-        guard: float,
-    ) -> NDArray:  # fmt: skip
-        """(N, 2 half) log ratios along the normals of a contour (4, N); see `kernels.profiles`."""
-        out = np.empty((outline.shape[1], 2 * half))
-        kernels.look_up(self.image, self.bins, *self.ratios.packed, anchor, outline, half * step)
-        kernels.profiles(self.image, self.bins, self.ratios.table, anchor, outline, *drawn, half, step, guard, out)
+    def profiles(self, lines: Lines, drawn: Drawn, half: int, step: int, guard: float) -> NDArray:
+        """(N, 2 half) log ratios along the normals of a contour; see `kernels.profiles`."""
+        out, r = np.empty((len(lines.anchor), 2 * half)), self.ratios
+        kernels.profiles(
+            self.image, self.bins, *r.packed, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond,
+            half, step, guard, out,
+        )  # fmt: skip
         return out
 
 
@@ -67,17 +67,16 @@ class Kept(Coloured):
         out[..., 1], out[..., 2] = (levels >> 5) << 3, (levels & 31) << 3
         return out
 
-    def profiles(
-        self, outline: NDArray, anchor: NDArray, drawn: tuple[NDArray, float, float, float], half: int, step: int,
-        guard: float,
-    ) -> NDArray:  # fmt: skip
+    def profiles(self, lines: Lines, drawn: Drawn, half: int, step: int, guard: float) -> NDArray:
         """As of the image, within the band; beyond it nothing is told."""
-        out, (face, left, top, scale) = np.empty((outline.shape[1], 2 * half)), drawn
-        moved = np.array(outline)
+        moved = np.array(lines.outline)
         moved[:2] -= np.array([[self.left], [self.top]])
+        there = drawn._replace(left=drawn.left - self.left, top=drawn.top - self.top)
+        own = replace(lines, outline=moved, anchor=np.zeros_like(lines.anchor))
+        out, r = np.empty((len(own.anchor), 2 * half)), self.ratios
         kernels.profiles(
-            self._painted, self.bins, self.ratios.table, np.zeros_like(anchor), moved, face, left - self.left,
-            top - self.top, scale, half, step, guard, out,
+            self._painted, self.bins, *r.packed, r.logs, own.anchor, moved, *there, own.own, own.beyond, half, step,
+            guard, out,
         )  # fmt: skip
         return out
 
@@ -85,29 +84,33 @@ class Kept(Coloured):
         return {k: v for k, v in self.__dict__.items() if k != "_painted"}
 
 
-def kept(seen: Coloured, outline: NDArray, anchor: NDArray, reach: int, most: float) -> Coloured:
-    """What lines from a contour (4, N), and from others a little beside it, would see within a reach [px].
+def kept(seen: Coloured, lines: Lines, reach: int, most: float) -> Coloured:
+    """What lines from a contour, and from others a little beside it, would see within a reach [px].
 
-    A pixel has the log ratio of the anchor (N,) of the contour's nearest point.
+    A pixel has the log ratio of the contour's nearest point.
     """
     height, width = seen.image.shape[:2]
-    uv = np.rint(outline[:2]).astype(np.int64)
+    uv = np.rint(lines.outline[:2]).astype(np.int64)
     inside = (uv[0] >= 0) & (uv[0] < width) & (uv[1] >= 0) & (uv[1] < height)
     levels = Ratios.of_table(((np.arange(256) - _LEVELS) * (most / _LEVELS)).astype(np.float32)[None])
     none = np.zeros((1, 1, 3), np.uint8)
     if not inside.any():
         return Kept(none, _PALETTE, levels, zlib.compress(bytes([_LEVELS])), (1, 1), 0, 0)
-    (u, v), anchor = uv[:, inside], anchor[inside]
+    (u, v), number = uv[:, inside], np.flatnonzero(inside)
     left, top = max(int(u.min()) - reach, 0), max(int(v.min()) - reach, 0)
     crop = seen.image[top : int(v.max()) + reach + 1, left : int(u.max()) + reach + 1].astype(np.int32)
     away = np.ones(crop.shape[:2], np.uint8)
     away[v - top, u - left] = 0
     distance, label = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     of = np.zeros(int(label.max()) + 1, np.int64)
-    of[label[v - top, u - left]] = anchor
+    of[label[v - top, u - left]] = number
     colour = ((crop[..., 0] >> 3) << 10) | ((crop[..., 1] >> 3) << 5) | (crop[..., 2] >> 3)
     value = np.zeros(crop.shape[:2])
     j, i = np.nonzero(distance <= reach)
-    value[j, i] = seen.ratios.at(of[label[j, i]], seen.bins[colour[j, i]])
+    point, bins = of[label[j, i]], seen.bins[colour[j, i]]
+    inner = lines.anchor[point] < 0
+    told = seen.ratios.between(lines.own[point], lines.beyond[point], bins)
+    told[~inner] = seen.ratios.at(lines.anchor[point[~inner]], bins[~inner])
+    value[j, i] = told
     packed = np.rint(value * (_LEVELS / most) + _LEVELS).astype(np.uint8)
     return Kept(none, _PALETTE, levels, zlib.compress(packed.tobytes(), 1), packed.shape, left, top)

@@ -10,39 +10,46 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.correspondences import _kernels, _kernels_outlines
-from kinefit.correspondences.morphed import morphed_outline_rows
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios, RegionColours, colour_bins
-from kinefit.losses import Loss, geman_mcclure
+from kinefit.losses import geman_mcclure
 from kinefit.observations import ColourFrame
-from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
+from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_image import Coloured, kept
-from kinefit.sensors.region_search import Seeker, region_starts
+from kinefit.sensors.region_matched import RegionMatched
+from kinefit.sensors.region_parts import Drawn, Lines, Parts
+from kinefit.sensors.region_seams import SPACING, Seams
+from kinefit.sensors.region_starts import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
+_LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
+# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
+# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
+_FIRST, _OFTEN = 10, 0.05
+_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
+_GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
 _STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
 _GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a state may be off its drawing
 # Of the median offset of lines, in deviations, that the loss takes for one: the fit then needs 5 steps in place of 6,
 # and at its end the loss is as it was; 1.5 (the deviation that a median stands for) let outliers in.
 _SPREAD = 0.5
 _JUDGED = 2  # [px] step of the lines by which a state is judged: they reach twice as far as the last ones of the fit
-_AGREES = 1.5  # [px] within which a line speaks for its segment, and within one deviation of the contour
+_AGREES = 1.5, 3.0  # [px], [deviations of the contour] within which a line speaks for its segment
+_ROOM = 4.0  # times as far judging lines reach at least: one that points anywhere agrees in a quarter of cases
 # Of rendered sequences in which nothing was reset, right poses have at most a third of such lines off in 97 %, wrong
 # ones more than that in 65 %: a wrong silhouette agrees along half of its contour by chance.
 _AGAINST = 2.0  # lines that agree, which one that does not outweighs
@@ -55,31 +62,33 @@ class RegionSensor(Sensor):
     ----------
     camera : Camera, whose name frames bear; the sensor's own is "region CAMERA".
     sigma : float [px] standard deviation of the contour, shape of the body included, in the camera's image.
+        None for `TrackSettings.region` of a body of meshes, and `shape` of one of simple shapes where it is first seen.
     settings : TrackSettings
     """
 
-    def __init__(self, camera: Camera, sigma: float, settings: TrackSettings) -> None:
-        self.name, self.camera, self.sigma = f"region {camera.name}", camera, sigma
+    def __init__(self, camera: Camera, sigma: float | None, settings: TrackSettings) -> None:
+        self.name, self.camera = f"region {camera.name}", camera
+        self.sigma, self._stated = settings.region if sigma is None else sigma, sigma is not None
         self.settings, self.regions = settings, settings.regions
         self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
         self.colours = RegionColours.none(self.count, self.regions)
         self.ratios: Ratios | None = None
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
-        self._anchors: NDArray | None = None
-        self._seeker: Seeker | None = None
+        self._parts: Parts | None = None
+        self._starts: Starts | None = None
+        self._learnt = -np.inf  # [s] when colours were blended in last
 
-    def anchors(self, scene: Scene) -> NDArray:
-        """(V,) the anchor of every vertex of the body's skin."""
-        if self._anchors is None:
-            self._anchors = spread_anchors(scene.surface.morphing.mesh.vertices, self.regions.anchors)
-        return self._anchors
+    def parts(self, scene: Scene) -> Parts:
+        """Parts of the body that have colours of their own."""
+        if self._parts is None:
+            self._parts = Parts(scene.body, scene.surface.morphing.mesh, self.regions.anchors, self.regions.parts)
+        return self._parts
 
-    def seeker(self, scene: Scene) -> Seeker:
-        """What draws a coarse mesh of the body."""
-        if self._seeker is None:
-            mesh = scene.surface.morphing.mesh
-            self._seeker = Seeker(mesh.vertices, mesh.faces)
-        return self._seeker
+    def starts(self, scene: Scene) -> Starts:
+        """What the body is sought with."""
+        if self._starts is None:
+            self._starts = Starts(scene, self.parts(scene).label, self.settings)
+        return self._starts
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
         """The image with what is known of colours; before anything is known they are those at the scene's state.
@@ -95,6 +104,10 @@ class RegionSensor(Sensor):
             problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
             raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
         m = RegionMeasurement(self, frame, scene)
+        if not self._stated:
+            self._stated = True
+            if scene.body.skin is not None or any(isinstance(s, TaperedCylinder) for s in scene.body.surfaces):
+                self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
         if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
@@ -105,16 +118,23 @@ class RegionSensor(Sensor):
         """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
         if not isinstance(measurement, RegionMeasurement):
             return
-        if not sure or measurement.hidden:
+        told = measurement.evidence(scene)
+        parts, wrong = self.parts(scene), told.lost | told.hidden
+        seen = float((told.agreeing + told.contrary).sum())
+        if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
+            sure = float(told.agreeing.sum()) > _LEARNT * seen and measurement.clear > _CLEAR
+        if not sure or told.hidden.all():
             self.reach = _WIDE
             return
         off = 2.0 * measurement.off(scene)
         self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        self._know(measurement, scene)
+        if parts.count == 1 or self.colours.images < _FIRST or abs(measurement.time - self._learnt) > _OFTEN:
+            self._know(measurement, scene, wrong)
+            self._learnt = measurement.time
 
-    def _know(self, measurement: RegionMeasurement, scene: Scene) -> None:
-        self.colours = measurement.counted(scene, self.colours)
-        self.ratios = self.colours.ratios(self.regions)
+    def _know(self, measurement: RegionMeasurement, scene: Scene, wrong: NDArray | None = None) -> None:
+        self.colours = measurement.counted(scene, self.colours, wrong)
+        self.ratios = self.colours.ratios(self.regions, self.parts(scene).of)
 
 
 class RegionMeasurement(Measurement):
@@ -130,7 +150,7 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
-    hidden : whether nothing of the body was seen in the state that was judged last: its colours are not learnt there
+    clear : share of the outline's lines that tell anything at the state that was judged last
     """
 
     settled = False
@@ -139,28 +159,38 @@ class RegionMeasurement(Measurement):
         self.sensor, self.time, self.of = of.name, frame.time, of
         self.image: NDArray | None = frame.image
         self.seen: Coloured | None = None
-        self.hidden = False
         self.reach, self._spacing = of.reach, 0.0
         camera = scene.placed(of.camera)
         self._expected, z = self._few(scene), scene.state.T_world_root[:3, 3] @ camera.T_camera_world[2, :3]
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
+        self._lines: Lines | None = None
+        self._told: tuple[Rim, Evidence] | None = None
+        self._judged: BodyState | None = None
+        self.clear = 0.0
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+
+    def pixels_per_metre(self, scene: Scene) -> float:
+        """[px/m] at the body's distance."""
+        camera = scene.placed(self.of.camera)
+        z = float(np.median(scene.pose.vertices[::_FEW] @ camera.T_camera_world[2, :3])) + camera.T_camera_world[2, 3]
+        return float(camera.matrix[0, 0]) / max(z, 0.1)
 
     def off(self, scene: Scene) -> float:
         """[px] how far the body is from where it was expected, at most."""
         return float(np.nanmax(np.abs(self._few(scene) - self._expected), initial=0.0))
 
     def rim(self, scene: Scene) -> Rim:
-        """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""
+        """The occluding contour at a scene's state, of parts before others too; kept for the state asked for last."""
         vertices, camera = scene.pose.vertices, scene.placed(self.of.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera:
-            finder = scene.surface.rims(camera)
+            finder, others = scene.surface.rims(camera), [s for s in scene.others if s.body.surfaces]
             rim = finder.find(
-                vertices, camera, spacing=self._spacing or 1.0, inner=False, stale=_STALE,
-                close=self.of.settings.outline,
+                vertices, camera, spacing=self._spacing or 1.0, inner=self.of.parts(scene).count > 1,
+                stale=0.0 if others and self._last is None else _STALE, close=self.of.settings.outline,
+                others=[(s.pose.vertices, s.surface.morphing.mesh.faces) for s in others],
             )  # fmt: skip
             if not self._spacing:  # the first look tells how long the contour is
                 self._spacing = max(len(rim) / self.of.regions.lines, 1.0)
@@ -169,41 +199,44 @@ class RegionMeasurement(Measurement):
             self._last = vertices, camera, rim
         return self._last[2]
 
-    def _drawn(self, scene: Scene) -> tuple[NDArray, float, float, float]:
-        """The body as it was drawn last: its faces, and where they are in the image; see `kernels.count`."""
-        finder = scene.surface.rims(scene.placed(self.of.camera))
+    def _drawn(self, scene: Scene) -> Drawn:
+        """The body as it was drawn last."""
+        finder, parts = scene.surface.rims(scene.placed(self.of.camera)), self.of.parts(scene)
         w = finder.window
-        return finder.face, w.left, w.top, w.scale
+        return Drawn(finder.face, parts.label, w.left, w.top, w.scale, parts.joined)
 
-    def _anchor(self, scene: Scene, rim: Rim) -> NDArray:
-        """(N,) the anchor of every point of a contour."""
-        if not self.of.regions.anchors:
-            return np.zeros(len(rim), np.int64)
-        return self.of.anchors(scene)[rim.vertices[:, 0]]
+    def counted(self, scene: Scene, before: RegionColours, wrong: NDArray | None = None) -> RegionColours:
+        """What is known of colours, with those of this image, the body being where a scene has it.
 
-    def counted(self, scene: Scene, before: RegionColours) -> RegionColours:
-        """What is known of colours, with those of this image, the body being where a scene has it."""
+        Of segments that are `wrong` (S,) bool nothing is learnt.
+        """
         of, s, rim, image = self.of, self.of.regions, self.rim(scene), self.image
+        rim = rim.chosen(~rim.inner if wrong is None else ~(rim.inner | wrong[rim.segment]))
         if not len(rim) or image is None:
             return before
+        parts = of.parts(scene)
+        if not before.images:
+            before = RegionColours.none(of.count, s, parts.count)
         low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
         margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
         box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
-        counts = np.zeros((3, of.count))
-        kernels.count(image, of.bins, *drawn, box, *counts)
+        inside, outside = np.zeros((parts.count, of.count)), np.zeros((2, of.count))
+        kernels.count(image, of.bins, *drawn[:5], box, inside, *outside)
 
-        def lines(weight: NDArray, own: NDArray) -> None:
-            anchor = self._anchor(scene, rim)
-            kernels.count_lines(image, of.bins, rim.outline, anchor, s.half, *drawn, weight, own)
+        def lines(weight: NDArray, into: NDArray) -> None:
+            at = parts.lines(rim, drawn)
+            kernels.count_lines(image, of.bins, at.outline, at.anchor, s.half, *drawn, at.own, weight, into)
 
-        return before.blended(counts, lines, s)
+        if wrong is not None:
+            inside[parts.group[wrong]] = 0.0
+        return before.blended(inside, outside, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
         """(N, 2 half) log ratios along the normals of a contour, in samples of `step` pixels."""
         assert self.seen is not None
-        return self.seen.profiles(
-            rim.outline, self._anchor(scene, rim), self._drawn(scene), self.of.regions.half, step, _GUARD
-        )
+        drawn = self._drawn(scene)
+        self._lines = self.of.parts(scene).lines(rim, drawn)
+        return self.seen.profiles(self._lines, drawn, self.of.regions.half, step, _GUARD)
 
     def match(self, scene: Scene, reach: float) -> RegionMatched:
         """Where along its normals the contour of the body is."""
@@ -216,113 +249,86 @@ class RegionMeasurement(Measurement):
         place = np.array(rim.outline)
         place[:2] += told[0] * place[2:]
         # Errors are alike along a piece of the contour, of which several lines tell.
-        share = min(self._spacing / self._drawn(scene)[3] / s.alike, 1.0)
+        share = min(self._spacing / self._drawn(scene).scale / s.alike, 1.0)
         weight = np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
         spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
-        return RegionMatched(self, rim, place, weight, geman_mcclure(s.loss * spread))
+        loss = geman_mcclure(s.loss * spread)
+        seams = self._seams(scene, step)
+        return RegionMatched(self, rim, place, weight, loss, *seams)
+
+    def _seams(self, scene: Scene, step: int) -> tuple[Seams | None, NDArray, NDArray]:
+        """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
+        of, s, none = self.of, self.of.regions, np.zeros(0)
+        parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
+        if parts.count == 1 or seen is None or self.image is None or not scene.surface.morphing.is_rigid:
+            return None, none, none
+        drawn = self._drawn(scene)
+        seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
+        told = np.empty((3, len(seams)))
+        kernels.places(seen.profiles(seams.lines, drawn, s.half, step, _GUARD), float(step), s.heat, told)
+        share = min(SPACING / drawn.scale / s.alike, 1.0)
+        return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
-        of, seen = self.of, self.seen
+        """Where colours alone show the body, if it is expected too roughly, or not where it was found.
+
+        Of a body of parts that nothing else was measured of, also where its limbs may be.
+        """
+        of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
         if self.image is None or seen is None or not of.settings.search:
             return ()
-        return region_starts(
-            scene, scene.placed(of.camera), of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
-            of.regions.search,
-        )  # fmt: skip
+        whole = of.starts(scene).whole(scene, camera, seen, information, told)
+        if whole or information is None or found is None or not self._alone(scene):
+            return whole
+        return of.starts(scene).limbs(scene, camera, seen, information, told, found, self.time)
+
+    def _alone(self, scene: Scene) -> bool:
+        """Whether nothing else was measured of a body of rigid parts: its colours alone then tell where limbs are."""
+        rigid = scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1
+        return rigid and len(scene.measurements) == 1
+
+    def better(self, new: Scene, old: Scene) -> bool | None:
+        """Of a body of parts: whether the colours of all its pixels say so."""
+        if self.image is None or not self._alone(new):
+            return None
+        gain = self._explained(new) - self._explained(old)
+        self._last = None  # what was drawn last is neither
+        return gain > _GAIN
+
+    def _explained(self, scene: Scene) -> float:
+        """By how much better the body where a scene has it explains the image than no body does, in logarithms."""
+        assert self.seen is not None
+        camera = scene.placed(self.of.camera)
+        scene.surface.rims(camera).find(scene.pose.vertices, camera, spacing=_WIDE, close=self.of.settings.outline)
+        return kernels.likelihood(self.seen.image, self.seen.bins, self.seen.ratios.logs, *self._drawn(scene)[:5])
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas, camera = self.rim(scene), scene.surface.areas, scene.placed(self.of.camera)
-        told = np.empty((3, len(rim)))
-        kernels.places(self.profiles(scene, rim, _JUDGED), float(_JUDGED), self.of.regions.heat, told)
-        tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < max(_AGREES, self.of.sigma)
+        rim, areas = self.rim(scene), scene.surface.areas
+        self._judged = scene.state
+        if self._told is not None and self._told[0] is rim:
+            return self._told[1]
+        told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
+        step = max(_JUDGED, math.ceil(_ROOM * agrees / self.of.regions.half))
+        kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, told)
+        tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < agrees
         agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))
         contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
-        T, focal = camera.T_camera_world, camera.matrix[0, 0]
-        depth = max(float(np.median(scene.pose.vertices[::_FEW] @ T[2, :3])) + T[2, 3], 0.1)
-        spacing = self._spacing / self._drawn(scene)[3]
-        whole = np.maximum(np.sqrt(np.pi * areas) * focal / depth / spacing, 1.0)  # points, if seen alone
+        spacing = self._spacing / self._drawn(scene).scale
+        whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self.hidden = bool(out.hidden.all())
+        self._told, self.clear = (rim, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
         return out
 
     def compact(self) -> RegionMeasurement:
         """Without the image: log ratios about the contour as it was drawn last."""
         out = copy(self)
-        if self.image is not None and self.seen is not None and self._last is not None:
-            rim = self._last[2]
-            anchor = np.zeros(len(rim), np.int64)
-            if self.of.regions.anchors and self.of._anchors is not None:
-                anchor = self.of._anchors[rim.vertices[:, 0]]
-            out.seen = kept(self.seen, rim.outline, anchor, _JUDGED * self.of.regions.half, self.of.regions.most)
-        out.image, out._last = None, None
+        if self.image is not None and self.seen is not None and self._lines is not None:
+            out.seen = kept(self.seen, self._lines, _JUDGED * self.of.regions.half, self.of.regions.most)
+        out.image, out._last, out._lines, out._told = None, None, None, None
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None}
-
-
-@dataclass(frozen=True, eq=False)
-class RegionMatched(Matched):
-    """A colour image with the places of the contour along its normals.
-
-    Parameters
-    ----------
-    measurement : RegionMeasurement
-    rim : Rim, N points of the body's occluding contour, of edges of its mesh
-    place : (4, N) u, v [px] of where the contour is, and unit normals
-    weight : (N,) [1/px²]
-    loss : Loss
-    """
-
-    measurement: RegionMeasurement
-    rim: Rim
-    place: NDArray
-    weight: NDArray
-    loss: Loss
-    of_points = False
-
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
-        n, camera = len(self.rim), scene.placed(self.measurement.of.camera)
-        numbers = np.arange(n)
-        if not scene.surface.morphing.is_rigid:
-            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, (numbers, numbers), sigma=1.0)
-            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss)]
-        data, segment, group = _kernels.buffers(n)
-        used = _kernels_outlines.tangent_rows(
-            camera.packed, np.ascontiguousarray(scene.pose.vertices), self.rim.vertices, self.rim.share,
-            self.rim.segment, self.place, numbers, numbers, 1.0, data, segment, group,
-        )  # fmt: skip
-        data[7, :used] *= self.weight[group[:used]]
-        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss)]
-
-    def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        return self.measurement.evidence(scene)
-
-    def leftovers(self, scene: Scene) -> list[Leftover]:
-        """Distances [px], in the camera's own image, of the image's contour from the body's, by segments."""
-        uv = scene.placed(self.measurement.of.camera).project(self.rim.on(scene.pose.vertices))
-        away = np.sum(self.place[2:].T * (self.place[:2].T - uv), axis=1)
-        seen = np.isfinite(away) & (self.weight > 0.0)
-        return [by_segments(self.sensor, scene.body, away[seen], self.rim.segment[seen], "px")]
-
-
-def spread_anchors(vertices: NDArray, count: int) -> NDArray:
-    """(V,) the nearest of some vertices that are spread over all of them, each as far from the others as can be."""
-    away = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1)
-    best, near = np.full(len(vertices), np.inf), np.zeros(len(vertices), np.int64)
-    for k in range(min(count, len(vertices))):
-        d = np.linalg.norm(vertices - vertices[int(np.argmax(away))], axis=1)
-        near[d < best] = k
-        away = best = np.minimum(best, d)
-    return near
+        return {**self.__dict__, "_last": None, "_lines": None, "_told": None}

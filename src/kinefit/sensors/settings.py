@@ -35,6 +35,10 @@ class TrackSettings:
         Iterations after which the body's own hidden parts are found anew.
     depth, pixel, marker, silhouette, region, line : float [m], [px], [m], [px], [px], [px]
         Standard deviation of a sensor that none is given for.
+        `region` is that of a mesh of the very body.
+    shape : float [m]
+        Standard deviation of the contour of a body of simple shapes where colours show it: on the balancing trial
+        half of the contour is within 0.8 cm of it, once its girths are fitted.
     regions : RegionSettings, of colours inside and outside of a body
     outline : int [px]
         Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
@@ -100,6 +104,7 @@ class TrackSettings:
     marker: float = 0.005
     silhouette: float = 4.0
     region: float = 0.5
+    shape: float = 0.01
     line: float = 2.0
     regions: RegionSettings = field(default_factory=RegionSettings)
     outline: int = 320

@@ -10,7 +10,6 @@ from kinefit.errors import TakeError
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.take import track_take
 from kinefit.tracking.take_recording import recording_of
 
@@ -58,7 +57,9 @@ def test_sigma_is_the_sensors(tmp_path):
     parsed = read_take(take)
     recording, _ = recording_of(parsed, load_observations(parsed), thing())
     assert recording.sigma["region cam"] == 2.5
-    assert TrackSettings().region == read_take(take).regions[0].__class__(camera="cam").sigma
+    take.write_text(take.read_text().replace("sigma = 2.5\n", ""))
+    parsed = read_take(take)
+    assert "region cam" not in recording_of(parsed, load_observations(parsed), thing())[0].sigma
 
 
 @pytest.mark.parametrize("region, message", [

@@ -116,7 +116,7 @@ def _values(take: Take) -> None:
         if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
     for region in take.regions:
-        if not 0 < region.sigma < 1e4:
+        if region.sigma is not None and not 0 < region.sigma < 1e4:
             refuse(f"sigma {region.sigma} px", f"region of camera {region.camera}", "Give a positive number.")
     for shape in take.silhouettes:
         place = f"silhouette of camera {shape.camera}"

@@ -107,7 +107,7 @@ class RegionEntry(_Entry, frozen=True, kw_only=True):
     """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
 
     camera: str
-    sigma: float = 0.5  # [px] standard deviation of the contour, shape included, in the calibration's image
+    sigma: float | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
 
 
 class LinesEntry(_Entry, frozen=True, kw_only=True):

@@ -1,0 +1,61 @@
+"""Densities of colours in CIELab, tabulated in cells: Parzen estimates, and mixtures of Gaussians (P3 2.4.1)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.special import logsumexp
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+
+_CELL, _GRID = 4.0, (26, 65, 65)  # [units of Lab] width of cells, and how many there are, in which colours are counted
+COLOURS = int(np.prod(_GRID))
+_FLOOR = 1e-8  # density that every colour has: a hundredth, spread over 1e6 units³ of Lab
+_WINDOW = 4.0  # [units of Lab] standard deviation of a Parzen window
+_GAUSSIANS, _ROUNDS = 5, 20  # of a mixture, and iterations of expectation and maximisation
+
+
+def colour_cells(image: ArrayLike, camera: Camera) -> NDArray:
+    """(H W,) number of the cell of CIELab that each pixel of an image (H, W, 3) uint8 RGB lies in."""
+    rgb = np.asarray(image)
+    if rgb.shape != (*camera.size[::-1], 3) or rgb.dtype != np.uint8:
+        problem = f"an image of shape {rgb.shape} and {rgb.dtype} of {camera.name}, whose size is {camera.size}"
+        raise ObservationError(problem, remedy="Give (H, W, 3) uint8 RGB in the size of the calibration.")
+    lab = cv2.cvtColor(rgb.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab).reshape(-1, 3) + (0, 128, 128)
+    return np.ravel_multi_index(tuple((lab / _CELL).astype(np.int64).T), _GRID, mode="clip")
+
+
+def parzen_density(count: NDArray) -> NDArray:
+    """Logarithm (cells,) of the Parzen estimate of a density, of pixels counted in cells of CIELab (cells,)."""
+    density = gaussian_filter(count.reshape(_GRID), _WINDOW / _CELL, mode="constant").ravel()
+    return np.asarray(np.log(density / max(count.sum(), 1.0) / _CELL**3 + _FLOOR))
+
+
+def mixture_density(count: NDArray) -> NDArray:
+    """The same of a mixture of Gaussians, fitted by expectation and maximisation."""
+    every = (np.indices(_GRID).reshape(3, -1).T + 0.5) * _CELL
+    used = np.flatnonzero(count)
+    x, n, share = every[used], count[used][:, None], np.zeros((len(used), _GAUSSIANS))
+    of = np.minimum(np.cumsum(n) / max(n.sum(), 1.0), 0.999) * _GAUSSIANS  # to begin with equal numbers by lightness
+    share[np.arange(len(used)), of.astype(np.int64)] = 1.0
+    for _ in range(_ROUNDS):
+        weight = (n * share).sum(axis=0) + 1e-9
+        mean = (n * share).T @ x / weight[:, None]
+        off = x[:, None] - mean
+        C = np.einsum("nk,nki,nkj->kij", n * share, off, off) / weight[:, None, None] + _CELL**2 / 12 * np.eye(3)
+        log = _gaussians(x, weight, mean, C)
+        share = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    return np.logaddexp(logsumexp(_gaussians(every, weight, mean, C), axis=1), np.log(_FLOOR))
+
+
+def _gaussians(x: NDArray, weight: NDArray, mean: NDArray, C: NDArray) -> NDArray:
+    """(N, K) logarithms of each Gaussian's part of the density at x (N, 3)."""
+    L = np.linalg.cholesky(np.linalg.inv(C))
+    square = np.stack([np.square((x - m) @ l).sum(axis=1) for m, l in zip(mean, L)], axis=1)
+    return np.asarray(np.log(weight / weight.sum()) - 0.5 * (square + np.linalg.slogdet(2.0 * np.pi * C)[1]))
+
+
+DENSITIES = {"parzen": parzen_density, "mixture": mixture_density}

@@ -1,0 +1,117 @@
+"""Pose from regions as Rosenhahn, Schmaltz et al. print it (P3 2.3, 2.4): densities, signs, rays, until forces cancel.
+
+1. The projected body splits every image into what it covers and the rest; the densities p₁, p₂ of both regions' colours
+   in CIELab are Parzen estimates, or mixtures of Gaussians (the paper leaves the form open).
+2. Points of the silhouette at which p₁ > p₂ are shifted along the outward normal, the others inwards (2.4.2).
+3. The pose and the joint angles that bring the body's points onto the rays of the shifted points follow in least
+   squares (eqs. 6, 7).
+4. Again, until the pose's average change over up to three iterations is below ε. Energy (8) is told, not minimised.
+
+The tracker (`[[region]]` in a take) beside it takes the likelihood of all places along a line in place of a sign,
+counts colours near each place of the contour and by parts of the body, weighs outliers down, predicts, and judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.surfaces.triangles import BodyMesh
+from kinefit.correspondences.outlines import outline_rows
+from kinefit.correspondences.rims import RimFinder
+from kinefit.errors import ObservationError, choices
+from kinefit.geometry.camera import Rig
+from kinefit.recipes._colour_densities import COLOURS, DENSITIES, colour_cells
+from kinefit.rows import Rows
+from kinefit.solvers.least_squares import gauss_newton
+
+__all__ = ["RegionFit", "pose_from_regions", "track_regions"]
+
+
+@dataclass(frozen=True, eq=False)
+class RegionFit:
+    """One frame.
+
+    Parameters
+    ----------
+    state : BodyState
+    energy : float, (8), a pixel: the mean over all pixels of all images, in natural logarithms
+    cycles : int
+    converged : whether the paper's rule ended them, and not their number
+    """
+
+    state: BodyState
+    energy: float
+    cycles: int
+    converged: bool
+
+
+def pose_from_regions(
+    body: Body, state: BodyState, rig: Rig, images: Mapping[str, ArrayLike], *, densities: str = "parzen",
+    mesh: BodyMesh | None = None, finder: RimFinder | None = None, shift: float = 1.0, cycles: int = 60,
+    epsilon: float = 1e-3,
+) -> RegionFit:  # fmt: skip
+    """Pose and joint angles from the colours inside and outside of the body (P3 2.4).
+
+    Parameters
+    ----------
+    state : BodyState to begin with, the last frame's.
+    images : camera -> (H, W, 3) uint8 RGB, in the size of the calibration.
+    densities : form of p₁ and p₂, "parzen" or "mixture".
+    mesh, finder : made once for the body; default: `body_mesh(body)`.
+    shift : float [px] by which a point is shifted; the paper does not state it.
+    cycles : int, at most.
+    epsilon : float, of the pose's average change (metres and radians) over three iterations, which ends the cycles.
+
+    Raises
+    ------
+    ObservationError
+        Densities of another form; an image of another size than its camera's; nothing of the body is in view.
+    """
+    mesh = body_mesh(body) if mesh is None else mesh
+    finder = RimFinder(mesh) if finder is None else finder
+    if densities not in DENSITIES:
+        raise ObservationError(choices("form of densities", densities, tuple(DENSITIES)))
+    cells = {rig[name]: colour_cells(image, rig[name]) for name, image in images.items()}
+    changes: list[NDArray] = []
+    energy, converged = np.nan, False
+    while len(changes) < cycles and not converged:
+        vertices = mesh.posed(body.tree.forward(state.T_world_root, state.angles)[0])
+        parts, told = [], []
+        for camera, cell in cells.items():
+            rim = finder.find(vertices, camera, inner=False)
+            inside = (finder.drawn(camera) >= 0).ravel()
+            counts = (np.bincount(cell[of], minlength=COLOURS).astype(float) for of in (inside, ~inside))
+            p1, p2 = map(DENSITIES[densities], counts)
+            told.append(-np.where(inside, p1[cell], p2[cell]).mean())
+            u, v = np.rint(rim.outline[:2]).astype(np.int64)
+            here = cell[v * camera.size[0] + u]
+            moved = np.array(rim.outline)
+            moved[:2] += shift * np.sign(p1[here] - p2[here]) * moved[2:]
+            every = np.arange(len(rim))
+            parts.append(outline_rows(body, state, rim, vertices, camera, moved, (every, every), by="rays"))
+        rows, energy = Rows.concat(*parts), float(np.mean(told))
+        if not len(rows):
+            raise ObservationError("nothing of the body is in view", remedy="Start nearer to where it is.")
+        step = gauss_newton(body, state, rows, damping=1e-6 * float(np.sum(rows.weight)))
+        state, changes = step.state, [*changes, step.delta]
+        converged = len(changes) >= 3 and float(np.linalg.norm(np.mean(changes[-3:], axis=0))) < epsilon
+    return RegionFit(state, energy, len(changes), converged)
+
+
+def track_regions(
+    body: Body, start: BodyState, rig: Rig, images: Iterable[Mapping[str, ArrayLike]],
+    densities: str = "parzen",
+) -> Iterator[RegionFit]:  # fmt: skip
+    """Frame after frame, each from the last one's pose: images camera -> (H, W, 3) uint8 RGB."""
+    mesh, state = body_mesh(body), start
+    finder = RimFinder(mesh)
+    for seen in images:
+        fit = pose_from_regions(body, state, rig, seen, densities=densities, mesh=mesh, finder=finder)
+        state = fit.state
+        yield fit

@@ -1,0 +1,94 @@
+"""The paper's region-based cycle, on rendered pictures; its densities against their definitions."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+from tests.recipes.test_silhouettes import pictures, rig, state
+
+from kinefit.bodies import BodyState, load_body
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.recipes import _colour_densities as densities
+from kinefit.recipes.regions import pose_from_regions, track_regions
+
+BODY, RIG = load_body("arm"), rig()
+
+
+def off(found, truth):
+    """[m] of the hand."""
+    hand = [BODY.positions(s, BODY.landmarks.select(("r_wrist",)))[0] for s in (found.state, truth)]
+    return float(np.linalg.norm(hand[0] - hand[1]))
+
+
+def images(i, seed=0):
+    """The red arm in the green room, with noise."""
+    random = np.random.default_rng(seed)
+    seen = pictures(BODY, state(BODY, i), RIG)
+    return {n: np.clip(p + random.normal(0, 8, p.shape), 0, 255).astype(np.uint8) for n, p in seen.items()}
+
+
+def cells_of(colours):
+    """Cells of CIELab of colours (N, 3) uint8."""
+    n = len(colours)
+    camera = Camera("one", (n, 1), [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1]])
+    return densities.colour_cells(colours[None], camera)
+
+
+@pytest.mark.parametrize("form, cycles", [("parzen", 20), ("mixture", 8)])
+def test_an_arm_is_drawn_to_where_it_is_by_both_forms(form, cycles):
+    """A pixel is a centimetre; the rule shifts by one."""
+    begun, truth = state(BODY, 0), state(BODY, 2)
+    fit, before = (
+        pose_from_regions(BODY, begun, RIG, images(2), densities=form, cycles=count) for count in (cycles, 1)
+    )
+    assert fit.energy < before.energy and fit.cycles == cycles
+    assert off(fit, truth) < 0.5 * off(before, truth)
+
+
+def test_an_arm_is_followed():
+    *_, last = track_regions(BODY, state(BODY, 0), RIG, (images(i, seed=i) for i in range(3)))
+    assert off(last, state(BODY, 2)) < 0.012
+
+
+def test_forces_cancel_and_the_rule_ends_the_cycles():
+    fit = pose_from_regions(BODY, state(BODY, 0), RIG, images(0), epsilon=0.05)
+    assert fit.converged and fit.cycles < 60
+    assert not pose_from_regions(BODY, state(BODY, 0), RIG, images(1), epsilon=1e-12, cycles=5).converged
+
+
+def test_the_energy_is_that_of_equation_8():
+    """With one colour inside and another outside, and the body where it is, each pixel has the density of its own."""
+    seen = pictures(BODY, state(BODY, 0), RIG)
+    fit = pose_from_regions(BODY, state(BODY, 0), RIG, seen, cycles=1)
+    flat = 0.0
+    for image in seen.values():
+        cell = cells_of(image.reshape(-1, 3))
+        inside = (image == (200, 60, 50)).all(axis=2).ravel()
+        counts = [np.bincount(cell[of], minlength=densities.COLOURS).astype(float) for of in (inside, ~inside)]
+        p1, p2 = map(densities.parzen_density, counts)
+        flat -= np.where(inside, p1[cell], p2[cell]).mean() / len(seen)
+    assert fit.energy == pytest.approx(flat, abs=0.02)
+
+
+def test_a_parzen_density_is_a_sum_of_windows_and_a_mixture_of_one_colour_a_gaussian():
+    colours = np.tile(np.array([[180, 90, 60]], np.uint8), (50, 1))
+    cell = cells_of(colours)
+    count = np.bincount(cell, minlength=densities.COLOURS).astype(float)
+    centres = (np.indices(densities._GRID).reshape(3, -1).T + 0.5) * densities._CELL
+    away = centres - centres[cell[0]]
+    near = np.linalg.norm(away, axis=1) < 9.0
+    for form, variance in (("parzen", densities._WINDOW**2), ("mixture", densities._CELL**2 / 12)):
+        told = np.exp(densities.DENSITIES[form](count))
+        expected = multivariate_normal.pdf(away, cov=variance * np.eye(3)) + densities._FLOOR
+        np.testing.assert_allclose(told[near], expected[near], rtol=0.15, atol=1e-7)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ObservationError, match="nothing of the body"):
+        T = np.eye(4)
+        T[:3, 3] = 50.0
+        pose_from_regions(BODY, BodyState(T, state(BODY, 0).angles), RIG, images(0))
+    with pytest.raises(ObservationError, match="gauss"):
+        pose_from_regions(BODY, state(BODY, 0), RIG, images(0), densities="gauss")
+    with pytest.raises(ObservationError, match="uint8"):
+        pose_from_regions(BODY, state(BODY, 0), RIG, {"front": images(0)["front"][::2]})
