@@ -87,11 +87,15 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
 
 def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:
     """Write a motion in several formats; enter into `files` what is there, one after the other."""
+    from kinefit._mapped import release
+
     formats = tuple(formats)
     for number, format in enumerate(formats):
         step("results", number, len(formats))
         write_format(motion, format, folder / NAMES[format])
         files[format] = folder / NAMES[format]
+        for residuals in motion.residuals.values():
+            release(residuals.values, residuals.weights, residuals.measured)
     step("results", len(formats), len(formats))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
@@ -116,6 +117,7 @@ def motion_of(
 
     provenance["contradictions"] = contradictions(*zip(*(seen(int(f)) for f in spread(len(results), LOOKS))))
     residuals = _residuals(len(results), seen if smooth or lag is not None else None, frames.leftovers)
+    release(channels.uv, channels.confidence, take.uv, take.confidence, weight)
     stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
     provenance["contradictions"] |= cameras_apart(residuals, stated)
     noise_of_others = None
