@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from os import PathLike
 from pathlib import Path
@@ -49,6 +49,12 @@ def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a whole text file (UTF-8, line ends as they are) or nothing."""
     with writing(path) as temporary:
         temporary.write_bytes(text.encode("utf-8"))
+
+
+def write_lines(path: str | PathLike[str], lines: Iterable[str]) -> None:
+    """Write a whole text file (UTF-8), line by line as they are made, or nothing."""
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
 
 
 def write_bytes(path: str | PathLike[str], data: bytes) -> None:

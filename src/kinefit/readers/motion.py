@@ -47,15 +47,21 @@ _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
 @checked
+def find_motion(path: str | PathLike[str]) -> Path:
+    """A motion file, or the one in a folder of results."""
+    inside = Path(path) / "motion.npz"
+    return inside if inside.is_file() else Path(path)
+
+
 def read_motion(path: str | PathLike[str]) -> Motion:
-    """Read a motion file.
+    """Read a motion file, or that in a folder of results.
 
     Raises
     ------
     FileError
         No such file, not a motion file, truncated, or of a later version.
     """
-    file = Path(path)
+    file = find_motion(path)
     arrays = _load(file)
     if "format" not in arrays or str(arrays["format"]) != FORMAT:
         remedy = "Give a file that `kinefit track` wrote."

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
@@ -207,10 +208,14 @@ def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
     if len(swapped) == len(channels.uv) and not swapped.any():
         unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
         return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
-    order = np.where(swapped, channels.partner, np.arange(swapped.shape[1]))
-    uv = np.take_along_axis(channels.uv[: len(swapped)], order[:, :, None], axis=1)
-    confidence = np.take_along_axis(channels.confidence[: len(swapped)], order, axis=1)
-    return uv, np.where(np.isfinite(uv).all(axis=2), confidence, 0.0)
+    uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
+    for some in stretches(len(swapped)):
+        order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))
+        uv[some] = np.take_along_axis(channels.uv[some], order[:, :, None], axis=1)
+        sure = np.take_along_axis(channels.confidence[some], order, axis=1)
+        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
+    release(uv, confidence)
+    return uv, confidence
 
 
 def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:

@@ -13,6 +13,8 @@ from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
+from kinefit.multiview.followed import follow
+from kinefit.multiview.people import Person
 from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
@@ -88,6 +90,24 @@ def track_take(
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
 
 
+def people_in_view(take: Take) -> tuple[Person, ...]:
+    """Everybody whom a take's keypoints show, the one of whom most is seen first; empty where that is one at most.
+
+    Where other sensors take part it is empty, too: their pixels and markers are not parted by people.
+    """
+    beside = (
+        take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines,
+        take.surface_points,
+    )  # fmt: skip
+    if any(beside) or not take.keypoints:
+        return ()
+    seen = load_observations(take)
+    if seen.rig is None:
+        return ()
+    people = follow(seen.rig, seen.keypoints).people
+    return people if len(people) > 1 else ()
+
+
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:
     """With what the take states of its calibration."""
     settings, entry = settings or TrackSettings(), take.calibration
@@ -122,5 +142,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
     accuracy, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
-    channels = make_channels(body, seen.rig, seen.keypoints, choose_people(seen.rig, seen.keypoints), accuracy)
+    keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
+    channels = make_channels(body, seen.rig, keypoints, choose_people(seen.rig, keypoints), accuracy)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

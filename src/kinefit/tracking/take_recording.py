@@ -103,10 +103,13 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
         name=take.name, sensors=_surface_sensors(take, seen),
     )  # fmt: skip
     if seen.keypoints:
-        pixels = Recording.of_keypoints(rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints])
-        recording = replace(
-            recording, keypoints=pixels.keypoints, people=pixels.people, keypoint_sigma=pixels.keypoint_sigma
+        pixels = Recording.of_keypoints(
+            rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person
         )
+        recording = replace(
+            recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,
+            keypoint_sigma=pixels.keypoint_sigma,
+        )  # fmt: skip
     return recording, body
 
 

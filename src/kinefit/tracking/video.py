@@ -111,7 +111,8 @@ def track(
         person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
-    told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
+    others = {} if recording.followed is None else recording.followed.as_told()
+    told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     motion = motion_of(

@@ -179,6 +179,9 @@ def _summary(
     session, facts = motion.provenance.get("session"), {}
     if isinstance(session, Mapping):
         facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
+    people = motion.provenance.get("people")
+    if isinstance(people, Mapping):
+        facts["Person"] = f"{people['followed']} of {people['in view']} in view"
     facts |= {
         "Date of the report": date, "Duration": f"{len(motion) / motion.rate:.2f} s", "Frames": f"{len(motion)}",
         "Rate": f"{motion.rate:g} Hz", "Body": f"{body.name}, {len(body.tree.coordinates)} angles",

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.errors import FileError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
+from kinefit.observations.person import PersonChoice
 from kinefit.readers.keypoints import KEYPOINT_SETS
-from kinefit.readers.markers import UNITS
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
+from kinefit.readers.units import LENGTHS, worth
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -79,6 +80,13 @@ def _values(take: Take) -> None:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
         refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+    if take.person is not None:
+        try:
+            PersonChoice.of(take.person)
+        except ObservationError as error:
+            refuse(error.problem, "[take] person", error.remedy or "")
+        if not take.keypoints and (take.depth or take.stereo or take.markers or take.silhouettes or take.skin):
+            refuse("'person' has no use without [[keypoints]]", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
@@ -136,8 +144,8 @@ def _values(take: Take) -> None:
         place = f"markers {entry.file.name}"
         if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
             refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
-        if entry.unit is not None and entry.unit.lower() not in UNITS:
-            refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+        if entry.unit is not None and worth(entry.unit, LENGTHS) is None:
+            refuse(choices("unit", entry.unit, LENGTHS), place, "Use one of these.")
         if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
             refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
     for surface in take.surface_points:

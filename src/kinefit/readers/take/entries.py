@@ -58,7 +58,7 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
-    unit: str = "auto"  # of its translations, where the format does not state it
+    unit: str | float = "auto"  # of its translations, where the format does not state it; or [m] of one
     position_sigma: float | None = None  # [m] of each camera's position; with rotation_sigma, or neither
     rotation_sigma: float | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
 
@@ -187,6 +187,7 @@ class _Head(_Entry, frozen=True, kw_only=True):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: float | None = None
+    person: int | str | None = None
     subject: Path | None = None
     start: Path | None = None
     size: bool | None = None

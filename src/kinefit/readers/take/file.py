@@ -7,14 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 import msgspec
 
 from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml
 from kinefit.errors import FileError, TakeError, choices, shortened
-from kinefit.readers.markers import UNITS
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
@@ -34,6 +33,8 @@ from kinefit.readers.take.entries import (
     _Head,
 )
 from kinefit.readers.take.find import find_take
+from kinefit.readers.take.values import wrong_value
+from kinefit.readers.units import LENGTHS, TIMES, worth
 
 __all__ = [
     "CalibrationEntry",
@@ -98,6 +99,8 @@ class Take:
         Name in the catalogue, or absolute path of a body file.
     height : float [m] or None
         Stature of the person, as a first guess.
+    person : int, str or None
+        Who is followed where several people are in view, see `PersonChoice`; None: the one of whom most is seen.
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
@@ -133,6 +136,7 @@ class Take:
     start: Path | None = None
     pose: StartEntry | None = None
     size: bool | None = None
+    person: int | str | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
     surface_points: tuple[SurfacePointsEntry, ...] = ()
@@ -160,17 +164,14 @@ def read_take(path: str | PathLike[str]) -> Take:
     _check_keys(raw, path)
     _rename(raw, path)
     for row in raw.get("depth", []):
-        if str(row.get("unit")).lower() in UNITS:
-            row["unit"] = UNITS[str(row["unit"]).lower()]
+        for key, units in (("unit", LENGTHS), ("time_unit", TIMES)):
+            if (value := worth(row.get(key), units)) is not None:
+                row[key] = value
     folder = path.parent
     try:
         content = msgspec.convert(raw, _File, dec_hook=_path_in(folder))
     except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$.")
-        place = place.rstrip("`")
-        listed = ", ".join(map(repr, _options(place)))
-        remedy = f"There are: {listed}." if listed and "enum" in problem else _form(problem, place)
-        raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
+        raise wrong_value(error, TABLES, path) from error
     head = content.take
     body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
@@ -180,7 +181,8 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size, session=content.session, surface_points=content.surface_points,
+        pose=content.start, size=head.size, person=head.person, session=content.session,
+        surface_points=content.surface_points,
     )  # fmt: skip
     check_take(take)
     return take
@@ -199,28 +201,6 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
         return folder / value
 
     return make
-
-
-def _options(place: str) -> tuple[Any, ...]:
-    """What may be written at a place such as "camera[0].image", where it is one of a few."""
-    table, _, key = place.rpartition(".")
-    entry = TABLES.get(table.partition("[")[0])
-    if entry is None or key not in _fields(entry):
-        return ()
-    hint = get_type_hints(entry)[key]
-    return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
-
-
-def _form(problem: str, place: str) -> str | None:
-    """How a value is written, of which msgspec says that it is of another type."""
-    wanted, _, given = problem.partition(", got ")
-    if "str" in wanted and place.endswith("unit"):
-        return 'Write it in quotes: unit = "mm", "cm" or "m".'
-    if "str" in given and ("float" in wanted or "int" in wanted):
-        return "Write a number, without quotes and without its unit: 1.75."
-    forms = {"str": "Write it in quotes.", "bool": "Write true or false.", "array": "Write a list: [1, 2].",
-             "object": "Write a table: { key = value }."}  # fmt: skip
-    return next((form for kind, form in forms.items() if kind in wanted), None)
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:
