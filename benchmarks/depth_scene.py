@@ -12,13 +12,14 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import FAILED, amount, figure
-from benchmarks.scene_body10 import FOUND, LOST, RATE, Run, Scene, as_frame, disturbed, folder, load_scene, run_scene
+from benchmarks.scene_body10 import FOUND, LOST, RATE, Run, Scene, disturbed, folder, load_scene, run_scene
 
 STARTS, SEEDS, PASSES = range(10, 300, amount(29, 145)), range(amount(3, 1)), 3
 NEVER = 999.0  # [s] for a part that is not found again
@@ -72,7 +73,7 @@ def _accuracy(plain: Scene, occluded: Scene) -> dict[str, float]:
         "scene_lost": 100.0 * runs[1].lost_share,
         "scene_every2_mm": float(runs[2].add.mean()),
         "scene_occluded_lost": 100.0 * hidden.lost_share,
-        "scene_occluded_found_s": _longest_search(hidden.add, unhidden(occluded, hidden)),
+        "scene_occluded_found_s": longest_search(hidden.add, unhidden(occluded, hidden)),
         "scene_start20": started(plain, 20.0),
         "scene_start30": started(plain, 30.0),
         "lost_recall": float(lost.mean()) if len(lost) else np.nan,
@@ -102,7 +103,7 @@ def _flags(scene: Scene, r: Run) -> tuple[NDArray, NDArray]:
     return r.flagged[r.add > LOST], r.flagged[good]
 
 
-def _longest_search(add: NDArray, shown: NDArray) -> float:
+def longest_search(add: NDArray, shown: NDArray) -> float:
     """Longest time [s] from a lost part's coming into view (half of its outline) until it is found again."""
     longest = 0.0
     for away, seen in zip(add.T, shown.T):
@@ -119,16 +120,18 @@ def _longest_search(add: NDArray, shown: NDArray) -> float:
     return longest
 
 
-def started(scene: Scene, degrees: float) -> float:
+def started(
+    scene: Scene, degrees: float, tracker: Callable[[Any, Any, float], Any] = tracker, kinds: Sequence[str] = ("depth",)
+) -> float:
     """Share of parts within 50 mm after three passes over one frame, all joints off by so many degrees at first."""
     within = []
     for i in STARTS:
-        raw = scene.raw(i)
+        frames_at = scene.seen(i, kinds)
         for seed in SEEDS:
             made = tracker(scene.body, scene.rig, RATE)
             made.start_at(disturbed(scene, i, degrees, np.random.default_rng(1000 * seed + i)))
             for step in range(PASSES):
-                result = made.update([as_frame(raw, (i + step) / RATE)])
+                result = made.update(frames_at((i + step) / RATE))
             within.append(scene.add(result.state, i) <= FOUND)
     return float(np.mean(within))
 

@@ -6,6 +6,7 @@ from benchmarks.figures import run_parts
 
 PARTS = {
     "regions_cat": "a real hand-held object before clutter, followed by its mesh",
+    "regions_body10": "a rendered body of ten parts in colour and depth",
     "regions_rendered": "rendered objects in the manner of RBOT: moving light, noise, an occluder, larger steps",
     "regions_people": "the balancing trial by colours alone, beside keypoints, and by the paper's own recipe",
     "regions_speed": "time of a frame of a whole person",

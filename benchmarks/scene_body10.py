@@ -20,7 +20,7 @@ from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.obj import read_obj
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations import DepthFrame
+from kinefit.observations import ColourFrame, DepthFrame
 
 RATE = 30.0  # [Hz] of the rendered frames
 LOST = 100.0  # [mm] ADD above which a part counts as lost, as with M3T
@@ -80,6 +80,26 @@ class Scene:
     def depth(self, i: int) -> DepthFrame:
         """Depth of a frame."""
         return as_frame(self.raw(i), i / RATE)
+
+    def colour(self, i: int) -> NDArray:
+        """(480, 640, 3) uint8 RGB of a frame."""
+        import cv2
+
+        image = cv2.imread(str(self.folder / "color" / f"{i:06d}.png"), cv2.IMREAD_COLOR)
+        if image is None:
+            raise FileNotFoundError(self.folder / "color" / f"{i:06d}.png")
+        return np.ascontiguousarray(image[..., ::-1])
+
+    def seen(self, i: int, kinds: Sequence[str]) -> Callable[[float], list[Any]]:
+        """What sensors of some kinds ("depth", "region") saw in a frame, as read from the disk, as frames of a time."""
+        raw = self.raw(i) if "depth" in kinds else None
+        image = self.colour(i) if "region" in kinds else None
+
+        def frames(time: float) -> list[Any]:
+            depth = [] if raw is None else [as_frame(raw, time)]
+            return depth if image is None else [*depth, ColourFrame("depth", time, image)]
+
+        return frames
 
     def posed(self, state: BodyState) -> NDArray:
         """(V, 3) [m] the meshes' vertices in the world."""
@@ -220,13 +240,14 @@ class Run:
 
 def run_scene(
     scene: Scene, tracker: Callable[[Body, Rig, float], Any], *, every: int = 1, frames: Iterable[int] | None = None,
-    first: BodyState | None = None,
+    first: BodyState | None = None, kinds: Sequence[str] = ("depth",),
 ) -> Run:  # fmt: skip
     """Follow a scene from its truth (or `first`) on, every few frames.
 
     Parameters
     ----------
     tracker : (body, rig, rate) -> an object with `start_at(state)` and `update(frames)`.
+    kinds : of sensors, "depth", "region" or both
     """
     from time import process_time
 
@@ -235,9 +256,9 @@ def run_scene(
     made.start_at(scene.states[chosen[0]] if first is None else first)
     add, ms, results = [], [], []
     for i in chosen:
-        raw = scene.raw(i)
+        frames_at = scene.seen(i, kinds)
         begin = process_time()
-        result = made.update([as_frame(raw, i / RATE)])
+        result = made.update(frames_at(i / RATE))
         ms.append(1e3 * (process_time() - begin))
         add.append(scene.add(result.state, i))
         results.append(result)

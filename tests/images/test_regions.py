@@ -83,8 +83,10 @@ def test_profiles_are_sums_of_log_ratios_along_the_normals():
     table, logs = RANDOM.normal(size=(3, count)).astype(np.float32), RANDOM.normal(size=(2, count)).astype(np.float32)
     half, step, guard, most = 5, 2, 3.0, 1.5
     out = np.empty((30, 2 * half))
+    known = np.zeros((2, 3, 1), np.float32), np.ones((2, 3)), np.zeros((2, count)), np.zeros(3, np.int64), 0.0, most
     kernels.profiles(
-        IMAGE, bins, table, logs, anchor, lines, FACE, LABEL, *WINDOW, JOINED, own, beyond, half, step, guard, most, out
+        IMAGE, bins, table, *known, logs, anchor, lines, FACE, LABEL, *WINDOW, JOINED, own, beyond, half, step, guard,
+        out,
     )  # fmt: skip
     between = np.clip(logs[own] - logs[beyond], -most, most)
     expected = np.zeros_like(out)
@@ -168,7 +170,11 @@ def test_ratios_are_found_when_they_are_asked_for():
     s, _, _, colours = statistics()
     ratios, (bins, _) = colours.ratios(s), colour_bins(s.space, s.levels)
     lines, anchor = contour(), RANDOM.integers(0, 3, 30)
-    kernels.look_up(IMAGE, bins, *ratios.packed, anchor, lines, 8)
+    own = np.zeros(30, np.int64), np.full(30, -1)
+    kernels.profiles(
+        IMAGE, bins, *ratios.packed, ratios.logs, anchor, lines, FACE, LABEL, *WINDOW, JOINED, *own, 8, 1, 3.0,
+        np.empty((30, 16)),
+    )  # fmt: skip
     a, b = np.nonzero(ratios.table < kernels.UNKNOWN)
     assert 50 < len(a) < ratios.table.size
     np.testing.assert_allclose(ratios.table[a, b], ratios.at(a, b), atol=1e-5)

@@ -148,6 +148,12 @@ class RimFinder:
         assert self._last is not None
         return self._last[2].face
 
+    @property
+    def depth(self) -> NDArray:
+        """(h, w) float32 [m] along the optical axis, of the same window, inf for none."""
+        assert self._last is not None
+        return self._last[2].depth
+
     def find(
         self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
         close: int | None = None, others: Sequence[tuple[NDArray, NDArray]] = (),

@@ -12,10 +12,10 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_closures
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
-from kinefit.frame.prediction import belief
+from kinefit.frame.prediction import belief, forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
-from kinefit.frame.trust import forgotten, holding, left_out, levered, moving, observed, unseen
+from kinefit.frame.trust import forgotten, holding, leapt, left_out, levered, moving, observed, unseen
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
@@ -47,12 +47,15 @@ class Fitted:
     ----------
     seen : (D,) bool, coordinates that this frame's measurements observe
     known : (D,) bool, those, and what was known before and is not lost now
+    released : (n,) bool, degrees of freedom that were found where their prediction had them not, and so do not go on
+        as they went; None where there are none
     """
 
     result: FrameResult
     filtered: NDArray
     seen: NDArray
     known: NDArray
+    released: NDArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +109,16 @@ class FrameFit:
             gain = found.cost - other.cost if every else sum(e.balance for e in also) - sum(e.balance for e in told)
             if gain > 0.0:
                 found, told = other, also
+        released: NDArray | None = None
         for m, one in zip(measurements, list(told)):
             for state in m.starts(scene, None if held is None else held[1], one):
-                other = self._fitted(scene.at(state), held, measurements)
+                free = None if held is None else leapt(*held, state)
+                other = self._fitted(scene.at(state), _without(held, free), measurements)
                 also = evidence_of(other.scene, other.matched)
-                if sum(e.balance for e in also) > sum(e.balance for e in told):
-                    found, told = other, also
-        return self._judged(found, held, told, known)
+                better = m.better(other.scene, found.scene)
+                if sum(e.balance for e in also) > sum(e.balance for e in told) if better is None else better:
+                    found, told, released = other, also, free
+        return replace(self._judged(found, _without(held, released), told, known), released=released)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
         settled = all(m.settled for m in measurements)
@@ -335,6 +341,10 @@ def weaker(rows: AnyRows, factor: float) -> AnyRows:
     if isinstance(rows, Rows):
         return rows.weaker(factor)
     return replace(rows, weight=rows.weight / factor**2)
+
+
+def _without(held: Held | None, free: NDArray | None) -> Held | None:
+    return held if held is None or free is None else (held[0], forgetting(held[1], free))
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import BodyState
 from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
@@ -18,6 +19,7 @@ from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances
 
+_LEAP = 4.0  # deviations of a prediction, beyond which a start is not held by it
 _MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and has no prior
 
 
@@ -91,6 +93,14 @@ def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArra
     out = np.where(gone[:, None] | gone[None, :], 0.0, covariance)
     out[gone, gone] = prior[gone] ** 2
     return out
+
+
+def leapt(predicted: BodyState, information: NDArray, state: BodyState) -> NDArray | None:
+    """(n,) bool: angles that a start has changed by more than the prediction allows; None where there are none."""
+    off, std = predicted.difference(state), np.sqrt(variances(information))
+    out = np.abs(off) > _LEAP * std
+    out[:6] = False
+    return out if out.any() else None
 
 
 def left_out(rows: AnyRows, segments: NDArray) -> AnyRows:

@@ -36,8 +36,14 @@ def count(image, bins, face, label, left, top, scale, box, inside, near, far):
         for x in range(0, width, 6):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
                 far[bins[_colour(image, y, x)]] += 1.0
+    beside = math.ceil(2.0 * scale) + 1
     for y in range(max(box[1], 0), min(box[3], height), 3):
+        j = math.floor((y - top + 0.5) * scale)
         for x in range(max(box[0], 0), min(box[2], width), 3):
+            i = math.floor((x - left + 0.5) * scale)
+            if not (-beside <= i < face.shape[1] + beside and -beside <= j < face.shape[0] + beside):
+                near[bins[_colour(image, y, x)]] += 1.0
+                continue
             here = part(face, label, x, y, left, top, scale)
             if part(face, label, x - 2, y, left, top, scale) != here:
                 continue
@@ -89,43 +95,30 @@ def part(face, label, x, y, left, top, scale):
 
 
 @jit
-def look_up(image, bins, table, own, total, general, inner, floor, most, anchor, contour, reach):
-    """Find the log ratios of all colours within `reach` [px] of a contour (4, N) that are UNKNOWN in a table (A, B).
-
-    own (2, A, B) pixels counted inside and outside near each anchor; general (G + 1, B) of each part of the body, and
-    last of what is outside, of which anchors have the parts inner (A,); both divided by total (2, A). To both densities
-    `floor` is added; ratios lie between -most and most. Points whose anchor (N,) is -1 need none.
-    """
-    height, width = image.shape[:2]
-    outer = len(general) - 1
-    for p in range(contour.shape[1]):
-        u, v, x, y, a = contour[0, p], contour[1, p], contour[2, p], contour[3, p], anchor[p]
-        if a < 0:
-            continue
-        for k in range(-reach, reach):
-            i, j = math.floor(u + (k + 0.5) * x + 0.5), math.floor(v + (k + 0.5) * y + 0.5)
-            if not (0 <= i < width and 0 <= j < height):
-                continue
-            b = bins[_colour(image, j, i)]
-            if table[a, b] == UNKNOWN:
-                inside = (own[0, a, b] + general[inner[a], b]) / total[0, a] + floor
-                told = math.log(inside / ((own[1, a, b] + general[outer, b]) / total[1, a] + floor))
-                table[a, b] = most if told > most else -most if told < -most else told
+def _found(table, own, total, general, inner, floor, most, a, b):
+    """Log ratio of a bin near an anchor, which a table (A, B) keeps from now on; see `profiles`."""
+    inside = (own[0, a, b] + general[inner[a], b]) / total[0, a] + floor
+    told = math.log(inside / ((own[1, a, b] + general[len(general) - 1, b]) / total[1, a] + floor))
+    table[a, b] = most if told > most else -most if told < -most else told
+    return table[a, b]
 
 
 @jit
 def profiles(
-    image, bins, table, logs, anchor, contour, face, label, left, top, scale, joined, own, beyond, half, step, guard,
-    most, out,
+    image, bins, table, counts, total, general, inner, floor, most, logs, anchor, contour, face, label, left, top,
+    scale, joined, own, beyond, half, step, guard, out,
 ):  # fmt: skip
     """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 
     Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log
-    ratios, of which a point has the row of its anchor (N,); `look_up` must have found them. Where that is -1 the point
-    lies before another part of the body, and the ratio is that of both parts, of whose densities the logarithms are
-    logs (G, B). face (h, w) is the body as drawn, label (T,) the part of each face, see `count`. Where a line leaves
-    what is `joined` (G + 1, G + 1, the last one what is around the body) with its point's part own (N,) inside, or
-    beyond (N,) outside, it tells nothing any more (0); `guard` [px] about the contour always tell.
+    ratios between -most and most, of which a point has the row of its anchor (N,). What is UNKNOWN in it is found from
+    counts (2, A, B) of pixels inside and outside near each anchor, and general (G + 1, B) of each part of the body, and
+    last of what is outside, of which anchors have the parts inner (A,); both divided by total (2, A), and `floor` added
+    to both densities. Where the anchor is -1 the point lies before another part of the body, and the ratio is that of
+    both parts, of whose densities the logarithms are logs (G + 1, B). face (h, w) is the body as drawn, label (T,) the
+    part of each face, see `count`. Where a line leaves what is `joined` (G + 1, G + 1, the last one what is around the
+    body) with its point's part own (N,) inside, or beyond (N,) outside, it tells nothing any more (0); `guard` [px]
+    about the contour always tell.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -151,7 +144,10 @@ def profiles(
                                 break
                         c = bins[_colour(image, j, i)]
                         if a_ >= 0:
-                            told += table[a_, c]
+                            t = table[a_, c]
+                            if t == UNKNOWN:
+                                t = _found(table, counts, total, general, inner, floor, most, a_, c)
+                            told += t
                         else:
                             t = logs[own[p], c] - logs[beyond[p], c]
                             told += most if t > most else -most if t < -most else t
@@ -232,3 +228,24 @@ def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
                 if face[j, i] >= 0:
                     total += ratios[j, i]
         out[m] = total
+
+
+@jit
+def likelihood(image, bins, logs, face, label, left, top, scale):
+    """How much better a body as it was drawn explains an image than no body does: a sum of log ratios over pixels.
+
+    logs (G + 1, B) of the densities of each part's colours and, last, of what is around; face, label and so on as of
+    `count`. A pixel of the drawing that is larger than the image's counts as many.
+    """
+    total, height, width = 0.0, image.shape[0], image.shape[1]
+    around = len(logs) - 1
+    for j in range(face.shape[0]):
+        y = math.floor((j + 0.5) / scale - 0.5 + top + 0.5)
+        if not 0 <= y < height:
+            continue
+        for i in range(face.shape[1]):
+            x = math.floor((i + 0.5) / scale - 0.5 + left + 0.5)
+            if face[j, i] >= 0 and 0 <= x < width:
+                b = bins[_colour(image, y, x)]
+                total += logs[label[face[j, i]], b] - logs[around, b]
+    return total / (scale * scale)

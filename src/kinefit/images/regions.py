@@ -82,6 +82,7 @@ class RegionSettings:
     alike : float [px] of the contour along which errors are alike: as many measurements count as there are such pieces
     lines : int, contour points, about
     loss : float [standard deviations] scale of the robust loss
+    flips : int, mirrored limbs that a fit is begun at, every `TrackSettings.search_every`
     search : SearchSettings
     """
 
@@ -101,6 +102,7 @@ class RegionSettings:
     alike: float = 15.0
     lines: int = 200
     loss: float = 2.0
+    flips: int = 2
     search: SearchSettings = field(default_factory=SearchSettings)
 
 
@@ -178,7 +180,7 @@ class RegionColours:
             told = np.log((inside + floor) / (outside + floor))
             return np.ascontiguousarray(np.clip(told, -s.most, s.most), np.float32)
 
-        whole, logs = ratio(body), np.log(parts + floor).astype(np.float32)
+        whole, logs = ratio(body), np.log(general + floor).astype(np.float32)
         if not s.anchors:
             every = np.arange(len(parts))
             none = np.zeros((2, len(parts), 1), np.float32), np.ones((2, len(parts)))
@@ -202,7 +204,7 @@ class Ratios:
     whole : (B,) float32 of the body as a whole
     table : (A, B) float32 at each anchor, UNKNOWN where it was not asked for yet
     own, total, general, of, floor, most : what they are found from
-    logs : (G, B) float32 logarithms of the densities of each part
+    logs : (G + 1, B) float32 logarithms of the densities of each part and, last, of what is around
     """
 
     whole: NDArray
@@ -217,7 +219,7 @@ class Ratios:
 
     @property
     def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float, float]:
-        """As kernels take them."""
+        """As `kernels.profiles` takes them."""
         return self.table, self.own, self.total, self.general, self.of, self.floor, self.most
 
     def at(self, anchor: NDArray, bins: NDArray) -> NDArray:

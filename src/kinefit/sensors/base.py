@@ -179,6 +179,13 @@ class Measurement(ABC):
         """
         return ()
 
+    def better(self, new: Scene, old: Scene) -> bool | None:
+        """Whether a fit that began at one of the `starts` is to be taken in place of what was found.
+
+        None for a sensor that knows no better than the sum of what all sensors' evidence says.
+        """
+        return None
+
     def depth_image(self) -> DepthSeen | None:
         """A depth image that other sensors may ask what is in front of something."""
         return None

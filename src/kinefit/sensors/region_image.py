@@ -37,11 +37,9 @@ class Coloured:
     def profiles(self, lines: Lines, drawn: Drawn, half: int, step: int, guard: float) -> NDArray:
         """(N, 2 half) log ratios along the normals of a contour; see `kernels.profiles`."""
         out, r = np.empty((len(lines.anchor), 2 * half)), self.ratios
-        if r.own.shape[2] > 1:
-            kernels.look_up(self.image, self.bins, *r.packed, lines.anchor, lines.outline, half * step)
         kernels.profiles(
-            self.image, self.bins, r.table, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond, half,
-            step, guard, r.most, out,
+            self.image, self.bins, *r.packed, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond,
+            half, step, guard, out,
         )  # fmt: skip
         return out
 
@@ -77,8 +75,8 @@ class Kept(Coloured):
         own = replace(lines, outline=moved, anchor=np.zeros_like(lines.anchor))
         out, r = np.empty((len(own.anchor), 2 * half)), self.ratios
         kernels.profiles(
-            self._painted, self.bins, r.table, r.logs, own.anchor, moved, *there, own.own, own.beyond, half, step,
-            guard, r.most, out,
+            self._painted, self.bins, *r.packed, r.logs, own.anchor, moved, *there, own.own, own.beyond, half, step,
+            guard, out,
         )  # fmt: skip
         return out
 

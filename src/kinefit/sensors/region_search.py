@@ -67,7 +67,7 @@ class Seeker:
 
 def region_starts(
     scene: Scene, camera: Camera, seeker: Seeker, image: NDArray, bins: NDArray, ratio: NDArray,
-    information: NDArray | None, told: Evidence, s: SearchSettings,
+    information: NDArray | None, told: Evidence, s: SearchSettings, *, rigid: bool = True,
 ) -> list[BodyState]:  # fmt: skip
     """States from which a fit may as well begin, the best first; none where the body is where it was expected.
 
@@ -77,6 +77,7 @@ def region_starts(
     image, bins, ratio : (H, W, 3) uint8 RGB, and the log ratio (B,) of each bin of colours
     information : (n, n) of where it is expected, None where nothing is known
     told : what the image says of the state that was found from there
+    rigid : whether the body is; one that is not is sought only if it is not where it was found, as a whole
     """
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
     x, size, spread = seeker.posed(scene.pose.vertices), seeker.size, np.full(6, np.inf)
@@ -84,7 +85,7 @@ def region_starts(
         arm = se3.hat(scene.state.T_world_root[:3, 3] - x.mean(axis=0))
         J = np.block([[R, R @ arm], [np.zeros((3, 3)), R]])
         spread = np.sqrt(np.diag(J @ inverse(information)[:6, :6] @ J.T))
-    rough = spread[:3].max() > s.far * size or spread[3:].max() > s.turn
+    rough = rigid and (spread[:3].max() > s.far * size or spread[3:].max() > s.turn)
     agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
     if not rough and agreeing >= s.poor * (agreeing + contrary):
         return []

@@ -10,36 +10,37 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.correspondences import _kernels, _kernels_outlines
-from kinefit.correspondences.morphed import morphed_outline_rows
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios, RegionColours, colour_bins
-from kinefit.losses import Loss, geman_mcclure
+from kinefit.losses import geman_mcclure
 from kinefit.observations import ColourFrame
-from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
+from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_image import Coloured, kept
+from kinefit.sensors.region_matched import RegionMatched
 from kinefit.sensors.region_parts import Drawn, Lines, Parts
-from kinefit.sensors.region_search import Seeker, region_starts
+from kinefit.sensors.region_seams import SPACING, Seams
+from kinefit.sensors.region_starts import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
 _CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
+# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
+# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
+_FIRST, _OFTEN = 10, 0.05
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
+_GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
 _STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
 _GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a state may be off its drawing
 # Of the median offset of lines, in deviations, that the loss takes for one: the fit then needs 5 steps in place of 6,
@@ -73,7 +74,8 @@ class RegionSensor(Sensor):
         self.ratios: Ratios | None = None
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
-        self._seeker: Seeker | None = None
+        self._starts: Starts | None = None
+        self._learnt = -np.inf  # [s] when colours were blended in last
 
     def parts(self, scene: Scene) -> Parts:
         """Parts of the body that have colours of their own."""
@@ -81,12 +83,11 @@ class RegionSensor(Sensor):
             self._parts = Parts(scene.body, scene.surface.morphing.mesh, self.regions.anchors, self.regions.parts)
         return self._parts
 
-    def seeker(self, scene: Scene) -> Seeker:
-        """What draws a coarse mesh of the body."""
-        if self._seeker is None:
-            mesh = scene.surface.morphing.mesh
-            self._seeker = Seeker(mesh.vertices, mesh.faces)
-        return self._seeker
+    def starts(self, scene: Scene) -> Starts:
+        """What the body is sought with."""
+        if self._starts is None:
+            self._starts = Starts(scene, self.parts(scene).label, self.settings)
+        return self._starts
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
         """The image with what is known of colours; before anything is known they are those at the scene's state.
@@ -104,7 +105,7 @@ class RegionSensor(Sensor):
         m = RegionMeasurement(self, frame, scene)
         if not self._stated:
             self._stated = True
-            if scene.body.skin is not None or any(isinstance(s, TaperedCylinder) for s in scene.body.surfaces):
+            if self.parts(scene).simple:
                 self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
         if not self.colours.images:
             self._know(m, scene)
@@ -126,7 +127,9 @@ class RegionSensor(Sensor):
             return
         off = 2.0 * measurement.off(scene)
         self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        self._know(measurement, scene, wrong)
+        if parts.count == 1 or self.colours.images < _FIRST or abs(measurement.time - self._learnt) > _OFTEN:
+            self._know(measurement, scene, wrong)
+            self._learnt = measurement.time
 
     def _know(self, measurement: RegionMeasurement, scene: Scene, wrong: NDArray | None = None) -> None:
         self.colours = measurement.counted(scene, self.colours, wrong)
@@ -163,6 +166,7 @@ class RegionMeasurement(Measurement):
         self._lines: Lines | None = None
         self._told: tuple[Rim, Evidence] | None = None
         self.clear = 0.0
+        self._judged: BodyState | None = None
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -249,21 +253,60 @@ class RegionMeasurement(Measurement):
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
         spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
-        return RegionMatched(self, rim, place, weight, geman_mcclure(s.loss * spread))
+        loss = geman_mcclure(s.loss * spread)
+        seams = self._seams(scene, step)
+        return RegionMatched(self, rim, place, weight, loss, *seams)
+
+    def _seams(self, scene: Scene, step: int) -> tuple[Seams | None, NDArray, NDArray]:
+        """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
+        of, s, none = self.of, self.of.regions, np.zeros(0)
+        parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
+        if parts.simple or parts.count == 1 or seen is None or self.image is None or not scene.surface.morphing.is_rigid:
+            return None, none, none
+        drawn = self._drawn(scene)
+        seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
+        told = np.empty((3, len(seams)))
+        kernels.places(seen.profiles(seams.lines, drawn, s.half, step, _GUARD), float(step), s.heat, told)
+        share = min(SPACING / drawn.scale / s.alike, 1.0)
+        return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
 
     def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Where colours alone show the body, if it is expected too roughly, or not where it was found."""
-        of, seen = self.of, self.seen
+        """Where colours alone show the body, if it is expected too roughly, or not where it was found.
+
+        Of a body of parts that nothing else was measured of, also where its limbs may be.
+        """
+        of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
         if self.image is None or seen is None or not of.settings.search:
             return ()
-        return region_starts(
-            scene, scene.placed(of.camera), of.seeker(scene), self.image, of.bins, seen.ratios.whole, information, told,
-            of.regions.search,
-        )  # fmt: skip
+        whole = of.starts(scene).whole(scene, camera, seen, information, told)
+        if whole or information is None or found is None or not self._alone(scene):
+            return whole
+        return of.starts(scene).limbs(scene, camera, seen, information, told, found, self.time)
+
+    def _alone(self, scene: Scene) -> bool:
+        """Whether nothing else was measured of a body of rigid parts: its colours alone then tell where limbs are."""
+        rigid = scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1
+        return rigid and len(scene.measurements) == 1
+
+    def better(self, new: Scene, old: Scene) -> bool | None:
+        """Of a body of parts: whether the colours of all its pixels say so."""
+        if self.image is None or not self._alone(new):
+            return None
+        gain = self._explained(new) - self._explained(old)
+        self._last = None  # what was drawn last is neither
+        return gain > _GAIN
+
+    def _explained(self, scene: Scene) -> float:
+        """By how much better the body where a scene has it explains the image than no body does, in logarithms."""
+        assert self.seen is not None
+        camera = scene.placed(self.of.camera)
+        scene.surface.rims(camera).find(scene.pose.vertices, camera, spacing=_WIDE, close=self.of.settings.outline)
+        return kernels.likelihood(self.seen.image, self.seen.bins, self.seen.ratios.logs, *self._drawn(scene)[:5])
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
         rim, areas = self.rim(scene), scene.surface.areas
+        self._judged = scene.state
         if self._told is not None and self._told[0] is rim:
             return self._told[1]
         told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
@@ -288,55 +331,3 @@ class RegionMeasurement(Measurement):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last": None, "_lines": None, "_told": None}
-
-
-@dataclass(frozen=True, eq=False)
-class RegionMatched(Matched):
-    """A colour image with the places of the contour along its normals.
-
-    Parameters
-    ----------
-    measurement : RegionMeasurement
-    rim : Rim, N points of the body's occluding contour, of edges of its mesh
-    place : (4, N) u, v [px] of where the contour is, and unit normals
-    weight : (N,) [1/px²]
-    loss : Loss
-    """
-
-    measurement: RegionMeasurement
-    rim: Rim
-    place: NDArray
-    weight: NDArray
-    loss: Loss
-    of_points = False
-
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
-        n, camera = len(self.rim), scene.placed(self.measurement.of.camera)
-        numbers = np.arange(n)
-        if not scene.surface.morphing.is_rigid:
-            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, (numbers, numbers), sigma=1.0)
-            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss)]
-        data, segment, group = _kernels.buffers(n)
-        used = _kernels_outlines.tangent_rows(
-            camera.packed, np.ascontiguousarray(scene.pose.vertices), self.rim.vertices, self.rim.share,
-            self.rim.segment, self.place, numbers, numbers, 1.0, data, segment, group,
-        )  # fmt: skip
-        data[7, :used] *= self.weight[group[:used]]
-        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss)]
-
-    def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        return self.measurement.evidence(scene)
-
-    def leftovers(self, scene: Scene) -> list[Leftover]:
-        """Distances [px], in the camera's own image, of the image's contour from the body's, by segments."""
-        uv = scene.placed(self.measurement.of.camera).project(self.rim.on(scene.pose.vertices))
-        away = np.sum(self.place[2:].T * (self.place[:2].T - uv), axis=1)
-        seen = np.isfinite(away) & (self.weight > 0.0)
-        return [by_segments(self.sensor, scene.body, away[seen], self.rim.segment[seen], "px")]

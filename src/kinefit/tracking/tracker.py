@@ -304,7 +304,11 @@ class Tracker:
     def _take(self, fitted: Fitted, time: float) -> None:
         """Go on from a fit that took its prediction into account."""
         state = fitted.result.state
-        self._prediction.correct(state, fitted.filtered)
+        if fitted.released is None:
+            self._prediction.correct(state, fitted.filtered)
+        else:
+            std = np.sqrt(np.maximum(np.diag(fitted.filtered), 0.0))
+            self._prediction.go_on(state, std, np.where(fitted.released, 0.0, self._prediction.velocity))
         self._seen = np.where(fitted.seen, time, np.where(fitted.known, self._seen, -np.inf))
         chart = off_the_limits(self.body.tree, state.angles)
         if chart is not None:

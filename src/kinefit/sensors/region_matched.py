@@ -1,0 +1,81 @@
+"""What a colour image says of where a body's contour is, frozen: a row for each line across it, and for each seam."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.correspondences import _kernels, _kernels_outlines
+from kinefit.correspondences.morphed import morphed_outline_rows
+from kinefit.correspondences.rims import Rim
+from kinefit.losses import Loss
+from kinefit.rows import AnyRows, Rows
+from kinefit.sensors.base import Leftover, Matched, by_segments
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.region_seams import Seams
+from kinefit.sensors.scene import Scene
+
+if TYPE_CHECKING:
+    from kinefit.sensors.regions import RegionMeasurement
+
+
+@dataclass(frozen=True, eq=False)
+class RegionMatched(Matched):
+    """A colour image with the places of the contour along its normals.
+
+    Parameters
+    ----------
+    measurement : RegionMeasurement
+    rim : Rim, N points of the body's occluding contour, of edges of its mesh
+    place : (4, N) u, v [px] of where the contour is, and unit normals
+    weight : (N,) [1/px²]
+    loss : Loss
+    seams : Seams, optional
+    off, sure : (M,) [px], [1/px²] how far each of its points is from where the image shows it, and how sure that is
+    """
+
+    measurement: RegionMeasurement
+    rim: Rim
+    place: NDArray
+    weight: NDArray
+    loss: Loss
+    seams: Seams | None
+    off: NDArray
+    sure: NDArray
+    of_points = False
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the sensor."""
+        return self.measurement.sensor
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
+        seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
+        n, camera = len(self.rim), scene.placed(self.measurement.of.camera)
+        numbers = np.arange(n)
+        if not scene.surface.morphing.is_rigid:
+            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, (numbers, numbers), sigma=1.0)
+            return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss), *seams]
+        data, segment, group = _kernels.buffers(n)
+        used = _kernels_outlines.tangent_rows(
+            camera.packed, np.ascontiguousarray(scene.pose.vertices), self.rim.vertices, self.rim.share,
+            self.rim.segment, self.place, numbers, numbers, 1.0, data, segment, group,
+        )  # fmt: skip
+        data[7, :used] *= self.weight[group[:used]]
+        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss), *seams]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """Points of each segment's contour at which colours change as they should, and those at which they do not."""
+        return self.measurement.evidence(scene)
+
+    def leftovers(self, scene: Scene) -> list[Leftover]:
+        """Distances [px], in the camera's own image, of the image's contour from the body's, by segments."""
+        uv = scene.placed(self.measurement.of.camera).project(self.rim.on(scene.pose.vertices))
+        away = np.sum(self.place[2:].T * (self.place[:2].T - uv), axis=1)
+        seen = np.isfinite(away) & (self.weight > 0.0)
+        return [by_segments(self.sensor, scene.body, away[seen], self.rim.segment[seen], "px")]

@@ -1,0 +1,80 @@
+"""Where else a body may be than where its contour was found: as a whole, a limb mirrored, a limb somewhere else."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import BodyState
+from kinefit.geometry.camera import Camera
+from kinefit.sensors.evidence import BELIEVED, Evidence
+from kinefit.sensors.region_flips import Flips
+from kinefit.sensors.region_image import Coloured
+from kinefit.sensors.region_limbs import Limbs
+from kinefit.sensors.region_search import Seeker, region_starts
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+
+
+class Starts:
+    """What one sensor has of a body for its searches, and whose turn it is.
+
+    Parameters
+    ----------
+    scene : Scene with the body
+    label : (T,) part of the body that each face of its skin belongs to
+    settings : TrackSettings
+    """
+
+    def __init__(self, scene: Scene, label: NDArray, settings: TrackSettings) -> None:
+        self._body, self._mesh, self._label = scene.body, scene.surface.morphing.mesh, label
+        self._jointed = len(scene.body.tree.segments) > 1
+        self._settings, self._turn, self._sought = settings, 0, -np.inf
+
+    @cached_property
+    def _seeker(self) -> Seeker:
+        return Seeker(self._mesh.vertices, self._mesh.faces)
+
+    @cached_property
+    def _flips(self) -> Flips:
+        mesh = self._mesh
+        count = np.maximum(np.bincount(mesh.segment, minlength=len(self._body.tree.segments)), 1)
+        sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
+        return Flips(self._body, np.array(sums).T / count[:, None] - self._body.tree.rest)
+
+    @cached_property
+    def _limbs(self) -> Limbs:
+        return Limbs(self._body, self._mesh, self._label)
+
+    def whole(
+        self, scene: Scene, camera: Camera, seen: Coloured, information: NDArray | None, told: Evidence
+    ) -> list[BodyState]:
+        """Of the body as a whole; see `region_starts`."""
+        return region_starts(
+            scene, camera, self._seeker, seen.image, seen.bins, seen.ratios.whole, information, told,
+            self._settings.regions.search, rigid=not self._jointed,
+        )  # fmt: skip
+
+    def limbs(
+        self, scene: Scene, camera: Camera, seen: Coloured, information: NDArray, told: Evidence, found: BodyState,
+        time: float,
+    ) -> list[BodyState]:  # fmt: skip
+        """Of limbs, at most every `TrackSettings.search_every`: some mirrored, and one sought, which is lost if any is.
+
+        Parameters
+        ----------
+        found : the state that was found, of which `told` says how it agrees
+        """
+        limbs, flips, s = self._limbs, self._flips, self._settings
+        if not limbs.segments or abs(time - self._sought) < s.search_every - 1e-6:
+            return []
+        self._sought, self._turn = time, self._turn + 1
+        poor = [k for k, limb in enumerate(limbs.segments) if (told.quality[limb] < BELIEVED).any()]
+        turns = poor or range(len(limbs.segments))
+        limb = turns[self._turn % len(turns)]
+        near = flips.near(scene.state, information, found, camera)[: s.regions.flips]
+        sought = limbs.sought(limb, found, list(flips.of(found, camera)), seen, camera)
+        leapt = [sought] if np.abs(sought.angles - found.angles).max() > 0.0 else []
+        return [*near, *leapt, *flips.untwisted(found, limbs.segments[limb])]
