@@ -261,7 +261,8 @@ class RegionMeasurement(Measurement):
         """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
         of, s, none = self.of, self.of.regions, np.zeros(0)
         parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
-        if parts.simple or parts.count == 1 or not scene.surface.morphing.is_rigid or seen is None or self.image is None:
+        known = parts.count > 1 and not parts.simple and scene.surface.morphing.is_rigid
+        if not known or seen is None or self.image is None:
             return None, none, none
         drawn = self._drawn(scene)
         seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
