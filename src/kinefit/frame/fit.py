@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_closures
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
-from kinefit.frame.prediction import belief, forgetting
+from kinefit.frame.prediction import belief, released_from
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
 from kinefit.frame.trust import forgotten, holding, leapt, left_out, levered, moving, observed, unseen
@@ -47,8 +47,7 @@ class Fitted:
     ----------
     seen : (D,) bool, coordinates that this frame's measurements observe
     known : (D,) bool, those, and what was known before and is not lost now
-    released : (n,) bool, degrees of freedom that were found where their prediction had them not, and so do not go on
-        as they went; None where there are none
+    released : (n,) bool, optional: degrees of freedom that were found where they were not expected
     """
 
     result: FrameResult
@@ -113,12 +112,12 @@ class FrameFit:
         for m, one in zip(measurements, list(told)):
             for state in m.starts(scene, None if held is None else held[1], one):
                 free = None if held is None else leapt(*held, state)
-                other = self._fitted(scene.at(state), _without(held, free), measurements)
+                other = self._fitted(scene.at(state), released_from(held, free), measurements)
                 also = evidence_of(other.scene, other.matched)
-                better = m.better(other.scene, found.scene)
-                if sum(e.balance for e in also) > sum(e.balance for e in told) if better is None else better:
+                gain = sum(e.balance for e in also) - sum(e.balance for e in told)
+                if gain > 0.0 if (better := m.better(other.scene, found.scene)) is None else better:
                     found, told, released = other, also, free
-        return replace(self._judged(found, _without(held, released), told, known), released=released)
+        return replace(self._judged(found, released_from(held, released), told, known), released=released)
 
     def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
         settled = all(m.settled for m in measurements)
@@ -341,10 +340,6 @@ def weaker(rows: AnyRows, factor: float) -> AnyRows:
     if isinstance(rows, Rows):
         return rows.weaker(factor)
     return replace(rows, weight=rows.weight / factor**2)
-
-
-def _without(held: Held | None, free: NDArray | None) -> Held | None:
-    return held if held is None or free is None else (held[0], forgetting(held[1], free))
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

@@ -125,3 +125,8 @@ def forgetting(information: NDArray, lost: NDArray) -> NDArray:
     out = np.zeros_like(information)
     out[np.ix_(kept, kept)] = inverse(inverse(information)[np.ix_(kept, kept)])
     return out
+
+
+def released_from(held: tuple[BodyState, NDArray] | None, free: NDArray | None) -> tuple[BodyState, NDArray] | None:
+    """What is held, a state and its information (n, n), without some degrees of freedom (n,) bool, None for none."""
+    return held if held is None or free is None else (held[0], forgetting(held[1], free))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
+from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -34,10 +34,10 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
-_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
 # A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
 # after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
 _FIRST, _OFTEN = 10, 0.05
+_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -164,9 +164,9 @@ class RegionMeasurement(Measurement):
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self._lines: Lines | None = None
-        self._told: tuple[Rim, Evidence] | None = None
-        self.clear = 0.0
+        self._told: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
         self._judged: BodyState | None = None
+        self.clear = 0.0
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -306,10 +306,11 @@ class RegionMeasurement(Measurement):
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas = self.rim(scene), scene.surface.areas
         self._judged = scene.state
-        if self._told is not None and self._told[0] is rim:
+        about = scene.state, scene.body, scene.placed(self.of.camera)
+        if self._told is not None and all(a is b for a, b in zip(self._told[0], about)):
             return self._told[1]
+        rim, areas = self.rim(scene), scene.surface.areas
         told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
         step = max(_JUDGED, math.ceil(_ROOM * agrees / self.of.regions.half))
         kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, told)
@@ -319,7 +320,7 @@ class RegionMeasurement(Measurement):
         spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self._told, self.clear = (rim, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
+        self._told, self.clear = (about, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
         return out
 
     def compact(self) -> RegionMeasurement:
