@@ -5,6 +5,7 @@ figure can still be measured, `python -m benchmarks.AREA [PART ...] [--quick]` o
 """
 
 AREAS = (
-    "solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "closures", "product",
+    "solver", "video", "depth", "silhouettes", "regions", "photogrammetry", "markers", "mixed", "people", "closures",
+    "product",
 )  # fmt: skip
 """Modules that run alone."""

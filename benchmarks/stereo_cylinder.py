@@ -49,7 +49,8 @@ def run() -> None:
     mask = np.zeros(SIZE[::-1], bool)
     mask[SPECKLE] = True
     grid = Grid.of(SIZE, amount(STEP, 24), mask=mask, margin=30)
-    start = measure(rig, states[0], grid, window=WINDOW)
+    whole = Grid.of(SIZE, STEP, mask=mask, margin=30)  # also in the quick form: the cameras are adjusted to all points
+    start = measure(rig, states[0], whole, window=WINDOW)
     rig = adjusted(rig, objects, start.uv[start.measured])
     surfaces = measure_states(rig, states, grid, window=WINDOW)
     for k, surface in enumerate(surfaces, 1):

@@ -42,6 +42,15 @@ def test_lengths_beyond_the_file_are_refused_at_once(png):
     assert time.process_time() - began < 1.0
 
 
+def test_a_closing_chunk_that_claims_a_length_is_refused_in_little_memory(png, monkeypatch):
+    data = png.read_bytes()
+    end = data.rindex(b"IEND") - 4
+    png.write_bytes(data[:end] + struct.pack(">I", 2**29) + data[end + 4 :])
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the decoder would fill half a gigabyte"))
+    with pytest.raises(FileError, match="no image"):
+        read_picture(png)
+
+
 def test_no_file_is_told(tmp_path):
     with pytest.raises(FileError, match="cannot be read"):
         read_picture(tmp_path / "none.png")

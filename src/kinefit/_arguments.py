@@ -7,7 +7,7 @@ import os
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from kinefit.errors import ObservationError
 
 F = TypeVar("F", bound=Callable[..., Any])
+Test = Callable[[Any], bool]
 
 
 def checked(function: F) -> F:
@@ -29,20 +30,18 @@ def checked(function: F) -> F:
     ObservationError
         When it is called: the argument's name, its type and what is wanted.
     """
-    signature = inspect.signature(function)
+    parameters = inspect.signature(function).parameters.values()
+    placed = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
 
     @wraps(function)
     def call(*args: Any, **more: Any) -> Any:
-        given = signature.bind(*args, **more).arguments
-        hints = _hints(function)
-        for name, value in given.items():
-            kind = signature.parameters[name].kind
-            several = kind in (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-            if name in hints and not several and not _fits(value, hints[name]):
+        tests = _tests(function)
+        for name, value in (*zip(placed, args), *more.items()):
+            if name in tests and not tests[name](value):
                 problem = f"{function.__name__}: {name} is a {type(value).__name__}"
                 if isinstance(value, Sequence | Mapping) and not isinstance(value, str):
                     problem += " that does not hold what it should, or none is wanted"
-                raise ObservationError(problem, remedy=f"It takes {_told(hints[name])}.")
+                raise ObservationError(problem, remedy=f"It takes {_told(_hints(function)[name])}.")
         return function(*args, **more)
 
     return typing.cast(F, call)
@@ -56,32 +55,49 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
         return {}
 
 
-def _fits(value: Any, hint: Any) -> bool:
+@cache
+def _tests(function: Callable[..., Any]) -> dict[str, Test]:
+    """Of each argument with an annotation, whether a value is of it."""
+    parameters, hints = inspect.signature(function).parameters.values(), _hints(function)
+    one = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return {name: _test(hints[name]) for name in one if name in hints}
+
+
+def _test(hint: Any) -> Test:
+    """Whether a value is of an annotation: made once, as calls are many."""
     origin, of = typing.get_origin(hint), typing.get_args(hint)
     if hint is None or hint is type(None):
-        return value is None
+        return lambda value: value is None
     if hint == ArrayLike or origin is np.ndarray or hint is np.ndarray:
-        return _is_array(value)
+        return _is_array
     if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, one) for one in of)
+        tests = [_test(one) for one in of]
+        return lambda value: any(test(value) for test in tests)
     kind = origin or hint
     if not isinstance(kind, type) or kind in (object, type):
-        return True
-    numbers = {float: Real, int: Integral, complex: complex}
+        return lambda value: True
+    numbers: dict[type, type] = {float: Real, int: Integral, complex: complex}
     if kind in numbers:
-        return isinstance(value, numbers[kind])
+        number = numbers[kind]
+        return lambda value: isinstance(value, number)
     if issubclass(kind, os.PathLike):
-        return isinstance(value, os.PathLike)
+        return lambda value: isinstance(value, os.PathLike)
+    inside = [_test(one) for one in of if one is not Ellipsis]
+    return partial(_held, kind=kind, inside=inside)
+
+
+def _held(value: Any, kind: type, inside: Sequence[Test]) -> bool:
+    """Whether a value is of a type, and what a list or a mapping holds, too."""
     try:
         fits = isinstance(value, kind)
     except TypeError:  # a protocol
         return True
     if not fits or (isinstance(value, str) and kind not in (str, object)):
         return fits and kind is str
-    if of and issubclass(kind, Sequence) and isinstance(value, Sequence) and len(of) == 1:
-        return all(_fits(one, of[0]) for one in value)
-    if of and issubclass(kind, Mapping) and isinstance(value, Mapping) and len(of) == 2:
-        return all(_fits(key, of[0]) and _fits(one, of[1]) for key, one in value.items())
+    if len(inside) == 1 and issubclass(kind, Sequence) and isinstance(value, Sequence):
+        return all(map(inside[0], value))
+    if len(inside) == 2 and issubclass(kind, Mapping) and isinstance(value, Mapping):
+        return all(inside[0](key) and inside[1](one) for key, one in value.items())
     return True
 
 

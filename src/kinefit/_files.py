@@ -65,6 +65,12 @@ def _remedy(text: str, problem: str) -> str:
         return f"{BACKSLASHES} Write '{path[1]}'." if path and len(path[1]) < 120 else BACKSLASHES
     if value in ("True", "False", "yes", "no", "Yes", "No"):
         return f"Write {'true' if value in ('True', 'yes', 'Yes') else 'false'}."
+    if "overwrite" in problem:
+        if header := re.match(r"\s*\[\[?([^\[\]]{1,60})\]", line):
+            return f"Tables that are there several times have two brackets, the first one too: [[{header[1].strip()}]]."
+        return "It is there twice: keep one."
+    if re.fullmatch(r"[^\W\d][^\"'\[\]{}]{0,119}", value):
+        return f"Put a text in quotes: {line.partition('=')[0].strip()[:60]} = \"{value}\"."
     return "Put texts in quotes and numbers not, and give numbers a point, not a comma: 1.5."
 
 

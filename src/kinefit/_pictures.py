@@ -45,6 +45,6 @@ def _is_whole(data: bytes) -> bool:
     while at + 8 <= len(data):
         length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
         if kind == b"IEND":
-            return True
+            return length == 0
         at += 12 + length
     return at <= len(data)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import import_module
@@ -28,6 +28,7 @@ UP_AXES = {
 
 
 _AT_ONCE = 2000  # frames of which all segments' poses are made at once
+_ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
 
 
 def rotation_between_up(source: str, target: str) -> NDArray:
@@ -136,7 +137,7 @@ class Motion:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"):
+        for name in _ARRAYS:
             array = getattr(self, name)
             mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
             if not mine or array.flags.writeable:
@@ -181,6 +182,12 @@ class Motion:
             f"angles {self.angles.shape} [rad], joint_centres {self.joint_std.shape} [m], to_dataframe()",
         ]
 
+    def parts(self, frames: int = _AT_ONCE) -> Iterator[Motion]:
+        """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
+        for start in range(0, max(len(self), 1), frames):
+            arrays = {name: getattr(self, name)[start : start + frames] for name in _ARRAYS}
+            yield replace(self, residuals={}, **arrays)
+
     def state(self, frame: int) -> BodyState:
         """State of the body in one frame."""
         return BodyState(self.Ts_world_root[frame], self.angles[frame])
@@ -192,10 +199,7 @@ class Motion:
     @property
     def joint_centres(self) -> NDArray:
         """(F, S, 3) [m] joint centres in the world, in the order of `body.joints`; `joint_std` are their deviations."""
-        starts = range(0, max(len(self), 1), _AT_ONCE)
-        poses = (self.body.tree.segment_poses(self.Ts_world_root[i : i + _AT_ONCE], self.angles[i : i + _AT_ONCE])
-                 for i in starts)  # fmt: skip
-        return np.concatenate([T[..., :3, 3].copy() for T in poses])
+        return np.concatenate([part.segment_poses()[..., :3, 3].copy() for part in self.parts()])
 
     def to_dataframe(self) -> Any:
         """A pandas data frame of one row a frame: the columns of the tables `angles` and `joints`, and the quality.
@@ -222,7 +226,10 @@ class Motion:
     def positions(self, points: PointSet | None = None) -> NDArray:
         """(F, K, 3) [m] points in the world; by default the body's landmarks."""
         points = self.body.landmarks if points is None else points
-        return self.body.trajectories(self.Ts_world_root, self.angles, points)
+        parts = (slice(i, i + _AT_ONCE) for i in range(0, max(len(self), 1), _AT_ONCE))
+        return np.concatenate([
+            self.body.trajectories(self.Ts_world_root[part], self.angles[part], points) for part in parts
+        ])  # fmt: skip
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""

@@ -49,9 +49,13 @@ def place_columns(names: Sequence[str], positions: NDArray, unit: str, suffix: s
     return {f"{n} {axis}{suffix} [{unit}]": positions[:, k, i] for k, n in enumerate(names) for i, axis in axes}
 
 
-def continuous_quaternions(rotations: NDArray) -> NDArray:
-    """Quaternions (F, 4) as (w, x, y, z) of rotations (F, 3, 3); of the two signs the nearer to the frame before."""
+def continuous_quaternions(rotations: NDArray, before: NDArray | None = None) -> NDArray:
+    """Quaternions (F, ..., 4) as (w, x, y, z) of rotations (F, ..., 3, 3).
+
+    Of the two signs the nearer to the frame before is taken; `before` (..., 4) is that of the frame before the first.
+    """
     q = se3.quaternion(rotations)
-    flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
-    q[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
+    last = q[:1] if before is None else before[None]
+    flips = np.sum(q * np.concatenate([last, q])[:-1], axis=-1) < 0
+    q *= np.where(np.cumsum(flips, axis=0) % 2, -1.0, 1.0)[..., None]
     return q

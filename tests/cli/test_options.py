@@ -122,7 +122,7 @@ def acts_or_is_refused(make, usual):
 HEAD = {
     "name": 'name = "another"', "rate": "rate = 5.0", "up": 'up = "x"', "body": 'body = "humanoid39"',
     "height": "height = 1.3", "subject": 'subject = "take.toml"', "start": 'start = "other.npz"',
-    "frames": "frames = [0, 4]", "size": "size = false",
+    "frames": "frames = [0, 4]", "size": "size = false", "person": "person = 2",
 }  # fmt: skip
 OWN = {
     "keypoints": {
@@ -341,7 +341,7 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 OPTIONS = {
     "overlays": "--overlays", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
     "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
-    "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
+    "person": "--person=2", "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
 }  # fmt: skip
 
 

@@ -7,7 +7,9 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.cli import main
+from kinefit.exporters import write_motion
 from kinefit.readers.take.file import read_take
+from kinefit.simulation import cut, squat_and_wave
 
 
 def run(*args):
@@ -118,6 +120,7 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
     take.unlink()
     told = run("init", take.parent)
     assert told.exit_code == 0 and "cam01 alone: one camera does not tell how far a person is" in told.stdout
+    assert "Write a second camera" in told.stdout
     told = run("track", take, "--out", tmp_path / "out")
     assert told.exit_code == 2 and "two cameras do" in told.stderr and "[[depth]]" in told.stderr
     take.with_name("calibration.toml").unlink()
@@ -150,3 +153,22 @@ def test_fbx_is_answered_with_glb_and_bvh():
     for words in (("export", "motion.npz", "--to", "fbx"), ("track", "take.toml", "--formats", "fbx")):
         told = run(*words)
         assert told.exit_code == 2 and "write glb or bvh" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (["--to", "csv", "unit=mm"], "Did you mean --unit mm?"), (["--to", "csv", "unit", "=", "mm"], "--unit mm?"),
+        (["to", "bvh"], "Did you mean --to bvh?"), (["--to", "bvh", "-out", "x.bvh"], "Did you mean --out x.bvh?"),
+        ([], "Give --to [csv|"), (["--to", "trc", "--unit", "ells"], "Error: --unit of trc is one of: m, cm, mm; not"),
+    ],
+)  # fmt: skip
+def test_an_option_without_its_dashes_is_recognised(tmp_path, words, meant):
+    told = run("export", tmp_path / "motion.npz", *words)
+    assert told.exit_code == 2 and meant in told.stderr
+
+
+def test_a_folder_of_results_stands_for_the_motion_in_it(tmp_path):
+    write_motion(cut(squat_and_wave(), 0, 4), tmp_path / "motion.npz")
+    assert run("export", tmp_path, "--to", "bvh").exit_code == 0
+    assert (tmp_path / "motion.bvh").is_file()

@@ -5,7 +5,8 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import nearest
-from kinefit.correspondences import surface_rows
+from kinefit.correspondences import anchored_rows, surface_rows
+from kinefit.correspondences.anchored import anchored
 from kinefit.errors import ObservationError
 
 BODY = load_body("humanoid10")
@@ -49,6 +50,21 @@ def test_a_segment_that_is_known_holds():
     rows = surface_rows(BODY, STATE, x, segment=np.where(np.arange(len(x)) % 2, 3, -1), max_distance=2.0)
     assert np.all(rows.segment[rows.group % 2 == 1] == 3) and len(set(rows.segment)) > 3
     assert len(surface_rows(BODY, STATE, np.zeros((0, 3)))) == 0
+
+
+def test_points_keep_what_they_found_when_the_body_moves():
+    x, state = cloud(), STATE.retract(np.linspace(-0.3, 0.3, BODY.tree.n_dofs))
+    frames, _ = BODY.tree.forward(state.T_world_root, state.angles)
+    rows = surface_rows(BODY, state, x, max_distance=0.2)
+    measured, rest, normal = anchored(rows, x, frames)
+    assert len(rows) > 50
+    np.testing.assert_array_equal(measured, x[rows.group])
+    again = anchored_rows(BODY, state, rows.segment, rest, normal, measured, weight=rows.weight)
+    np.testing.assert_allclose(again.data, rows.data, atol=1e-12)
+    away = anchored_rows(BODY, STATE, rows.segment, rest, normal, measured)
+    R, R0 = (BODY.tree.forward(s.T_world_root, s.angles)[0][:, :9].reshape(-1, 3, 3) for s in (state, STATE))
+    turned = (R0 @ R.swapaxes(1, 2))[rows.segment]
+    np.testing.assert_allclose(away.direction, np.einsum("nij,nj->ni", turned, rows.direction), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -104,3 +104,16 @@ def test_folders_on_the_way_are_made_and_obstacles_are_told(tmp_path):
         with pytest.raises(ExportError, match="in the way"):
             write_text(path, "x")
     assert files_in(tmp_path) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="processes are asked for by POSIX")
+def test_what_a_killed_process_left_goes_with_the_next(tmp_path):
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    kept = [f".a[1]-{os.getppid()}.npz", f".a[1]-{child}.csv", ".a[1]-x.npz", f".b-{child}.npz"]
+    for name in [f".a[1]-{child}.npz", *kept]:
+        (tmp_path / name).write_bytes(b"half")
+    write_text(tmp_path / "a[1].npz", "whole")
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*kept, "a[1].npz"])

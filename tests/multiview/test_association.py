@@ -184,3 +184,30 @@ def test_a_person_whom_a_detector_cuts_in_two_for_a_moment_is_not_lost():
     chosen = choose_people(RIG, [halved, *seen[1:]])
     for before, now in zip(whole[1:], chosen[1:], strict=True):
         np.testing.assert_array_equal(now, before)
+
+
+def of_another_detector(record, count=17):
+    """A record of fewer points, as of another keypoint set."""
+    part = {"points": record.points[:, :, :count], "confidence": 0.9 * record.confidence[:, :, :count]}
+    return Keypoints(record.camera, "COCO", record.names[:count], record.rate, **part)
+
+
+def test_a_second_detector_shows_the_same_person_and_none_is_ignored():
+    """Both records of every camera are used in all frames, although each detector lists people in its own order."""
+    first, truth = records([MAIN, OTHER], sure=(1.0, 0.5))
+    second, there = records([MAIN, OTHER], sure=(0.5, 1.0), seed=7)
+    several = [*first, *(of_another_detector(k) for k in second)]
+    chosen = choose_people(RIG, several)
+    who = [np.argmax(places == c[:, None], axis=1) for c, places in zip(chosen, [*truth, *there], strict=True)]
+    assert all(np.all(c >= 0) for c in chosen) and len(np.unique(who)) == 1
+
+
+def test_where_the_surer_detector_sees_nobody_the_other_goes_on():
+    first, _ = records([MAIN])
+    second, _ = records([MAIN], seed=3)
+    blank = first[2].points.copy(), first[2].confidence.copy()
+    blank[0][:5], blank[1][:5] = np.nan, 0.0
+    first[2] = Keypoints(first[2].camera, SET, NAMES, 25.0, *blank)
+    chosen = choose_people(RIG, [*first, *(of_another_detector(k) for k in second)])
+    np.testing.assert_array_equal(chosen[2][:5], -1)
+    np.testing.assert_array_equal(chosen[len(first) + 2], 0)

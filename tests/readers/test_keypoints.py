@@ -96,6 +96,7 @@ def test_what_is_written_is_read(tmp_path_factory, rows):
 BAD = {
     "broken json": '{"people": [{"pose_keypoints_2d": [1, 2',
     "broken json.*people": '{"version": 1.3}',
+    "broken json.*recursion": '{"a": ' + "[" * 100_000,
     "NaN": json.dumps({"people": [person(value=float("nan"))]}),
     "NaN or infinity": json.dumps({"people": [person(value=float("inf"))]}),
     "broken json.*null": json.dumps({"people": [person(value=0) | {"pose_keypoints_2d": [None] * 51}]}),

@@ -1,5 +1,7 @@
 """C3D and TRC: every real file, ezc3d as a second opinion, and damaged files that must not crash."""
 
+from pathlib import Path
+
 import ezc3d
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import FileError, KinefitError, ObservationError
-from kinefit.readers.c3d_file import read_c3d
+from kinefit.readers.c3d_file import _values, read_c3d
 from kinefit.readers.markers import read_markers
 
 TABLE = {  # folder/part of the name: markers, frames, rate, up, first frame
@@ -259,3 +261,8 @@ def test_missing_and_foreign_files(tmp_path):
         read_markers(tmp_path / "a.c3d")
     with pytest.raises(FileError, match="cannot be read"):
         read_markers(tmp_path)
+
+
+def test_a_parameter_of_no_numbers_in_dimensions_beyond_bounds_is_refused():
+    with pytest.raises(FileError, match="dimensions that cannot be"):
+        _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X", Path("a.c3d"))

@@ -5,12 +5,13 @@ import pytest
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, posture
 
-from kinefit.bodies import load_body
+from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.surfaces import sample
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
+from kinefit.observations import SurfacePointFrame
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.surface_points import SurfacePointFrame, SurfacePointSensor
+from kinefit.sensors.surface_points import SurfacePointSensor
 from kinefit.tracking.tracker import Tracker
 
 BODY = load_body("humanoid")
@@ -28,7 +29,8 @@ def frame(state, time=0.0, rng=None, sigma=0.002):
 
 def learnt(state):
     sensor, scene = SurfacePointSensor("skin"), Scene(BODY, state, Rig(()))
-    sensor.learn(sensor.prepare(frame(state), scene), scene, True)
+    for _ in range(2):
+        sensor.learn(sensor.prepare(frame(state), scene), scene, True)
     return sensor
 
 
@@ -41,6 +43,23 @@ def test_anchors_are_where_the_points_were_seen():
     scene = Scene(BODY, posture(BODY, 1), Rig(()))
     sensor.learn(sensor.prepare(frame(posture(BODY, 1)), scene), scene, False)
     assert sensor.anchors is before
+
+
+def test_points_are_anchored_once_the_limb_rests_in_the_cloud():
+    sensor, state = SurfacePointSensor("skin"), posture(BODY, 0)
+    turn = BODY.tree.coordinate("arm_rot_r")
+    forearm = BODY.tree.segments.index("forearm_r")
+
+    def learn(degrees):
+        angles = np.array(state.angles)
+        angles[turn] += np.radians(degrees)
+        scene = Scene(BODY, BodyState(state.T_world_root, angles), Rig(()))
+        sensor.learn(sensor.prepare(frame(state), scene), scene, True)
+        return {s for s, _ in sensor.anchors.values()}
+
+    learn(6)
+    assert forearm not in learn(3) and len(sensor.anchors) > 100  # the trunk rests, the arm still turns
+    assert forearm in (learn(0.1) | learn(0))
 
 
 def test_rows_of_old_and_new_points_have_the_derivative_of_their_residuals():
@@ -86,3 +105,27 @@ def test_frames_that_are_none():
         SurfacePointSensor("skin").prepare(object(), scene)
     empty = SurfacePointFrame("skin", 0.0, np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     assert SurfacePointSensor("skin").prepare(empty, scene).match(scene, 0.1).rows(scene) == []
+
+
+def test_a_point_of_another_limb_is_let_go_and_given_anew():
+    state, other = posture(BODY, 0), posture(BODY, 12)
+    sensor = learnt(state)
+    right = dict(sensor.anchors)
+    arm = BODY.tree.segments.index("forearm_r")
+    some = [i for i, (s, _) in right.items() if s == arm][:3]
+    here, there = Scene(BODY, state, Rig(())), Scene(BODY, other, Rig(()))
+    trunk = int(np.bincount([s for s, _ in right.values()]).argmax())
+    f = here.frames[trunk]
+    for i in some:  # as if seen first while the arm lay on the trunk
+        g = here.frames[arm]
+        x = g[:9].reshape(3, 3) @ right[i][1] + g[9:]
+        sensor.anchors = {**sensor.anchors, i: (trunk, f[:9].reshape(3, 3).T @ (x - f[9:]))}
+    for _ in range(2):
+        sensor.learn(sensor.prepare(frame(other), there), there, True)
+    assert all(sensor.anchors[i][0] == arm for i in some)
+    kept = [i for i in right if i not in some and right[i][0] == sensor.anchors[i][0]]
+    assert len(kept) > 0.95 * (len(right) - len(some))
+    wrong = Scene(BODY, posture(BODY, 2), Rig(()))  # a pose that most points contradict takes none away
+    before = set(sensor.anchors)
+    sensor.learn(sensor.prepare(frame(other), wrong), wrong, True)
+    assert len(before & set(sensor.anchors)) > 0.5 * len(before)

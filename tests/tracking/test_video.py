@@ -10,7 +10,10 @@ import pytest
 from kinefit import Keypoints, Recording, load_body, load_observations, read_take, track
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.evaluation import angle_errors, joint_errors
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.tracking.agreement import sentences
 from kinefit.tracking.take import track_take
 
 
@@ -67,6 +70,24 @@ def test_bystanders_are_not_followed(data_dir, tmp_path):
         for several in (observations.keypoints, shuffled)
     )
     np.testing.assert_allclose(other.angles, as_is.angles, atol=1e-6)
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_camera_that_was_turned_is_named_and_spoils_little(truth, smooth):
+    rig = studio_rig(truth)
+    keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", seed=1)
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(3.0), 0.0]))
+    moved = Rig(tuple(c.with_pose(turn @ c.T_camera_world) if c.name == "cam03" else c for c in rig))
+    motion = track(
+        Recording.of_keypoints(moved, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"), smooth=smooth
+    )
+    told = motion.provenance["contradictions"]
+    assert set(told) == {"cam03"} and told["cam03"]["median_px"] > 50.0 > told["cam03"]["others_px"]
+    assert "cam03 contradicts the other cameras" in sentences(told)[0] and "px" in sentences(told)[0]
+    assert joint_errors(truth, motion).mean() < 0.02
+    right = Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up)
+    as_it_is = track(right, load_body("humanoid"), smooth=smooth)
+    assert as_it_is.provenance["contradictions"] == {}
 
 
 def test_known_motion_is_recovered(truth):

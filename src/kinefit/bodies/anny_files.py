@@ -33,7 +33,8 @@ FACTORS = {**_SIDES, **_BUILD, **_ENDS}
 _RACES = ("african", "asian", "caucasian")  # one third of each
 _TO_BODY = 0.1 * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # theirs: decimetres, z forward, x left
 _LARGEST = 20_000_000  # [bytes] of a target, unpacked; the largest has 2 MB
-_DAMAGE = (OSError, EOFError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError, zlib.error)
+_DAMAGE = (OSError, EOFError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError, RecursionError,
+           zlib.error)  # fmt: skip
 _VERSION = "1"  # of what is kept
 
 

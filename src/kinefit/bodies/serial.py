@@ -47,7 +47,7 @@ from kinefit.bodies.serial_morphs import (
     skin_from_arrays,
     skin_to_arrays,
 )
-from kinefit.bodies.surfaces import MeshSurface, Surface, TaperedCylinder
+from kinefit.bodies.surfaces import MeshSurface, Metaballs, Surface, TaperedCylinder
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
@@ -175,6 +175,9 @@ def text_array(names: object) -> NDArray:
     return np.array(list(names), dtype=np.str_)  # type: ignore[call-overload]
 
 
+_BALLS = ("centres", "radii", "weights", "axes")
+
+
 def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
     count = len(surfaces)
     out = {"surfaces/segments": np.array([c.segment for c in surfaces], np.int64)}
@@ -185,6 +188,8 @@ def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
             for name in ("starts", "ends", "sides"):
                 out[f"surfaces/{name}"][k] = getattr(surface, name[:-1])
             out["surfaces/radii"][k] = surface.radii
+        elif isinstance(surface, Metaballs):
+            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in _BALLS}
         else:
             out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in ("vertices", "faces")}
     return out
@@ -201,7 +206,11 @@ def _surfaces_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> tup
     starts, sides = (_array(arrays, f"surfaces/{name}", (count, 3)) for name in ("starts", "sides"))
     radii = _array(arrays, "surfaces/radii", (count, 2, 2))
     for k, segment in enumerate(owners):
-        if f"surfaces/{k}/vertices" in arrays:
+        if f"surfaces/{k}/centres" in arrays:
+            shapes = (None, 3), (None, 3), (None,), (None, 3, 3)
+            balls = [_array(arrays, f"surfaces/{k}/{name}", shape) for name, shape in zip(_BALLS, shapes)]
+            out.append(Metaballs.of(int(segment), *balls))
+        elif f"surfaces/{k}/vertices" in arrays:
             vertices, faces = (_array(arrays, f"surfaces/{k}/{name}", (None, 3)) for name in ("vertices", "faces"))
             out.append(MeshSurface(int(segment), vertices, faces))
         else:
@@ -233,7 +242,7 @@ def _decoded(arrays: Mapping[str, NDArray], key: str, kind: type[_Kind]) -> tupl
         return ()
     try:
         return tuple(msgspec.json.decode(str(text), type=kind) for text in _array(arrays, key, (None,)))
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BodyError(f"{key} that cannot be read ({error})") from error
 
 

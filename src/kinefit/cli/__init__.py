@@ -6,6 +6,7 @@ Heavy imports stand inside the commands, so that help comes at once.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
@@ -39,6 +40,7 @@ Exit codes:
   2    the input or the command line is wrong, or a result cannot be written: the message says what would work
   130  stopped by Ctrl-C; what was done is kept and named
 """
+_WORDS = "kinefit.words"
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
@@ -63,6 +65,7 @@ class _Commands(click.Group):
             near = get_close_matches(args[0].lower(), COMMANDS, n=1, cutoff=0.5)
             told = f" Did you mean '{near[0]}'?" if near else f" There are: {', '.join(COMMANDS)}."
             raise click.UsageError(f"No such command '{args[0]}'.{told}", ctx)
+        ctx.meta[_WORDS] = args[1:]
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
@@ -79,6 +82,11 @@ class _Commands(click.Group):
 
                 warnings.showwarning = show  # type: ignore[assignment]
                 return super().invoke(ctx)
+        except click.UsageError as error:
+            meant = _meant(error, ctx.meta.get(_WORDS, ()))
+            if not meant:
+                raise
+            raise click.UsageError(error.format_message() + meant, error.ctx) from error
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except KinefitError as error:
@@ -96,6 +104,22 @@ class _Commands(click.Group):
             _screen.tell_bug(error)
             code = 1
         ctx.exit(code)
+
+
+def _meant(error: click.UsageError, words: Sequence[str]) -> str:
+    """What to say of words of a wrong command line that are options but for their dashes: "unit=mm", "unit = mm"."""
+    parameters = error.ctx.command.params if error.ctx else []
+    names = {option for parameter in parameters for option in parameter.opts if option.startswith("--")}
+    found = []
+    for k, (name, _, value) in enumerate(word.partition("=") for word in words):
+        option = f"--{name.lstrip('-').lower()}"
+        if option in names and not name.startswith("--"):
+            found.append(f"{option} {value or next((word for word in words[k + 1 :] if word != '='), '')}".strip())
+    if found:
+        return f" Did you mean {' '.join(found)}?"
+    if isinstance(error, click.MissingParameter) and error.param is not None and error.param.metavar:
+        return f"Give {error.param.opts[0]} {error.param.metavar}."
+    return ""
 
 
 @click.group("kinefit", cls=_Commands, epilog=_EPILOG, context_settings=_SETTINGS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,11 +24,11 @@ _PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
 
 def write_track_report(
     motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path],
-    pictures: str = "full",
+    pictures: str = "full", notes: Iterable[str] = (),
 ) -> None:  # fmt: skip
     """Write report.html into a folder of results, with links to what lies there already; enter it into `files`.
 
-    `pictures` are "full", "blurred" or "none".
+    `pictures` are "full", "blurred" or "none"; `notes` are what the command says, too.
     """
     from kinefit.cli._results import ABOUT
     from kinefit.exporters.report.norms import read_norms
@@ -38,7 +39,8 @@ def write_track_report(
     step("report", 0, 1)
     links = {path.relative_to(folder).as_posix(): ABOUT.get(name, name) for name, path in files.items()}
     files["report"] = write_report(
-        motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms
+        motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms,
+        findings=[("warning", f"{note}.", "") for note in notes],
     )
     step("report", 1, 1)
 

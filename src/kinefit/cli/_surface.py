@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -165,7 +167,7 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
     count = len(views.photographs[0])
     if wanted.still is not None and wanted.still >= count:
         raise ObservationError(f"state {wanted.still} of {count}", remedy="The first is 0; --still names another one.")
-    states = [[spline_of(read_picture(files[k]), wanted.field) for files in views.photographs] for k in range(count)]
+    states = _States(views.photographs, wanted.field)
     first = states[0]
     grid = Grid.of(first[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
@@ -177,12 +179,34 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
     told = []
     for k, surface in enumerate(surfaces):
         reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
-        told += _write(surface, reference, states[k][0], wanted, k, int(np.max(window)))
+        told += _write(surface, reference, _grey(views.photographs[0][k], wanted.field), wanted, k, int(np.max(window)))
     return told
 
 
+class _States(Sequence[list[SplineImage]]):
+    """Images of all cameras in each state, read when they are asked for: the first and the latest are kept."""
+
+    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None) -> None:
+        self._files, self._field, self._kept = photographs, field, dict[int, list[SplineImage]]()
+
+    def __len__(self) -> int:
+        return len(self._files[0])
+
+    def __getitem__(self, k: Any) -> Any:
+        if k not in self._kept:
+            self._kept = {j: images for j, images in self._kept.items() if j == 0}
+            self._kept[k] = [spline_of(read_picture(files[k]), self._field) for files in self._files]
+        return self._kept[k]
+
+
+def _grey(path: Path, field: str | None) -> NDArray:
+    """Grey values (H, W) of a photograph, or of a field of it."""
+    image = cv2.cvtColor(read_picture(path), cv2.COLOR_RGB2GRAY)
+    return image if field is None else field_of(image, field)  # type: ignore[arg-type]
+
+
 def _write(
-    surface: Surface, reference: Surface | None, image: SplineImage, wanted: Wanted, k: int, window: int
+    surface: Surface, reference: Surface | None, grey: NDArray, wanted: Wanted, k: int, window: int
 ) -> list[str]:
     """Write one state; lines about it."""
     out, told = wanted.out, [_about(surface, k)]
@@ -208,16 +232,16 @@ def _write(
     write_points_csv(surface, out / f"points_{k:03d}.csv", columns)
     write_surface_vtk(surface, out / f"surface_{k:03d}.vtk", columns)
     std = 1e3 * np.linalg.norm(surface.std, axis=1)
-    write_field_picture(surface, image.grey, std, out / f"std_{k:03d}.png", title="std deviation", unit="mm")
+    write_field_picture(surface, grey, std, out / f"std_{k:03d}.png", title="std deviation", unit="mm")
     if reference is not None:
         file = out / f"displacement_{k:03d}.png"
         length = 1e3 * np.linalg.norm(surface.x_world - reference.x_world, axis=1)
-        write_field_picture(surface, image.grey, length, file, title="displacement", unit="mm")
+        write_field_picture(surface, grey, length, file, title="displacement", unit="mm")
     if strain is not None:
         for name in ("xx", "yy", "xy"):
             file = out / f"strain_{name}_{k:03d}.png"
             title = f"strain {name}, {1e3 * strain.gauge:.1f} mm"
-            write_field_picture(surface, image.grey, 1e6 * getattr(strain, name), file, title=title, unit="1e-6")
+            write_field_picture(surface, grey, 1e6 * getattr(strain, name), file, title=title, unit="1e-6")
     return told
 
 

@@ -1,4 +1,4 @@
-"""`kinefit calibrate`: cameras from a board, or from the people in view."""
+"""`kinefit calibrate`: cameras from a board, from a bar with two targets, or from the people in view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from kinefit.cli import _screen
 if TYPE_CHECKING:
     from kinefit.calibration.board.calibrate import BoardCalibration
 
-_WAYS = {"board": "kinefit.cli.calibrate", "people": "kinefit.cli._calibrate_people"}
+_WAYS = {
+    "board": "kinefit.cli.calibrate", "bar": "kinefit.cli._calibrate_bar", "people": "kinefit.cli._calibrate_people",
+}  # fmt: skip
 
 _EXAMPLES = """\b
 Examples:
@@ -21,6 +23,7 @@ Examples:
   kinefit calibrate board left.mp4 right.mp4 --board checkerboard:9x6:0.025 -o stereo.toml
   kinefit calibrate board pictures/ --board checkerboard:9x6:0.025 --interiors-only
   kinefit calibrate board videos/ --board charuco:5x7:0.04:0.03:5X5_100 --interiors lenses.toml
+  kinefit calibrate bar videos/ --length 0.9
 """
 
 
@@ -36,9 +39,9 @@ class _Ways(click.Group):
         return getattr(import_module(_WAYS[name]), name) if name in _WAYS else None
 
 
-@click.group(cls=_Ways, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, or from the people in view.")
+@click.group(cls=_Ways, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, a bar, or from people in view.")
 def calibrate() -> None:
-    """Calibrate cameras: with a board in view, or from the people in view alone."""
+    """Calibrate cameras: with a board in view, with a bar that is waved, or from the people in view alone."""
 
 
 @click.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)

@@ -90,8 +90,9 @@ def export(motion: Path, format: str, out: Path | None, verbose: bool, **choices
         key: _choice(format, key, value if key == "up" else spelled(value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
     }  # fmt: skip
-    from kinefit.readers.motion import read_motion
+    from kinefit.readers.motion import find_motion, read_motion
 
+    motion = find_motion(motion)
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
     (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
     recorded = read_motion(motion)
@@ -105,7 +106,7 @@ def _choice(format: str, key: str, value: str) -> str:
     valid = getattr(FREEDOM[format], key)
     if value in valid:
         return value
-    why = f"{FREEDOM[format].why}. " if FREEDOM[format].why else ""
+    why = f"{FREEDOM[format].why}. " if FREEDOM[format].why and not (valid and key == "unit") else ""
     if valid:
         raise click.UsageError(f"{why}--{key} of {format} is one of: {', '.join(valid)}; not {value}.")
     others = [name for name, free in FREEDOM.items() if getattr(free, key)]

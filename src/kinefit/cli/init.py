@@ -42,7 +42,9 @@ def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
     write_text(out, guess.text)
     _show(guess.notes)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
-    first = "Write its rate, in frames a second, into it. Then" if asked else "Next"
+    alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)
+    lacking = ["its rate, in frames a second,"] * asked + ["a second camera, [[depth]] or [[markers]]"] * alone
+    first = f"Write {' and '.join(lacking)} into it. Then" if lacking else "Next"
     _screen.say(f"\n{out}: written. {first}:\n  {command('check', out)}\n  {command('track', out)}")
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kinefit.cli import _results, _screen
+
+if TYPE_CHECKING:
+    from kinefit.readers.take.file import Take
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -27,6 +31,7 @@ Examples:
   kinefit track take.toml --out results --no-overlays --formats bvh,csv
   kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
   kinefit track take.toml --lag 0.1     the same a tenth of a second later, which is far smoother
+  kinefit track take.toml --person moving      one of several people
   kinefit track take.toml -v            also how well every point of every camera fits
 """
 
@@ -50,19 +55,26 @@ Examples:
     "--lag", type=float, metavar="SECONDS",
     help="Each frame from those before it and so many seconds after it, as a live session has it a little later.",
 )
+@click.option(
+    "--person", metavar="WHO",
+    help='Follow one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
+    "[default: the take's, else all, each in a folder of their own]",
+)
 @click.option("--restart", is_flag=True, help="Begin anew where an earlier run was stopped; the default is to go on.")
 @_screen.verbose_option
 @click.pass_context
 def track(
     ctx: click.Context, take: Path, out: Path | None, overlays: bool, formats: tuple[str, ...], report: bool,
-    pictures: str, contacts: bool, realtime: bool, lag: float | None, restart: bool, verbose: bool,
+    pictures: str, contacts: bool, realtime: bool, lag: float | None, person: str | None, restart: bool, verbose: bool,
 ) -> None:
-    """Track the person of a take file and write all results.
+    """Track the people of a take file and write all results.
 
     TAKE is one TOML file that names calibration, cameras, videos and keypoints: `kinefit init` writes a first one,
     `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
     the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done; the same command
     then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
+
+    Where keypoints show several people, each has the same results in OUT/person-1, OUT/person-2 and so on.
     """
     from kinefit.readers.take.find import find_take
 
@@ -79,6 +91,7 @@ def track(
     code = run(
         take, out, overlays=overlays and pictures != "none", formats=formats, report=report, pictures=pictures,
         smooth=not realtime, contacts=contacts, lag=lag, verbose=verbose, wanted=overlays and wanted, restart=restart,
+        person=person,
     )  # fmt: skip
     ctx.exit(code)
 
@@ -86,34 +99,70 @@ def track(
 def run(
     path: Path, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool = True, smooth: bool = True,
     pictures: str = "full", contacts: bool = False, lag: float | None = None, verbose: bool = False,
-    wanted: bool = False, restart: bool = False,
+    wanted: bool = False, restart: bool = False, person: str | None = None,
 ) -> int:  # fmt: skip
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
+    from kinefit.errors import KinefitError, TakeError
+    from kinefit.preparing.take import prepared
+    from kinefit.readers.take.checks import check_enough, check_take
+    from kinefit.readers.take.file import read_take
+    from kinefit.tracking.take import people_in_view
+
+    take = read_take(path)
+    if person is not None:
+        take = replace(take, person=person)
+        check_take(take)
+    check_enough(take)
+    if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
+        raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
+    _results.check_folder(out)
+    options: dict[str, Any] = {
+        "overlays": overlays, "formats": formats, "report": report, "smooth": smooth, "pictures": pictures,
+        "contacts": contacts, "lag": lag, "verbose": verbose, "restart": restart,
+    }  # fmt: skip
+    with _screen.bars() as step:
+        take = prepared(take, step, _screen.note)
+    people = people_in_view(take) if take.person is None else ()
+    if not people:
+        return _track_one(take, out, **options)
+    code = 0
+    for k in range(1, len(people) + 1):
+        folder = out / f"person-{k}"
+        _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            own = _track_one(replace(take, person=k, name=f"{take.name}-person-{k}"), folder, **options)
+        except KinefitError as error:  # of one person: the others are tracked all the same
+            _screen.tell_error(error)
+            own = error.exit_code
+        if own == _screen.INTERRUPTED:
+            return own
+        code = max(code, own)
+    return code
+
+
+def _track_one(
+    take: Take, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool, smooth: bool, pictures: str,
+    contacts: bool, lag: float | None, verbose: bool, restart: bool,
+) -> int:  # fmt: skip
+    """Track one person of a take, and write what comes of it; returns the exit code."""
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._report import provenance, write_track_report
     from kinefit.cli._summary import print_files, print_summary
-    from kinefit.errors import TakeError, TrackingError
-    from kinefit.preparing.take import prepared
-    from kinefit.readers.take.checks import check_enough
-    from kinefit.readers.take.file import read_take
+    from kinefit.errors import TrackingError
+    from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoint import Checkpoint, key_of
     from kinefit.tracking.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
-    take = read_take(path)
-    check_enough(take)
-    if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
-        raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
-    _results.check_folder(out)
     files: dict[str, Path] = {}
     notes: list[str] = []
     total = 0
     work = ExitStack()
     try:
         with work, _screen.bars() as step:
-            take = prepared(take, step, _screen.note)
             unfinished = work.enter_context(Checkpoint(
                 out / "unfinished", key_of(take, smooth=smooth, contacts=contacts, lag=lag), restart=restart
             ))  # fmt: skip
@@ -126,6 +175,7 @@ def run(
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
                 notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])
+                notes.extend(followed.sentences(motion.provenance, asked=take.person is not None))
                 notes.extend(cameras.sentences(motion.provenance, settings_of(take).camera_std))
             except TrackingInterrupted as stopped:
                 motion, total, overlays, report = stopped.motion, stopped.total, False, False
@@ -134,7 +184,7 @@ def run(
             if overlays:
                 _results.write_overlays(motion, take, seen, out, step, files, blur=pictures == "blurred")
             if report:
-                write_track_report(motion, take, seen, out, step, files, pictures)
+                write_track_report(motion, take, seen, out, step, files, pictures, notes)
             if not total:
                 unfinished.remove()
     except BaseException as error:

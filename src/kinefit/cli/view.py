@@ -141,18 +141,20 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
     from kinefit.multiview.association import choose_people
+    from kinefit.multiview.followed import follow
     from kinefit.sensors.channels import make_channels
     from kinefit.sensors.triangulation import triangulated
 
     if seen.rig is None or not seen.keypoints:
         return None
     try:
-        people = choose_people(seen.rig, seen.keypoints)
+        keypoints = follow(seen.rig, seen.keypoints, take.person).keypoints
+        people = choose_people(seen.rig, keypoints)
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")
         return None
     accuracy = [entry.sigma for entry in take.keypoints]
-    channels = make_channels(load_body(take.body), seen.rig, seen.keypoints, people, accuracy)
+    channels = make_channels(load_body(take.body), seen.rig, keypoints, people, accuracy)
     return triangulated(channels, np.arange(len(channels.uv)))
 
 

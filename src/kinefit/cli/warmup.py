@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import click
 
 from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 _EXAMPLES = """\b
 Examples:
@@ -21,13 +25,15 @@ def warmup(verbose: bool) -> None:
     """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
     begin = perf_counter()
     with _screen.bars() as step:
-        step("compiling", 0, 2)
+        step("compiling", 0, 3)
         from kinefit._jit import kernel_folder
 
         _video()
-        step("compiling", 1, 2)
+        step("compiling", 1, 3)
         _depth()
-        step("compiling", 2, 2)
+        step("compiling", 2, 3)
+        _surfaces()
+        step("compiling", 3, 3)
     kept = kernel_folder()
     where = f"the kernels lie in {kept.parent}" if kept else "none can be kept: set KINEFIT_CACHE"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
@@ -57,3 +63,51 @@ def _depth() -> None:
     tracker = Tracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
     for i in range(len(motion)):
         tracker.update([DepthFrame("kinect", motion.times[i], video.frame(i).depth)])
+
+
+def _surfaces() -> None:
+    """Two states of a textured limb before three cameras, followed and strained; a body of metaballs moved by it."""
+    import numpy as np
+
+    from kinefit.bodies import load_body
+    from kinefit.geometry.camera import Camera, Rig
+    from kinefit.geometry.se3 import transform
+    from kinefit.observations import SurfacePointFrame
+    from kinefit.photogrammetry.region_growing import Grid
+    from kinefit.photogrammetry.spline_image import SplineImage
+    from kinefit.photogrammetry.states import measure_states, surface_strain
+    from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
+    from kinefit.sensors.surface_points import SurfacePointSensor
+    from kinefit.tracking.tracker import Tracker
+
+    random, places = np.random.default_rng(0), (0.0, -0.12, 0.12)
+    K = np.array([[300.0, 0.0, 79.5], [0.0, 300.0, 59.5], [0.0, 0.0, 1.0]])
+    cameras = [Camera(f"camera {k}", (160, 120), K, T_camera_world=transform(np.eye(3), np.array([-x, 0.0, 1.0])))
+               for k, x in enumerate(places)]  # fmt: skip
+    rig, fine = Rig(tuple(cameras)), np.cumsum(np.cumsum(random.normal(size=(140, 320)), axis=0), axis=1)
+    fine = 120.0 + 40.0 * _white(fine)
+    states = [
+        [SplineImage.of(fine[10 + k : 130 + k, 80 + round(300 * x) + k :][:, :160] + random.normal(size=(120, 160)))
+         for x in places]
+        for k in (0, 1)
+    ]
+    grid = Grid.of((160, 120), 8, margin=12)
+    first, second = measure_states(rig, states, grid)
+    surface_strain(first, second, 0.1, 13)
+    tracker = SurfaceTracker(rig, 30.0, SurfaceTracking(step=8))
+    for images in states:
+        points = tracker.update(images)
+    body = load_body("arm_metaballs")
+    follower = Tracker(body, rig, rate=30.0, sensors=[SurfacePointSensor("surface")])
+    follower.start_at(body.usual_state())
+    for k in range(3):
+        frame = SurfacePointFrame("surface", k / 30.0, points.ids, points.x_world, points.covariance)
+        follower.update([frame])
+
+
+def _white(texture: NDArray) -> NDArray:
+    """A texture of grains of a few pixels, mean 0 and deviation 1: a random walk less its surroundings."""
+    import cv2
+
+    fine = cv2.GaussianBlur(texture, (0, 0), 1.0) - cv2.GaussianBlur(texture, (0, 0), 3.0)
+    return (fine - fine.mean()) / fine.std()

@@ -33,6 +33,23 @@ def surface_rows(x, distance, normal, owner, weight, eye, least, data, segment, 
 
 
 @jit
+def anchors(data, segment, group, frames, measured, x, rest, normal):
+    """The point and normal of the surface that each row (8, N) of `surface_rows` is about, in the root frame at rest.
+
+    measured (M, 3) [m]; frames (S, 12). Out: x (N, 3), the row's measured point; rest, normal (N, 3).
+    """
+    for k in range(segment.size):
+        f, i = frames[segment[k]], group[k]
+        nx, ny, nz = data[3, k], data[4, k], data[5, k]
+        x[k, 0], x[k, 1], x[k, 2] = measured[i, 0], measured[i, 1], measured[i, 2]
+        back = data[6, k] / (nx * nx + ny * ny + nz * nz)
+        px, py, pz = x[k, 0] - back * nx - f[9], x[k, 1] - back * ny - f[10], x[k, 2] - back * nz - f[11]
+        for j in range(3):
+            rest[k, j] = f[j] * px + f[3 + j] * py + f[6 + j] * pz
+            normal[k, j] = f[j] * nx + f[3 + j] * ny + f[6 + j] * nz
+
+
+@jit
 def anchored_rows(frames, owner, rest, normal, target, weight, at_surface, data):
     """One row for each point of a surface: what was measured lies r further along the surface's normal.
 

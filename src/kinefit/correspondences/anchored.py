@@ -53,6 +53,19 @@ def anchored_rows(
     return Rows(data, segment, np.arange(count))
 
 
+def anchored(rows: Rows, x_world: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """(N, 3) each: the measured points of N rows, and the points and normals of the surface that belong to them.
+
+    Parameters
+    ----------
+    rows : as of `surface_rows`, of measured points x_world (M, 3) [m].
+    frames : (S, 12) of the state that they were made at; what is of the surface comes in the root frame at rest.
+    """
+    x, rest, normal = np.empty((3, len(rows), 3))
+    kernels.anchors(rows.data, rows.segment, rows.group, frames, _checked(x_world, len(x_world)), x, rest, normal)
+    return x, rest, normal
+
+
 def target_rows(
     body: Body,
     state: BodyState,

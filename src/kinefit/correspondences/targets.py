@@ -56,7 +56,9 @@ def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArr
 
 def lines(vectors: NDArray) -> NDArray:
     """(3, K) contiguous lines of x, y and z from (K, 3); zeros where not finite."""
-    return np.ascontiguousarray(np.nan_to_num(vectors).T)
+    out = np.ascontiguousarray(vectors.T)
+    finite = np.isfinite(out)
+    return out if finite.all() else np.where(finite, out, 0.0)
 
 
 def unit(directions: NDArray, present: NDArray, what: str) -> None:

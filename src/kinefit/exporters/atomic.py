@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from os import PathLike
 from pathlib import Path
 
@@ -22,7 +23,8 @@ _REMEDIES = {
 def writing(path: str | PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`; what was written there takes its place when the block ends well.
 
-    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays.
+    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays; what a
+    process left that was killed, the next one that writes there removes.
 
     Raises
     ------
@@ -35,6 +37,7 @@ def writing(path: str | PathLike[str]) -> Iterator[Path]:
     temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_of_the_dead(target)
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
@@ -45,10 +48,31 @@ def writing(path: str | PathLike[str]) -> Iterator[Path]:
             temporary.unlink()
 
 
+def _remove_of_the_dead(target: Path) -> None:
+    """Remove temporary files of `target` whose process is there no more."""
+    if os.name != "posix":
+        return
+    for left in target.parent.glob(f".{escape(target.stem)}-*{escape(target.suffix)}"):
+        number = left.name.removeprefix(f".{target.stem}-").removesuffix(target.suffix)
+        if number.isdecimal():
+            try:
+                os.kill(int(number), 0)
+            except ProcessLookupError:
+                left.unlink(missing_ok=True)
+            except (OSError, OverflowError):  # another user's, which lives
+                pass
+
+
 def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a whole text file (UTF-8, line ends as they are) or nothing."""
     with writing(path) as temporary:
         temporary.write_bytes(text.encode("utf-8"))
+
+
+def write_lines(path: str | PathLike[str], lines: Iterable[str]) -> None:
+    """Write a whole text file (UTF-8), line by line as they are made, or nothing."""
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
 
 
 def write_bytes(path: str | PathLike[str], data: bytes) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -134,8 +133,8 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
             yield piece | {name: column[some] for name, column in quaternions.items()}
 
     def of_parts(columns: Callable[[Motion], Table]) -> Iterator[Table]:
-        for some in stretches:
-            yield {name: column[some] for name, column in start.items()} | columns(_part(motion, some))
+        for some, part in zip(stretches, motion.parts(_ROWS)):
+            yield {name: column[some] for name, column in start.items()} | columns(part)
 
     def landmarks(part: Motion) -> Table:
         return place_columns(body.landmarks.names, factor * part.positions(), unit)
@@ -148,11 +147,6 @@ def _in_pieces(motion: Motion, unit: str, up: str | None, names: str | None) -> 
         "angles": angles(), "joints": of_parts(lambda part: joint_columns(part, bones, factor, unit)),
         "landmarks": of_parts(landmarks), "quality": of_parts(quality), "residuals": residuals,
     }  # fmt: skip
-
-
-def _part(motion: Motion, some: slice) -> Motion:
-    fields = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
-    return replace(motion, residuals={}, **{name: getattr(motion, name)[some] for name in fields})
 
 
 def _residuals(

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
+from kinefit.multiview.boxes import same_people
 from kinefit.observations import Keypoints
 
 _ENOUGH = 4  # points of a person that must be seen
 _SOME = 13  # points, spread over the set, that decide whether two detections are of one person
-_STRIDE = 0.6  # [m] by which the middle of a person leaps at most from frame to frame: half of the body may be unseen
-_SPEED = 3.0  # [m/s] people do not go further while they are unseen
+STRIDE = 0.6  # [m] by which the middle of a person leaps at most from frame to frame: half of the body may be unseen
+SPEED = 3.0  # [m/s] people do not go further while they are unseen
 _SWITCH = 1.0  # [s] going on with somebody else must show that much more of a person, seen by all cameras
 _SWAY = 0.1  # frames of the same that a leap of one stride must show more: of two who stand close, the same one
 _PATHS = 16  # how many people and gaps are borne in mind at a time
@@ -31,44 +32,73 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     whom the groups show most over the whole take, by the number of keypoints seen and how sure the detector was of
     them; gone after from frame to frame, so that nobody else stands in for a moment (dynamic programming).
 
+    Where a camera has records of several detectors, the person is sought in those of the surest one, and in the others
+    by the boxes; alone where the surest sees nobody, if both are of one person elsewhere.
+
     Raises
     ------
     TrackingError
         Nobody is seen in any frame.
     """
+    sets = list(dict.fromkeys(k.names for k in keypoints))
+    each = {names: [q for q, k in enumerate(keypoints) if k.names == names] for names in sets}
+    chosen: dict[int, NDArray] = {}
+    for own in each.values():
+        chosen |= zip(own, _of_one_detector(rig, [keypoints[q] for q in own]))
     frames = min(len(k) for k in keypoints)
-    surety = [_surety(k, frames) for k in keypoints]
+    sure = {n: sum(float(surety_of(keypoints[q], frames).sum()) for q in own) for n, own in each.items()}
+    surest = {keypoints[q].camera: q for q in reversed(each[max(sure, key=lambda names: sure[names])])}
+    for q, record in enumerate(keypoints):
+        main = surest.get(record.camera, q)
+        if main != q:
+            by_box = same_people([chosen[main]], keypoints[main], record)[0][:frames]
+            both = (by_box >= 0) & (chosen[q] >= 0)
+            alone = (chosen[main] < 0) & (np.mean((by_box == chosen[q])[both]) > 0.5 if both.any() else False)
+            chosen[q] = np.where(alone, chosen[q], by_box)
+    out = [chosen[q] for q in range(len(keypoints))]
+    if all(np.all(c < 0) for c in out):
+        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
+    return out
+
+
+def _of_one_detector(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
+    """(F,) the person to follow in each of several records of one kind of keypoints."""
+    frames = min(len(k) for k in keypoints)
+    surety = [surety_of(k, frames) for k in keypoints]
     chosen = [np.full(frames, -1) for _ in keypoints]
     if all(k.points.shape[1] == 1 for k in keypoints):
         for c, sure in zip(chosen, surety, strict=True):
             c[sure[:, 0] > 0] = 0
     else:
-        meetings = _meetings(rig, keypoints, surety, frames)
+        meetings = meetings_of(rig, keypoints, surety, frames)
         everybody = len(keypoints) * max(len(k.names) for k in keypoints)
         groups = []
         for f in range(frames):
             ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(surety) for p in np.flatnonzero(s[f] > 0)]
             people = [(q, p) for _, q, p in sorted(ranked, reverse=True)]
-            groups.append(_groups(people, meetings, surety, f, everybody))
+            groups.append(groups_of(people, meetings, surety, f, everybody))
         for f, group in enumerate(_one_person(groups, keypoints[0].rate)):
             for q, p in group:
                 chosen[q][f] = p
-    if all(np.all(c < 0) for c in chosen):
-        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
     return chosen
 
 
 Node = tuple[int, int]  # record, person in it
 
 
-def _surety(record: Keypoints, frames: int) -> NDArray:
+def surety_of(record: Keypoints, frames: int) -> NDArray:
     """(F, P) summed confidence of each person's points, 0 for one of whom too few are seen."""
     seen = np.isfinite(record.points[:frames]).all(axis=-1) & (record.confidence[:frames] > 0.1)
     total = np.where(seen, record.confidence[:frames], 0.0).sum(axis=-1)
     return np.where(seen.sum(axis=-1) >= _ENOUGH, total, 0.0)
 
 
-def _meetings(
+def some_points(count: int) -> NDArray:
+    """(k,) int: some of so many points, spread over the set."""
+    return np.unique(np.linspace(0, count - 1, _SOME).astype(int))
+
+
+def meetings_of(
     rig: Rig, keypoints: Sequence[Keypoints], surety: Sequence[NDArray], frames: int
 ) -> dict[tuple[Node, Node], NDArray]:
     """Centre (F, 3) [m] in space of two detections where they are of one person, NaN elsewhere."""
@@ -90,7 +120,7 @@ def _meetings(
 
 def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArray) -> NDArray:
     """(F, 3) median point in space where two detections agree in some frames, NaN where they do not."""
-    some = np.unique(np.linspace(0, len(a.names) - 1, _SOME).astype(int))
+    some = some_points(len(a.names))
     at = frames[:, None], some
     uv = np.stack([k.points[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2)
     sure = np.stack([k.confidence[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2) > 0.1
@@ -106,7 +136,7 @@ def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArr
 
 
 @dataclass(frozen=True)
-class _Group:
+class Group:
     """Detections of one frame that are of one person."""
 
     nodes: tuple[Node, ...]
@@ -114,16 +144,16 @@ class _Group:
     centre: NDArray  # (3,) [m], NaN where one camera alone sees the person
 
 
-def _groups(
+def groups_of(
     people: list[Node], meetings: dict[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int, full: float
-) -> list[_Group]:
+) -> list[Group]:
     """Largest sets of people of different records that all meet; single ones where nobody meets."""
     links = {
         pair: centre[frame]
         for pair, centre in meetings.items()
         if np.isfinite(centre[frame, 0]) and pair[0] in people and pair[1] in people
     }
-    found: dict[frozenset[Node], _Group] = {}
+    found: dict[frozenset[Node], Group] = {}
     for pair in links:
         group = list(pair)
         for node in people:
@@ -132,20 +162,20 @@ def _groups(
         score = sum(float(surety[q][frame, p]) for q, p in group) / full
         # of all its pairs: one of them may have only half of the person in common
         middle = np.median([c for (a, b), c in links.items() if a in group and b in group], axis=0)
-        found.setdefault(frozenset(group), _Group(tuple(group), score, middle))
+        found.setdefault(frozenset(group), Group(tuple(group), score, middle))
     nowhere = np.full(3, np.nan)
-    return list(found.values()) or [_Group(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people]
+    return list(found.values()) or [Group(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people]
 
 
-def _one_person(groups: Sequence[Sequence[_Group]], rate: float) -> list[tuple[Node, ...]]:
+def _one_person(groups: Sequence[Sequence[Group]], rate: float) -> list[tuple[Node, ...]]:
     """The detections of one person in each frame, none where unseen: the path through the groups that shows most."""
     value, centre, unseen = np.zeros(1), np.full((1, 3), np.nan), np.zeros(1)  # of every path that is borne in mind
     history: list[tuple[NDArray, NDArray]] = []  # for each path the one it goes on from, and its group or -1
     for there in groups:
         at = np.array([g.centre for g in there]).reshape(-1, 3)
         apart = np.linalg.norm(at[:, None] - centre, axis=-1)  # (groups, paths); NaN where a place is not known
-        far = apart > _STRIDE + _SPEED * (unseen + 1) / rate
-        cost = np.where(far, _SWITCH * rate, _SWAY * np.nan_to_num(np.minimum(apart / _STRIDE, 1)) ** 2)
+        far = apart > STRIDE + SPEED * (unseen + 1) / rate
+        cost = np.where(far, _SWITCH * rate, _SWAY * np.nan_to_num(np.minimum(apart / STRIDE, 1)) ** 2)
         total = value - cost
         before = total.argmax(axis=1)
         gained = total.max(axis=1) + [g.score for g in there]
@@ -168,7 +198,7 @@ def _distinct(value: NDArray, centre: NDArray, unseen: NDArray) -> list[int]:
     """The best paths that end at different places, the best first."""
     kept: list[int] = []
     for path in np.argsort(-value, kind="stable"):
-        beside = np.linalg.norm(centre[kept] - centre[path], axis=-1) < _STRIDE
+        beside = np.linalg.norm(centre[kept] - centre[path], axis=-1) < STRIDE
         if not np.any(beside & (unseen[kept] <= unseen[path])):
             kept.append(int(path))
         if len(kept) == _PATHS:

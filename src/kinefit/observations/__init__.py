@@ -19,6 +19,7 @@ from kinefit.observations.frames import (
 )
 from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.silhouettes import SilhouetteVideo
+from kinefit.observations.surface_points import SurfacePointFrame, SurfacePointVideo
 
 __all__ = [
     "MEDIAPIPE_33",
@@ -41,4 +42,6 @@ __all__ = [
     "SilhouetteFrame",
     "SilhouetteVideo",
     "SkeletonMotion",
+    "SurfacePointFrame",
+    "SurfacePointVideo",
 ]

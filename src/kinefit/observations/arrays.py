@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from mmap import mmap
 from numbers import Real
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+
+_SHARE = 0.5  # of an array, of which a part keeps the whole in memory; less is copied
 
 
 def numbers(values: Any, dtype: type | None = float, what: str = "an observation") -> NDArray:
@@ -22,8 +25,17 @@ def numbers(values: Any, dtype: type | None = float, what: str = "an observation
 
 
 def frozen(values: Any, dtype: type = float, what: str = "an observation") -> NDArray:
-    """The same copy, that cannot be written."""
-    array = numbers(values, dtype, what)
+    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`)."""
+    if isinstance(values, np.ndarray) and values.dtype == dtype and not values.flags.writeable:
+        owner = values.base if type(values.base) is np.ndarray else values
+        alone = type(owner) is np.ndarray and (owner.base is None or isinstance(owner.base, mmap))
+        if alone and not owner.flags.writeable and values.nbytes > _SHARE * owner.nbytes:
+            return values
+    return sealed(numbers(values, dtype, what))
+
+
+def sealed(array: NDArray) -> NDArray:
+    """An array of one's own, made read-only: records take it as it is."""
     array.flags.writeable = False
     return array
 

@@ -14,6 +14,8 @@ from kinefit.geometry.triangulation import triangulate
 _STEPS = 5  # of Gauss-Newton, from the point of equal weights, which is nearly there
 _ANGLE = np.deg2rad(0.5)  # between rays, below which a distance is 100 times less certain than a direction
 
+_EXACT = 1e-6  # [px] no match is surer: images that are equal have no residuals
+
 
 @dataclass(frozen=True, eq=False)
 class Intersections:
@@ -60,7 +62,7 @@ def intersect(rig: Rig, uv: NDArray, covariance: NDArray) -> Intersections:
     x = np.where(good[:, None], points, np.nan)
     _check_angles(rig, x)
     weight = np.zeros_like(covariance)
-    weight[seen] = np.linalg.inv(covariance[seen])
+    weight[seen] = np.linalg.inv(covariance[seen] + _EXACT**2 * np.eye(2))
     normal = np.full((len(x), 3, 3), np.nan)
     for _ in range(_STEPS):
         normal, right = np.zeros((len(x), 3, 3)), np.zeros((len(x), 3))

@@ -39,7 +39,7 @@ def measure_states(
 
     Parameters
     ----------
-    states : of each the images of all cameras, in the rig's order
+    states : of each the images of all cameras, in the rig's order; asked for one by one, in this order
     grid, seeds, window, least, constrained : as in `measure`, of the first state
     incremental : False: every image is matched with the first one of the first camera, so that errors do not add up.
         True: with the state before, for motions so large that the first image is not recognised any more
@@ -50,15 +50,17 @@ def measure_states(
     list of Surface
         Points of one row are the same material points; NaN where one is lost.
     """
-    if not states:
+    if not len(states):
         raise ObservationError("no state", remedy="Give the images of one time, or more.")
-    for images in states:
-        check_images(rig, images)
-    out = [measure(rig, states[0], grid, seeds=seeds, window=window, least=least, constrained=constrained)]
-    template, places = states[0][0], grid
-    for k, images in enumerate(states[1:], 1):
+    first = states[0]
+    check_images(rig, first)
+    out = [measure(rig, first, grid, seeds=seeds, window=window, least=least, constrained=constrained)]
+    template, places = first[0], grid
+    for k in range(1, len(states)):
         if progress is not None:
             progress("states", k, len(states))
+        images = states[k]
+        check_images(rig, images)
         own = _found_again(template, images[0], places, window, least)
         here = replace(places, points=own.uv)
         source, base = (images[0], here) if incremental else (template, places)

@@ -85,7 +85,7 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
     videos = any(camera.video for camera in take.cameras) and not (
         take.depth or take.stereo or take.silhouettes or take.regions
     )
-    if not asked and (take.keypoints or take.skin or take.lines or not videos):
+    if not asked and (take.keypoints or take.skin or take.lines or take.surface_points or not videos):
         return take
     files = ensure_detections(take, progress=progress, tell=tell)
     if take.keypoints:

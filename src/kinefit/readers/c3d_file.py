@@ -120,7 +120,10 @@ def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
     if kind not in _SIZES or len(shape) < rank or len(data) < size:
         raise FileError("longer than its record, or of no known type", file=path, place=key, remedy=_REMEDY)
     if kind != -1:
-        return _numbers(data, kind, processor).reshape(shape, order="F")
+        try:
+            return _numbers(data, kind, processor).reshape(shape, order="F")
+        except ValueError as error:  # of no numbers, in dimensions beyond all bounds
+            raise FileError(f"dimensions that cannot be ({error})", file=path, place=key, remedy=_REMEDY) from error
     width = shape[0] if shape else 1
     cells = [data[i : i + width] for i in range(0, size, width)] if size else []
     return [_text(cell) for cell in cells]

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npy
+from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MEDIAPIPE_33, Keypoints
+from kinefit.observations.arrays import sealed
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -64,15 +66,9 @@ _decode = msgspec.json.Decoder(_OpenPoseFrame).decode
 
 @checked
 def read_openpose(
-    folder: str | PathLike[str],
-    *,
-    camera: str,
-    rate: float,
-    keypoint_set: str = "BODY_25B",
-    frames: tuple[int, int] | None = None,
-    time_offset: float = 0.0,
-    image_frame: ImageFrame | None = None,
-) -> Keypoints:
+    folder: str | PathLike[str], *, camera: str, rate: float, keypoint_set: str = "BODY_25B",
+    frames: tuple[int, int] | None = None, time_offset: float = 0.0, image_frame: ImageFrame | None = None,
+) -> Keypoints:  # fmt: skip
     """Read a folder with one json file per frame, as OpenPose and its followers write them.
 
     Parameters
@@ -300,7 +296,7 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     raw = path.read_bytes()
     try:
         people = _decode(raw).people
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
@@ -343,7 +339,7 @@ def _keypoints(
     seen = (confidence > 0) | points.any(axis=-1)
     if image_frame is not None:
         points = image_frame.to_calibration(points)
-    return Keypoints(
-        camera, keypoint_set, names, rate, np.where(seen[..., None], points, np.nan), np.where(seen, confidence, 0.0),
-        time_offset=time_offset + start / rate, source=str(source),
-    )
+    points = sealed(kept(np.where(seen[..., None], points, np.nan)))
+    confidence = sealed(kept(np.where(seen, confidence, 0.0)))
+    offset = time_offset + start / rate
+    return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=offset, source=str(source))

@@ -13,11 +13,8 @@ from kinefit._arguments import checked
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
+from kinefit.readers.units import LENGTHS, worth
 
-UNITS = {
-    "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01,
-    "mm": 0.001, "millimeters": 0.001, "millimetres": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048,
-}  # [m] each
 _TINY = 0.01  # [m] from the origin: no further is who moves in metres that are read as millimetres
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # points of a C3D that are no positions
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
@@ -66,9 +63,11 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 def _metres(unit: str | None, path: Path) -> float:
     if not unit:
         raise ObservationError("the file tells no unit", file=path, place="units", remedy='State it: unit = "mm".')
-    if unit.strip().lower() not in UNITS:
-        raise ObservationError(choices("unit", unit, UNITS), file=path, place="units", remedy='State it: unit = "mm".')
-    return UNITS[unit.strip().lower()]
+    metres = worth(unit, LENGTHS)
+    if metres is None:
+        told = choices("unit", unit, LENGTHS)
+        raise ObservationError(told, file=path, place="units", remedy='State it: unit = "mm".')
+    return metres
 
 
 def _unique(names: list[str]) -> tuple[str, ...]:

@@ -46,16 +46,22 @@ RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured",
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
+def find_motion(path: str | PathLike[str]) -> Path:
+    """A motion file, or the one in a folder of results."""
+    inside = Path(path) / "motion.npz"
+    return inside if inside.is_file() else Path(path)
+
+
 @checked
 def read_motion(path: str | PathLike[str]) -> Motion:
-    """Read a motion file.
+    """Read a motion file, or that in a folder of results.
 
     Raises
     ------
     FileError
         No such file, not a motion file, truncated, or of a later version.
     """
-    file = Path(path)
+    file = find_motion(path)
     arrays = _load(file)
     if "format" not in arrays or str(arrays["format"]) != FORMAT:
         remedy = "Give a file that `kinefit track` wrote."
@@ -72,7 +78,7 @@ def read_motion(path: str | PathLike[str]) -> Motion:
         raise
     except KeyError as error:
         raise FileError(f"motion file without the array {error}", file=file, remedy=_REMEDY) from error
-    except (KinefitError, ValueError, TypeError, IndexError) as error:
+    except (KinefitError, ValueError, TypeError, IndexError, RecursionError) as error:
         problem = f"motion file whose contents do not fit together ({error})"
         raise FileError(problem, file=file, remedy=_REMEDY) from error
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
@@ -117,8 +118,8 @@ def make_channels(
         if record.camera not in rig:
             raise ObservationError(choices("camera", record.camera, rig.names), file=record.source or None)
         known = known_points(body, record.keypoint_set).names
-        mine = names.setdefault(record.keypoint_set, [])
-        mine += [n for n in dict.fromkeys(record.names) if n in known and n not in mine]
+        used = names.setdefault(record.keypoint_set, [])
+        used += [n for n in dict.fromkeys(record.names) if n in known and n not in used]
     sets, parts, start = {}, [], 0
     for name, chosen in names.items():
         if not chosen:
@@ -130,10 +131,13 @@ def make_channels(
     column: list[int] = []
     partner: list[int] = []
     spread: list[float] = []
-    uv, confidence = [], []
+    columns_of_all = sum(len(names[record.keypoint_set]) for record in keypoints)
+    uv = room((len(keypoints[0]), columns_of_all, 2))
+    confidence = room(uv.shape[:2])
     for q, (record, person) in enumerate(zip(keypoints, people, strict=True)):
         span, chosen = sets[record.keypoint_set], names[record.keypoint_set]
         first = len(source)
+        mine = slice(first, first + len(chosen))
         mirrored = [mirror_name(n) for n in chosen]
         partner += [first + (chosen.index(m) if m in chosen else i) for i, m in enumerate(mirrored)]
         source += [q] * len(chosen)
@@ -143,8 +147,7 @@ def make_channels(
         lacking = np.array([n not in record.names for n in chosen], bool)
         columns = [0 if none else record.names.index(n) for n, none in zip(chosen, lacking)]
         if record.points.shape[1] == 0:  # nobody was ever seen there
-            uv.append(np.full((len(record), len(chosen), 2), np.nan))
-            confidence.append(np.zeros((len(record), len(chosen))))
+            uv[:, mine] = np.nan
             continue
         frames, one = np.arange(len(record)), np.maximum(person, 0)
         there = (np.asarray(person) >= 0)[:, None]
@@ -152,13 +155,14 @@ def make_channels(
         seen = np.where(there[..., None], record.points[frames, one][:, columns], np.nan)
         trust = np.where(there, record.confidence[frames, one][:, columns], 0.0)
         late = float(common_start(keypoints) - record.times[0]) * record.rate
-        uv.append(between_frames(seen, late))
-        confidence.append(between_frames(trust, late))
+        uv[:, mine] = between_frames(seen, late)
+        confidence[:, mine] = np.nan_to_num(between_frames(trust, late))
+        release(record.points, record.confidence, uv, confidence)
     twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
     labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
     return Channels(
         rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
-        np.array(spread), np.concatenate(uv, axis=1), np.nan_to_num(np.concatenate(confidence, axis=1)),
+        np.array(spread), uv, confidence,
     )  # fmt: skip
 
 

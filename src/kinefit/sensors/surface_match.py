@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces import SurfaceAnchors
 from kinefit.correspondences import anchored_rows, free_space_rows, target_rows
+from kinefit.correspondences.anchored import anchored
 from kinefit.correspondences.depth_image import SurfaceSamples
 from kinefit.correspondences.free_space import FreeSpace
 from kinefit.correspondences.morphed import on_moved_joints
@@ -48,13 +49,9 @@ class SurfacePairs:
 
         `factor` multiplies the weights.
         """
-        x, n, r = x_world[rows.group], rows.direction, rows.residual
-        foot = x - (r / np.square(n).sum(axis=1))[:, None] * n
-        f = scene.frames[rows.segment]
-        R = f[:, :9].reshape(-1, 3, 3)
-        rest, normal = np.einsum("nji,nj->ni", R, foot - f[:, 9:]), np.einsum("nji,nj->ni", R, n)
+        x, rest, normal = anchored(rows, x_world, scene.frames)
         anchors = SurfaceAnchors(scene.body, rows.segment, rest, normal)
-        return cls(anchors, np.ascontiguousarray(x), factor * rows.weight, scale, True, camera)
+        return cls(anchors, x, factor * rows.weight, scale, True, camera)
 
     @classmethod
     def seen(

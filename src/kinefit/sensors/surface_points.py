@@ -1,9 +1,9 @@
 """Tracked points of a surface: each sticks to the place of the body where it was first seen (P4-5, P4-11).
 
-A point that was not seen before is drawn to the nearest surface, as one of a cloud. Once the step is accepted it is
-anchored where it lies on its segment; from then on it says in all three directions where that place is, so that turns
-about a limb's own axis are seen. Anchors are what the sensor learnt, not parameters: skin slides on the bone by
-`slide`.
+A point that was not seen before is drawn to the nearest surface, as one of a cloud. Once the limb rests in the cloud,
+so that places of points on it no longer wander from step to step, they are anchored where they lie on its segment; from
+then on each says in all three directions where that place is, so that turns about a limb's own axis are seen. Anchors
+are what the sensor learnt, not parameters: skin slides on the bone by `slide`.
 """
 
 from __future__ import annotations
@@ -17,48 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies.surfaces import SurfaceAnchors
 from kinefit.correspondences import surface_rows
 from kinefit.errors import ObservationError
+from kinefit.observations import SurfacePointFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surface_match import SurfacePairs
 
+_SETTLED = 0.05  # of the slide, by which places on a limb may wander from step to step: 0.5 mm, a degree of a thin arm
+_PATIENCE = 10  # steps after which a limb counts as settled: a cloud does not tell a round one's turn at all
 _AGREES = 3.0  # standard deviations from the surface within which a new point is anchored
 Anchor = tuple[int, NDArray]
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePointFrame:
-    """Points of a surface at one time, as `photogrammetry.surface_tracking.SurfaceTracker.update` gives them.
-
-    Parameters
-    ----------
-    sensor, time : name of the sensor, and [s]
-    ids : (N,) int, the same for the same point at all times
-    x_world : (N, 3) [m]; NaN where not seen
-    covariance : (N, 3, 3) [m²]
-
-    Raises
-    ------
-    ObservationError
-        Shapes that do not fit, or a point twice.
-    """
-
-    sensor: str
-    time: float
-    ids: NDArray
-    x_world: NDArray
-    covariance: NDArray
-
-    def __post_init__(self) -> None:
-        ids, x, c = np.asarray(self.ids), np.asarray(self.x_world, float), np.asarray(self.covariance, float)
-        if ids.ndim != 1 or x.shape != (len(ids), 3) or c.shape != (len(ids), 3, 3) or ids.dtype.kind not in "iu":
-            problem = f"{ids.dtype} ids {ids.shape}, points {x.shape}, covariances {c.shape} of {self.sensor}"
-            raise ObservationError(problem, remedy="Give whole numbers (N,), (N, 3) and (N, 3, 3).")
-        if len(np.unique(ids)) < len(ids):
-            raise ObservationError(f"a point of {self.sensor} twice", remedy="Give every point its own number.")
-        seen = np.isfinite(x).all(axis=1) & np.isfinite(c).all(axis=(1, 2))
-        for name, value in (("ids", ids[seen]), ("x_world", x[seen]), ("covariance", c[seen])):
-            object.__setattr__(self, name, value)
 
 
 class SurfacePointSensor(Sensor):
@@ -76,6 +44,8 @@ class SurfacePointSensor(Sensor):
             raise ObservationError(f"a slide of {slide} m, {most} points", remedy="Give positive numbers.")
         self.name, self.slide, self.most = name, float(slide), int(most)
         self.anchors: Mapping[int, Anchor] = {}
+        self._last: Mapping[int, Anchor] = {}  # places of points on limbs that have not settled
+        self._waited: Mapping[int, int] = {}  # steps of each such limb
 
     def prepare(self, frame: SurfacePointFrame, scene: Scene) -> SurfacePointMeasurement:
         """Points with an anchor first, then new ones, no more than `most`."""
@@ -87,23 +57,44 @@ class SurfacePointSensor(Sensor):
         if len(order) > self.most:
             order = order[np.linspace(0, len(order) - 1, self.most).astype(int)]
         mean = np.trace(frame.covariance[order], axis1=1, axis2=2) / 3.0
+        ids = frame.ids[order]
+        anchors = {int(i): self.anchors[int(i)] for i in ids if int(i) in self.anchors}
         return SurfacePointMeasurement(
-            frame.sensor, frame.time, frame.ids[order], frame.x_world[order], mean + self.slide**2, self.slide,
-            self.anchors,
-        )  # fmt: skip
+            frame.sensor, frame.time, ids, frame.x_world[order], mean + self.slide**2, self.slide, anchors
+        )
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
-        """Anchor the new points that lie on the surface."""
+        """Anchor new points on limbs that have settled; let go of those that left the limb they were given to.
+
+        A point is let go where its place on the segment is far from where it is seen, while most points of the same
+        segment agree: it belongs to another limb, or its path went astray. Its next frame gives it to the nearest.
+        """
         if not sure or not isinstance(measurement, SurfacePointMeasurement):
             return
+        lost = measurement.strayed(scene)
+        if lost:
+            self.anchors = {i: anchor for i, anchor in self.anchors.items() if i not in lost}
         new = measurement.new
         near = measurement.near(scene, new, _AGREES * self.slide)
         f = scene.frames[near.segment]
         gap = measurement.x_world[new][near.group] - f[:, 9:]
         rest = np.einsum("nji,nj->ni", f[:, :9].reshape(-1, 3, 3), gap)
         ids = measurement.ids[new][near.group]
-        added = {int(i): (int(s), x) for i, s, x in zip(ids, near.segment, rest)}
-        self.anchors = {**self.anchors, **added}
+        found = {int(i): (int(s), x) for i, s, x in zip(ids, near.segment, rest)}
+        known = {s for s, _ in self.anchors.values()}
+        settled = known | {s for s in {s for s, _ in found.values()} - known if self._rests(s, found)}
+        self._last = {i: anchor for i, anchor in found.items() if anchor[0] not in settled}
+        added = {i: anchor for i, anchor in found.items() if anchor[0] in settled}
+        if added:
+            self.anchors = {**self.anchors, **added}
+
+    def _rests(self, segment: int, found: Mapping[int, Anchor]) -> bool:
+        """Whether places of points on a segment have stopped to wander, or have been waited for long enough."""
+        waited = self._waited.get(segment, 0) + 1
+        self._waited = {**self._waited, segment: waited}
+        both = [i for i, (s, _) in found.items() if s == segment and self._last.get(i, (-1, None))[0] == segment]
+        moved = [float(np.linalg.norm(found[i][1] - self._last[i][1])) for i in both]
+        return waited > _PATIENCE or (len(moved) > 2 and float(np.median(moved)) < _SETTLED * self.slide)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +106,7 @@ class SurfacePointMeasurement(Measurement):
     sensor, time, ids, x_world : as of the frame
     variance : (N,) [m²] with the slide
     slide : float [m]
-    anchors : {id: (segment, place in its frame (3,) [m])}, as known then
+    anchors : {id: (segment, place in its frame (3,) [m])} of its points, as known then
     """
 
     sensor: str
@@ -131,6 +122,23 @@ class SurfacePointMeasurement(Measurement):
     def new(self) -> NDArray[np.int64]:
         """(M,) indices of points without an anchor."""
         return np.flatnonzero([int(i) not in self.anchors for i in self.ids])
+
+    def strayed(self, scene: Scene) -> set[int]:
+        """Points that are far from their anchors, on segments where the median is within one standard deviation."""
+        index = [k for k, i in enumerate(self.ids) if int(i) in self.anchors]
+        if not index:
+            return set()
+        told = [self.anchors[int(i)] for i in self.ids[index]]
+        segment = np.array([s for s, _ in told])
+        f = scene.frames[segment]
+        at = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), np.array([x for _, x in told])) + f[:, 9:]
+        off = np.linalg.norm(self.x_world[index] - at, axis=1) / np.sqrt(3.0 * self.variance[index])
+        out: set[int] = set()
+        for s in np.unique(segment):
+            mine = np.flatnonzero(segment == s)
+            if np.median(off[mine]) < 1.0:
+                out |= {int(self.ids[index[k]]) for k in mine if off[k] > _AGREES}
+        return out
 
     def near(self, scene: Scene, index: ArrayLike, reach: float) -> Rows:
         """Rows of some points to the nearest surface, within a distance [m]; groups count among `index`."""

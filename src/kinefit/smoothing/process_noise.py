@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, PointSet
 from kinefit.losses import Loss
 from kinefit.sensors.base import Matched, rows_at
@@ -118,8 +119,12 @@ class SmoothTake:
 
     def agreeing(self, sigma: NDArray) -> NDArray:
         """(T, N) robust factor of every channel at its states, 0 where unseen."""
-        parts = [self.part(some) for some in stretches(len(self.roots))]
-        return np.concatenate([p.factors(sigma, p.fitted(p.roots, p.angles)) for p in parts])
+        out = room(self.confidence.shape)
+        for some in stretches(len(self.roots)):
+            part = self.part(some)
+            out[some] = part.factors(sigma, part.fitted(part.roots, part.angles))
+            release(self.uv, self.confidence, out)
+        return out
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """All frames together, from where they are."""

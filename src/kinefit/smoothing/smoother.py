@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
@@ -93,7 +94,10 @@ def smooth_results(
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
     # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
-    took_part = take.confidence / np.square(strength.sigma) * take.agreeing(strength.sigma)
+    took_part = take.agreeing(strength.sigma)
+    for some in stretches(len(took_part)):
+        took_part[some] *= take.confidence[some] / np.square(strength.sigma)
+    release(took_part, take.confidence)
     surfaces = False
     smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
     covariance = np.empty((body.tree.n_dofs,) * 2)
@@ -207,10 +211,14 @@ def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
     if len(swapped) == len(channels.uv) and not swapped.any():
         unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
         return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
-    order = np.where(swapped, channels.partner, np.arange(swapped.shape[1]))
-    uv = np.take_along_axis(channels.uv[: len(swapped)], order[:, :, None], axis=1)
-    confidence = np.take_along_axis(channels.confidence[: len(swapped)], order, axis=1)
-    return uv, np.where(np.isfinite(uv).all(axis=2), confidence, 0.0)
+    uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
+    for some in stretches(len(swapped)):
+        order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))
+        uv[some] = np.take_along_axis(channels.uv[some], order[:, :, None], axis=1)
+        sure = np.take_along_axis(channels.confidence[some], order, axis=1)
+        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
+    release(uv, confidence)
+    return uv, confidence
 
 
 def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
@@ -237,6 +245,7 @@ def _estimate(
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
         piece = done[i] if i in done else enliven(take.part(whole), strength)
+        release(take.uv, take.confidence)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
@@ -261,6 +270,7 @@ def _solve(
             fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
+            release(take.uv, take.confidence)
             speeds.append(_speed_std(post, part.dt)[max(inside.start - 1, 0) : inside.stop - 1])
             for covariance in post.frames[inside]:
                 covariances.append(covariance[packed])

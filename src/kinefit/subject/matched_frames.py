@@ -35,6 +35,8 @@ class Worlds:
         self._first = world
         ends = np.cumsum([0, *(len(one.names) for one in parameters)])
         self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
+        # Cameras know nothing of bodies: moved first, they are not moved again for every body.
+        self._applied = sorted(self._parameters, key=lambda each: not isinstance(each[0], CameraExtrinsics))
         self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
         self._bare: Worlds | None = None
         self._scenes: dict[int, tuple[Body, Scene]] = {}
@@ -42,7 +44,7 @@ class Worlds:
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
         world = self._first
-        for one, own in self._parameters:
+        for one, own in self._applied:
             values = theta[own]
             key = id(world), values.tobytes()
             if key not in self._kept:

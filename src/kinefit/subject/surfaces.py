@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.anny import AnnyFamily, AnnyModel
 from kinefit.bodies.flesh import with_flesh
-from kinefit.bodies.surfaces import Surface, TaperedCylinder
+from kinefit.bodies.surfaces import Metaballs, Surface, TaperedCylinder
 from kinefit.errors import BodyError
+from kinefit.subject.metaballs import MetaballShape
 from kinefit.subject.parameters import Parameters, World
 
 GIRTH, OFFSET = 0.2, 0.015
@@ -236,7 +237,7 @@ class AnnyShape:
 
 
 def shape_of(body: Body) -> list[Parameters]:
-    """What a take with surfaces tells of a body beside its lengths: Anny's shape, or girths of cylinders; or nothing.
+    """What a take with surfaces tells of a body beside its lengths: Anny's shape, girths, radii of metaballs.
 
     A mesh, or a skin of another make, is taken as it is.
     """
@@ -244,4 +245,5 @@ def shape_of(body: Body) -> list[Parameters]:
     if isinstance(family, AnnyFamily) and family.model.segments == body.tree.segments:
         return [AnnyShape(family.model, family.usual, flesh=True)]
     cylinders = any(isinstance(s, TaperedCylinder) for s in body.surfaces)
-    return [CylinderShape(body)] if cylinders and not body.skin else []
+    out: list[Parameters] = [CylinderShape(body)] if cylinders and not body.skin else []
+    return [*out, MetaballShape(body)] if any(isinstance(s, Metaballs) for s in body.surfaces) else out

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.motion import Residuals
 from kinefit.rows import Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
@@ -16,6 +17,7 @@ FAR = 3.0
 """Standard deviations, as they are stated, that half of a sensor's residuals must exceed to be a contradiction."""
 
 LOOKS = 12  # frames that are looked at, spread over the take
+_RAYLEIGH = 1.177  # median length of a vector whose two parts have a standard deviation of 1
 _TINY = 1e-6  # share of a direction that nothing measures
 
 
@@ -44,9 +46,40 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
     return dict(sorted(far.items(), key=lambda one: -one[1]["deviations"]))
 
 
+def cameras_apart(residuals: Mapping[str, Residuals], sigma: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Cameras whose keypoints lie far from the fit while those of the others do not: moved, or calibrated otherwise.
+
+    Parameters
+    ----------
+    residuals : of all sensors
+    sigma : {camera: [px]} standard deviation of a sure keypoint, as it is stated
+
+    Returns
+    -------
+    {camera: {"deviations": float, "median_px": float, "others_px": float}}
+        Of three cameras or more; deviations are of what is stated, or of the others' where these are larger.
+    """
+    medians = {}
+    for name, one in residuals.items():
+        if name in sigma and one.unit == "px" and np.isfinite(one.norms).any():
+            medians[name] = float(np.nanmedian(one.norms))
+    found: dict[str, dict[str, Any]] = {}
+    for name, median in medians.items() if len(medians) > 2 else ():
+        others = float(np.median([m for other, m in medians.items() if other != name]))
+        deviations = median / max(_RAYLEIGH * sigma[name], others)
+        if deviations > FAR:
+            found[name] = {
+                "deviations": round(deviations, 2), "median_px": round(median, 1), "others_px": round(others, 1)
+            }
+    return dict(sorted(found.items(), key=lambda one: -one[1]["deviations"]))
+
+
 def sentences(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The same in words, one for each sensor."""
     return [
+        f"{sensor} contradicts the other cameras: half of its keypoints lie {t['median_px']:.0f} px or more from the "
+        f"fit, those of the others {t['others_px']:.0f} px; it counts for little. kinefit check tells more"
+        if "median_px" in t else
         f"{sensor} contradicts the other sensors: half of its residuals exceed {1000 * t['median_m']:.0f} mm, "
         f"{t['deviations']:.1f} of its standard deviations; it is shifted by "
         f"({', '.join(f'{1000 * v:+.0f}' for v in t['shift_m'])}) mm"

@@ -26,11 +26,11 @@ from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import STRETCH, Spool
 from kinefit.smoothing.uncertainty import with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
-from kinefit.tracking.agreement import LOOKS, contradictions
+from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
 from kinefit.tracking.cameras import CAMERAS, as_told
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
@@ -116,6 +116,8 @@ def motion_of(
 
     provenance["contradictions"] = contradictions(*zip(*(seen(int(f)) for f in spread(len(results), LOOKS))))
     residuals = _residuals(len(results), seen if smooth or lag is not None else None, frames.leftovers)
+    stated = {name: float(np.median(channels.sigma[channels.source == q])) for q, name in enumerate(channels.sources)}
+    provenance["contradictions"] |= cameras_apart(residuals, stated)
     noise_of_others = None
     if others is not None and matched is not None:
         # the tracker's own frames hold the surfaces' errors already
@@ -197,9 +199,12 @@ def _residuals(
     """What every sensor leaves over of so many frames: as it was tracked, or of what was matched since."""
     remains = Remains(count)
     for f in range(count):
+        if f % STRETCH == 0:
+            remains.release()
         if seen is None:
             remains.add(f, tracked[f])
             continue
         scene, matched = seen(f)
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))
+    remains.release()
     return remains.residuals()

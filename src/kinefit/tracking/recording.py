@@ -15,6 +15,7 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
+from kinefit.multiview.followed import Followed, follow
 from kinefit.observations import (
     ColourFrame,
     DepthFrame,
@@ -48,6 +49,7 @@ class Recording:
     steps : what all sensors but the keypoints' detectors saw at each step
     keypoints : of F frames each, of one or several people
     people : (F,) int each, which of them is followed in each frame, -1 for none
+    followed : who of several people that is, where keypoints show others
     sigma : {sensor: standard deviation}, [px] of cameras' keypoints and of "silhouette CAMERA", else [m]
     sensors : of one's own, see `kinefit.sensors.base`
     markers : labelled recordings among what the steps show, whole, for the subject fit
@@ -66,6 +68,7 @@ class Recording:
     steps: Steps = lambda i: ()
     keypoints: tuple[Keypoints, ...] = ()
     people: tuple[NDArray, ...] = ()
+    followed: Followed | None = None
     sigma: Mapping[str, float] = field(default_factory=dict)
     keypoint_sigma: tuple[float, ...] = ()
     sensors: tuple[Sensor, ...] = ()
@@ -107,8 +110,9 @@ class Recording:
 
     @classmethod
     def of_keypoints(
-        cls, rig: Rig, keypoints: Sequence[Keypoints], *, accuracy: float | Sequence[float] = 8.0, **more: Any
-    ) -> Recording:
+        cls, rig: Rig, keypoints: Sequence[Keypoints], *, accuracy: float | Sequence[float] = 8.0,
+        person: int | str | None = None, **more: Any,
+    ) -> Recording:  # fmt: skip
         """Keypoints of calibrated cameras; the person is chosen among all detected.
 
         Parameters
@@ -116,14 +120,15 @@ class Recording:
         rig : Rig
         keypoints : records of the same number of frames and the same rate.
         accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
+        person : "first" (of whom most is seen, the default), "moving", "largest", "nearest X Y Z" [m], or a number
         more : other arguments of a recording
 
         Raises
         ------
         ObservationError
-            No keypoints, or of different lengths or rates.
+            No keypoints, or of different lengths or rates; a person in another form.
         TrackingError
-            Nobody is seen in any frame.
+            Nobody is seen in any frame, or fewer people than the number.
         """
         given = () if keypoints is None else keypoints
         of_kind(given, Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
@@ -135,9 +140,10 @@ class Recording:
             told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
             raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
         sigma = _sigmas(accuracy, len(keypoints))
-        people = tuple(choose_people(rig, keypoints))
+        one = follow(rig, keypoints, person)
+        people = tuple(choose_people(rig, one.keypoints))
         return cls(
-            keypoints[0].times, keypoints[0].rate, rig, keypoints=tuple(keypoints), people=people,
+            keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=people, followed=one,
             keypoint_sigma=sigma, **more,
         )  # fmt: skip
 

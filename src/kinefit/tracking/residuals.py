@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import release, room
 from kinefit.motion import Residuals
 from kinefit.sensors.base import Leftover
 
@@ -49,6 +50,11 @@ class Remains:
             if of.surface and rest.rms is not None and rest.count is not None:
                 of.arrays["rms"][f, columns], of.arrays["count"][f, columns] = rest.rms, rest.count
 
+    def release(self) -> None:
+        """Give back the memory of what was added so far: it lies in files where it is much."""
+        for of in self._of.values():
+            release(*of.arrays.values())
+
     def residuals(self, frames: Sequence[int] | None = None) -> dict[str, Residuals]:
         """Of all frames, or of some of them, by sensor."""
         which = slice(None) if frames is None or len(frames) == self._frames else np.asarray(frames, np.int64)
@@ -78,7 +84,7 @@ class Remains:
         more = len(of.place) - before
         if more:
             for name, array in of.arrays.items():
-                nothing = 0.0 if name in ("weights", "count") else np.nan
-                fresh = np.full((len(array), more, *array.shape[2:]), nothing)
-                of.arrays[name] = np.concatenate([array, fresh], axis=1)
+                of.arrays[name] = larger = room((len(array), before + more, *array.shape[2:]))
+                larger[:, :before] = array
+                larger[:, before:] = 0.0 if name in ("weights", "count") else np.nan
         return [of.place[name] for name in rest.names]

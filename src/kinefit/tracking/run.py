@@ -7,6 +7,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
+from kinefit._mapped import release
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
@@ -169,8 +170,10 @@ def run(
     stopped = False
     try:
         for i in range(at, len(times)):
-            if checkpoint is not None and i > at and (i - begin) % _EVERY == 0:
-                tracker = frames.keep(checkpoint, tracker, i)
+            if i > at and (i - begin) % _EVERY == 0:
+                release(channels.uv, channels.confidence)
+                if checkpoint is not None:
+                    tracker = frames.keep(checkpoint, tracker, i)
             found = step(tracker, i, float(times[i])) or frames.place
             if not found and i - begin >= _GIVE_UP and tracker.sees_surfaces:
                 break

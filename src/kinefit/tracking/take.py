@@ -13,6 +13,8 @@ from kinefit.errors import TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
+from kinefit.multiview.followed import follow
+from kinefit.multiview.people import Person
 from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
@@ -57,8 +59,10 @@ def track_take(
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
     alone = take.start or take.pose or any(sensors)
-    if (take.silhouettes or take.regions) and not alone:
+    if (take.silhouettes or take.regions or take.surface_points) and not alone:
         kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")
+        if take.surface_points:
+            kind, table = "points of a surface", "surface_points"
         raise TakeError(
             f"{kind} alone do not show where the body is to begin with", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
@@ -84,6 +88,24 @@ def track_take(
         checkpoint=checkpoint,
     )  # fmt: skip
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
+
+
+def people_in_view(take: Take) -> tuple[Person, ...]:
+    """Everybody whom a take's keypoints show, the one of whom most is seen first; empty where that is one at most.
+
+    Where other sensors take part it is empty, too: their pixels and markers are not parted by people.
+    """
+    beside = (
+        take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines,
+        take.surface_points,
+    )  # fmt: skip
+    if any(beside) or not take.keypoints:
+        return ()
+    seen = load_observations(take)
+    if seen.rig is None:
+        return ()
+    people = follow(seen.rig, seen.keypoints).people
+    return people if len(people) > 1 else ()
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:
@@ -120,5 +142,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
     accuracy, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
-    channels = make_channels(body, seen.rig, seen.keypoints, choose_people(seen.rig, seen.keypoints), accuracy)
+    keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
+    channels = make_channels(body, seen.rig, keypoints, choose_people(seen.rig, keypoints), accuracy)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

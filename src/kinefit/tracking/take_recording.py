@@ -23,6 +23,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surface_points import SurfacePointSensor
 from kinefit.tracking.recording import Recording, spread
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
@@ -99,13 +100,16 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(m.markers for m in marked),
         marker_sets=tuple((m.marker_set, m.std) for m in marked), depth=_first_depth(depth, seen),
         on_body=tuple(v.sensor for v in depth if v.on_body), backgrounds=_backgrounds(depth), start=start, up=take.up,
-        name=take.name,
+        name=take.name, sensors=_surface_sensors(take, seen),
     )  # fmt: skip
     if seen.keypoints:
-        pixels = Recording.of_keypoints(rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints])
-        recording = replace(
-            recording, keypoints=pixels.keypoints, people=pixels.people, keypoint_sigma=pixels.keypoint_sigma
+        pixels = Recording.of_keypoints(
+            rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person
         )
+        recording = replace(
+            recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,
+            keypoint_sigma=pixels.keypoint_sigma,
+        )  # fmt: skip
     return recording, body
 
 
@@ -130,6 +134,12 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {marker_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
+
+
+def _surface_sensors(take: Take, seen: Observations) -> tuple[SurfacePointSensor, ...]:
+    """Sensors of tracked surfaces, which learn where on the body each point is."""
+    pairs = zip(take.surface_points, seen.surface_points)
+    return tuple(SurfacePointSensor(video.sensor, slide=entry.sigma) for entry, video in pairs)
 
 
 def marker_sensor(take: Take, k: int) -> str:

@@ -95,7 +95,7 @@ def track(
     if checkpoint is None:
         person = fitted()
     else:
-        if recording.sensors:
+        if any(type(sensor).__module__.partition(".")[0] != "kinefit" for sensor in recording.sensors):
             problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
             raise ObservationError(problem, remedy="Leave the checkpoint out.")
         whole = {name: getattr(recording, name) for name in ("steps", "keypoints", "people", "markers", "depth", "rig")}
@@ -111,7 +111,8 @@ def track(
         person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
         recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
     )  # fmt: skip
-    told = {**person.told, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
+    others = {} if recording.followed is None else recording.followed.as_told()
+    told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     motion = motion_of(

@@ -13,6 +13,7 @@ from kinefit.calibration.check.scene import lens_findings, placement_findings
 from kinefit.calibration.check.views import make_views, with_sides_right
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
+from kinefit.sensors.channels import mirror_name
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 
 MOTION = cut(squat_and_wave(duration=2.0), 0, 60)
@@ -38,6 +39,18 @@ def mirrored(axis):
         return out
 
     return [replace(k, points=turn(k.points)) for k in SEEN]
+
+
+def one_reversed(camera, axes, *, sides):
+    """One camera's keypoints in a picture that is reversed, where a detector may take left for right."""
+    def turn(record):
+        points = record.points.copy()
+        for axis in axes:
+            points[..., axis] = RIG[camera].size[axis] - 1 - points[..., axis]
+        other = [record.names.index(mirror_name(n) or n) for n in record.names] if sides else slice(None)
+        return replace(record, points=points[:, :, other], confidence=record.confidence[:, :, other])
+
+    return [turn(k) if k.camera == camera else k for k in SEEN]
 
 
 def kinds(check, severity="fault"):
@@ -67,6 +80,9 @@ MISTAKES = {
     "graphics, inverted": (posed(lambda T: se3.inverse(FLIP @ T)), SEEN, "poses", "y down"),
     "left-handed world": (RIG, mirrored(1), "mirrored", "right-handed"),
     "selfie pictures": (RIG, mirrored(0), "mirrored", "hflip"),
+    "one selfie picture": (RIG, one_reversed("cam02", (0,), sides=True), "mirrored", "cam02 was recorded mirrored"),
+    "one mirrored table": (RIG, one_reversed("cam03", (0,), sides=False), "mirrored", "cam03 was recorded mirrored"),
+    "one upside down": (RIG, one_reversed("cam01", (0, 1), sides=False), "turned", "rotation = 180"),
     "floor as ceiling": (RIG.moved(FLIP), SEEN, "up", 'up = "-z"'),
     "another session": (ELSEWHERE, SEEN, "session", "another session"),
     "millimetres": (

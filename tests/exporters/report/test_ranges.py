@@ -8,7 +8,8 @@ from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.exporters.curves import Curve, curves
-from kinefit.exporters.report.ranges import NAMES, WIDE, extremes, ranges_table
+from kinefit.exporters.report.names import NAMES
+from kinefit.exporters.report.ranges import WIDE, extremes, ranges_table
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE

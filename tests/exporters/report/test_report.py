@@ -178,7 +178,7 @@ def test_angles_that_share_a_bend_by_the_prior_are_named_and_why(tmp_path):
     unsure = replace(motion, dof_std=std)
     assert {name: round(v, 6) for name, v in shared_by_prior(unsure).items()} == dict.fromkeys(shared, 8.0)
     page = write_report(unsure, tmp_path / "report.html", date="2026-01-01").read_text(encoding="utf-8")
-    assert "Shared by the prior posture" in page and "right hip flexion (±8°)" in page
+    assert "Shared by the prior posture" in page and "right hip flexion (±16°)" in page
     std[:, 6 + tree.coordinate("hip_flexion_l")] = np.radians(1.0)  # markers on the pelvis tell how the hips turn
     assert shared_by_prior(replace(motion, dof_std=std)) == {}
     assert "Shared by the prior" not in write_report(motion, tmp_path / "r.html").read_text(encoding="utf-8")

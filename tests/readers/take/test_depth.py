@@ -73,7 +73,7 @@ def test_frames_that_are_missing_are_told(folder):
         (ALONE + "unit = 1", "rate = 30", "", "depth tof: the median depth is 101"),
         (ALONE + "range = [2, 3]", "rate = 30", "", "depth tof: nothing lies within the range of 2 to 3 m"),
         (ALONE + "range = [3, 2]", "rate = 30", "", r"depth tof: range = \[3.0, 2.0\]"),
-        (ALONE + "range = [3]", "rate = 30", "", "Expected `array` of length 2"),
+        (ALONE + "range = [3]", "rate = 30", "", "a list of 2 is expected, not of 1"),
         (ALONE + "sigma = 5", "rate = 30", "", "sigma 5.0 m"),
         (ALONE + "unit = 0", "rate = 30", "", "unit = 0"),
         (ALONE + "size = [0, 3]", "rate = 30", "", r"size = \[0, 3\]"),

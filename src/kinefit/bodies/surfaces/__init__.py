@@ -1,9 +1,10 @@
-"""Surfaces of a body's segments: tapered elliptical cylinders and meshes."""
+"""Surfaces of a body's segments: tapered elliptical cylinders, meshes and metaballs."""
 
 from kinefit.bodies.surfaces.anchors import SurfaceAnchors
 from kinefit.bodies.surfaces.cylinder import Box, TaperedCylinder, bounding_box
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.nearest import Nearest, nearest
 from kinefit.bodies.surfaces.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.tables import SurfaceTables
@@ -17,6 +18,7 @@ __all__ = [
     "FourierCurve",
     "FourierSurface",
     "MeshSurface",
+    "Metaballs",
     "Nearest",
     "SkinnedMesh",
     "Surface",

@@ -6,20 +6,33 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.obj import mesh_surface
 from kinefit.errors import BodyError
+from kinefit.geometry.se3 import exp_so3
 
 Vector = tuple[float, float, float]
 Section = float | tuple[float, float]
 
 
+class BallRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A metaball: an ellipsoid's centre and radii [m] in the segment's frame, its weight, its turn [deg]."""
+
+    at: Vector
+    radii: Vector
+    weight: float = 1.0
+    turn: Vector = (0.0, 0.0, 0.0)
+
+
 class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
 
-    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit.
+    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or metaballs, from one end of
+    the limb to the other.
     """
 
     end: Vector | None = None
@@ -29,6 +42,7 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     mesh: str | None = None
     unit: str = "m"
     mirror: bool = False
+    balls: tuple[BallRecord, ...] = ()
 
     def mirrored(self) -> SurfaceRecord:
         """The surface on the other side of the body's plane of symmetry."""
@@ -49,12 +63,15 @@ def surfaces_of(
     out: list[TaperedCylinder | MeshSurface] = []
     for record in [records] if isinstance(records, SurfaceRecord) else records or ():
         is_cylinder = record.end is not None and record.radii is not None
-        if is_cylinder == (record.mesh is not None):
-            remedy = "Give `end` and `radii` of a cylinder, or else `mesh`, the path of an OBJ file."
+        if is_cylinder + (record.mesh is not None) + bool(record.balls) != 1:
+            remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, or `balls`."
             raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
         if record.mesh is not None:
             path = Path(source).parent / record.mesh
             out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
+            continue
+        if record.balls:
+            out.append(_metaballs(record, segment, source, place))
             continue
         assert record.end is not None and record.radii is not None
         first, last = (r if isinstance(r, tuple) else (r, r) for r in record.radii)
@@ -63,6 +80,16 @@ def surfaces_of(
         except BodyError as error:
             raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
     return out
+
+
+def _metaballs(record: SurfaceRecord, segment: int, source: str, place: str) -> Metaballs:
+    balls = record.balls
+    axes = exp_so3(np.radians([b.turn for b in balls])).swapaxes(1, 2)
+    try:
+        out = Metaballs.of(segment, [b.at for b in balls], [b.radii for b in balls], [b.weight for b in balls], axes)
+    except BodyError as error:
+        raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
+    return out.mirrored() if record.mirror else out
 
 
 def _mirrored(vector: Vector) -> Vector:

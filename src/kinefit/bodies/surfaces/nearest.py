@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.surfaces._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
 from kinefit.bodies.surfaces._kernels_grid import nearest_on_grids
+from kinefit.bodies.surfaces._kernels_metaballs import nearest_on_metaballs
 from kinefit.errors import ObservationError
 
 if TYPE_CHECKING:
@@ -91,4 +92,6 @@ def nearest_lines(
         search(x, frames, tables.cylinders, wanted, distance, normal, segment)
     if tables.grids is not None:
         nearest_on_grids(x, frames, *tables.grids, wanted, distance, normal, segment)
+    if tables.balls is not None:
+        nearest_on_metaballs(np.ascontiguousarray(x), frames, *tables.balls, wanted, distance, normal, segment)
     return distance, normal, segment

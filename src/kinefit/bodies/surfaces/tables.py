@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.grid import GridTable, pack_grids
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.metaballs import BallTable, Metaballs, pack_balls
 
 
 class SurfaceTables(NamedTuple):
@@ -22,20 +23,24 @@ class SurfaceTables(NamedTuple):
         segment, start (3) [m] in the root frame at rest, directions of a, b and the axis (9), length [m],
         a0, b0 and how much they grow along the axis (4).
     grids : GridTable of its meshes, None where it has none.
+    balls : BallTable of its metaballs, None where it has none.
     """
 
     cylinders: NDArray
     grids: GridTable | None
+    balls: BallTable | None = None
 
 
 def tables(surfaces: Sequence[TaperedCylinder | MeshSurface], rest: NDArray) -> SurfaceTables:
     """Tables of surfaces; rest (S, 3) [m] joint centres in the root frame at rest."""
     cylinders = [s for s in surfaces if isinstance(s, TaperedCylinder)]
-    meshes = [s for s in surfaces if isinstance(s, MeshSurface)]
+    melted = [s for s in surfaces if isinstance(s, Metaballs)]
+    meshes = [s for s in surfaces if isinstance(s, MeshSurface) and not isinstance(s, Metaballs)]
     out = np.empty((len(cylinders), 18))
     for line, c in zip(out, cylinders):
         (a0, b0), (a1, b1) = c.radii
         growth = [a0, b0, (a1 - a0) / c.length, (b1 - b0) / c.length]
         line[:] = [c.segment, *np.add(c.start, rest[c.segment]), *c.axes.ravel(), c.length, *growth]
     out.flags.writeable = False
-    return SurfaceTables(out, pack_grids(meshes, rest) if meshes else None)
+    grids, balls = pack_grids(meshes, rest) if meshes else None, pack_balls(melted, rest) if melted else None
+    return SurfaceTables(out, grids, balls)

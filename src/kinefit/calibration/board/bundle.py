@@ -113,7 +113,8 @@ def interior_parameters(camera: Camera) -> int:
     return 4 + camera.distortion.size
 
 
-def _moved(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
+def moved_camera(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
+    """The camera, its pose moved by a twist delta[:6] in its frame, its interior changed by the rest."""
     T = se3.exp(delta[:_POSE]) @ camera.T_camera_world
     u, _, vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = u @ vt
@@ -189,7 +190,7 @@ class _Problem:
             before = system.cost
             while damping < 1e8:
                 d_cameras, d_boards = system.step(damping)
-                new_rig = Rig(tuple(_moved(camera, d, self.interiors) for camera, d in zip(rig, d_cameras)))
+                new_rig = Rig(tuple(moved_camera(camera, d, self.interiors) for camera, d in zip(rig, d_cameras)))
                 new_boards = np.stack([T @ se3.exp(d) for T, d in zip(Ts_world_board, d_boards)])
                 new = self.system(new_rig, new_boards)
                 if new.cost < system.cost:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 
@@ -59,7 +60,9 @@ class Pictures:
         """Nothing is open."""
 
 
-class _Frames(Video):
+class Frames(Video):
+    """A video of one camera by frame number."""
+
     @property
     def numbers(self) -> tuple[int, ...]:
         """Of the frames that there are."""
@@ -159,18 +162,12 @@ def find_boards(
     CalibrationError
         A camera in which the board is never seen; the message tells what other board is, if one is.
     """
-    opened: dict[str, Pictures | _Frames] = {}
-    try:
-        for name, source in sources.items():
-            opened[name] = Pictures(source) if isinstance(source, dict) else _Frames(source)
-        _check_lengths({name: len(o) for name, o in opened.items() if isinstance(o, _Frames)})
-        frames = sorted({frame for o in opened.values() for frame in o.numbers})
-        chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).astype(int)}
-        wanted = sorted(chosen | (set(include) & set(frames)))
+    with opened(sources) as cameras:
+        wanted = evenly(cameras, max_frames, include)
         if board.kind == "charuco" and not board.dictionary:
-            board = with_dictionary(board, [image for o in opened.values() for image in _sample(o, 4)])
-        finder, seen, total = Finder(board), {}, len(wanted) * len(opened)
-        for n, (name, camera) in enumerate(opened.items()):
+            board = with_dictionary(board, [image for o in cameras.values() for image in sample(o, 4)])
+        finder, seen, total = Finder(board), {}, len(wanted) * len(cameras)
+        for n, (name, camera) in enumerate(cameras.items()):
             views: list[View] = []
             own = set(camera.numbers)
             for i, frame in enumerate(wanted):
@@ -181,13 +178,37 @@ def find_boards(
             seen[name] = CameraViews(camera.size, tuple(views))
         unseen = [name for name, views in seen.items() if not views.views]
         if unseen:
-            _refuse(board, unseen, opened, any(views.views for views in seen.values()))
+            _refuse(board, unseen, cameras, any(views.views for views in seen.values()))
         if board.kind == "checkerboard":
-            _refuse_part(board, seen, opened)
+            _refuse_part(board, seen, cameras)
         return board, seen
+
+
+@contextmanager
+def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, Pictures | Frames]]:
+    """The cameras of `camera_sources`, open; closed at the end.
+
+    Raises
+    ------
+    CalibrationError
+        Videos of different lengths.
+    """
+    cameras: dict[str, Pictures | Frames] = {}
+    try:
+        for name, source in sources.items():
+            cameras[name] = Pictures(source) if isinstance(source, dict) else Frames(source)
+        _check_lengths({name: len(o) for name, o in cameras.items() if isinstance(o, Frames)})
+        yield cameras
     finally:
-        for camera in opened.values():
+        for camera in cameras.values():
             camera.close()
+
+
+def evenly(cameras: Mapping[str, Pictures | Frames], max_frames: int, include: Sequence[int] = ()) -> list[int]:
+    """Numbers of at most so many frames, evenly over the recording, and of those to include that there are."""
+    frames = sorted({frame for camera in cameras.values() for frame in camera.numbers})
+    chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).astype(int)}
+    return sorted(chosen | (set(include) & set(frames)))
 
 
 def _check_lengths(lengths: Mapping[str, int]) -> None:
@@ -199,12 +220,13 @@ def _check_lengths(lengths: Mapping[str, int]) -> None:
         )
 
 
-def _sample(source: Pictures | _Frames, count: int) -> list[NDArray]:
+def sample(source: Pictures | Frames, count: int) -> list[NDArray]:
+    """So many images, evenly over the recording."""
     frames = source.numbers
     return [source.read(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
 
 
-def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | _Frames], others: bool) -> None:
+def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | Frames], others: bool) -> None:
     place = f"camera{'s' * (len(unseen) > 1)} {', '.join(unseen)}"
     if others:
         raise CalibrationError(
@@ -212,7 +234,7 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | _Fr
             place=place,
             remedy="Show the board to every camera, near enough that its squares are 20 px or more; or leave it out.",
         )
-    images = [image for name in unseen for image in _sample(opened[name], _SAMPLES)]
+    images = [image for name in unseen for image in sample(opened[name], _SAMPLES)]
     fits = fitting_boards(board, images[: 2 * _SAMPLES])
     tried = "other dictionaries, the legacy pattern and the board turned" if board.kind == "charuco" else "other sizes"
     found = f"there is one that reads as --board {fits[0]}" if fits else f"nor with {tried}"
@@ -224,7 +246,7 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | _Fr
     )
 
 
-def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, Pictures | _Frames]) -> None:
+def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, Pictures | Frames]) -> None:
     """Refuse a board that is a part of a larger one: which part, differs from picture to picture."""
     shown = [source.read(seen[name].views[i].frame) for name, source in opened.items() for i in (0, -1)]
     for other in fitting_boards(board, shown[:4])[:1]:

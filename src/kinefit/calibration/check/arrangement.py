@@ -25,6 +25,10 @@ _FOREIGN = 0.5  # of the limit: mean error of cameras in step that have nothing 
 _RIGHT = 0.5  # of that error: what is left once the mistake is undone is far less
 _MOST_ORDERS = 4  # cameras of which all orders are tried; of more, exchanges of two
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from x right, y up, z back (OpenGL) to x right, y down, z ahead
+_REVERSED = (  # what, which axes, and whether a detector took left for right in it
+    ("mirrored", "is mirrored left to right", (0,), True), ("mirrored", "is mirrored left to right", (0,), False),
+    ("turned", "stands upside down", (0, 1), False),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,42 @@ def sample(views: Views) -> NDArray:
 
 def find_mistake(views: Views) -> Mistake | None:
     """The gross mistake that explains why the cameras do not agree; None where they do, or none explains it."""
+    return _of_the_rig(views) or _of_one_camera(views)
+
+
+def _of_one_camera(views: Views) -> Mistake | None:
+    """A picture of one camera that is reversed, where the others agree: undone, it fits what they saw."""
+    best: Mistake | None = None
+    for c, name in enumerate(views.rig.names if len(views.rig) > 2 else ()):
+        before = _beside_others(views, c)
+        if before < _FOREIGN:
+            continue
+        for kind, text, axes, sides in _REVERSED:
+            uv = views.uv.copy()
+            uv[:, :, c] = uv[:, views.partner, c] if sides else uv[:, :, c]
+            for axis in axes:
+                uv[:, :, c, axis] = views.rig.cameras[c].size[axis] - 1 - uv[:, :, c, axis]
+            after = _beside_others(replace(views, uv=uv), c)
+            if after < _RIGHT * before and (best is None or after < 0.9 * best.after):
+                best = Mistake(kind, f"{name}'s image {text}", (name,), (), before, after)
+    return best
+
+
+def _beside_others(views: Views, c: int) -> float:
+    """Median error of one camera's views of the points that the others make, cut at a limit, as its share."""
+    uv, limit = sample(views), 0.03 * max(float(np.hypot(*camera.size)) for camera in views.rig)
+    others = [k for k in range(len(views.rig)) if k != c]
+    rig = views.rig.select(tuple(views.rig.names[k] for k in others))
+    x, _, _ = triangulate_robust(rig, uv[:, others], max_residual_px=limit)
+    both = np.isfinite(x).all(axis=1) & np.isfinite(uv[:, c]).all(axis=1)
+    if both.sum() < _POINTS:
+        return 0.0
+    error = np.linalg.norm(views.rig.cameras[c].project(x[both]) - uv[both, c], axis=1)
+    return float(np.median(np.minimum(np.nan_to_num(error, nan=limit), limit)) / limit)
+
+
+def _of_the_rig(views: Views) -> Mistake | None:
+    """The gross mistake that makes all cameras agree."""
     uv = sample(views)
     before = disagreement_share(views.rig, uv)
     if before < _BAD:

@@ -27,6 +27,7 @@ from kinefit.calibration.check.verdicts import bias_findings, explained, side_fi
 from kinefit.calibration.check.views import Views, make_views, meet, with_sides_right
 from kinefit.errors import KinefitError, command
 from kinefit.geometry.camera import Rig
+from kinefit.multiview.followed import Followed, follow
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
@@ -34,6 +35,7 @@ from kinefit.readers.take.load import Observations
 Progress = Callable[[str, int, int], None]
 
 _FRAMES = 240  # for what does not change over time, spread over the recording
+_SHOWS_MOST = "moving"  # of several people: who stands still shows cameras little of the volume, and clocks nothing
 _STEPS = 6
 
 
@@ -110,12 +112,23 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     accuracy: dict[str, float] = {}
     for entry in loaded.take.keypoints:
         accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
+    rig, one = seen.rig, follow(seen.rig, seen.keypoints, take.person or _SHOWS_MOST)
+    seen = replace(seen, keypoints=one.keypoints)
     check = check_keypoints(
-        seen.rig.select(tuple(n for n in seen.rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
+        rig.select(tuple(n for n in rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
         height=take.height, accuracy=accuracy, name=take.name, take=loaded.take, observations=seen,
-        found=loaded.findings, progress=progress,
+        found=(*loaded.findings, *_others(one, take.person is not None)), progress=progress,
     )  # fmt: skip
     return _with_sensors(check, progress)
+
+
+def _others(one: Followed, asked: bool) -> list[Finding]:
+    """Who else is in view."""
+    if len(one.people) < 2:
+        return []
+    why = "" if asked else ", who moves most and so tells most of the cameras"
+    text = f"{len(one.people)} people are in view; the check is by person {one.number}{why}."
+    return [Finding("note", "people", text, remedy="Another: write person = 2 to [take], or whichever it is.")]
 
 
 def _with_sensors(check: Check, progress: Progress | None) -> Check:

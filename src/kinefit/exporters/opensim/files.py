@@ -7,15 +7,17 @@ ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from itertools import chain, count
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from kinefit.bodies import Body, PointSet
-from kinefit.exporters.atomic import write_text
+from kinefit.exporters.atomic import write_lines, write_text
 from kinefit.exporters.opensim.model import model
-from kinefit.exporters.skeletons.common import UNITS, euler_zxy, length_factor, plain_names, turned
+from kinefit.exporters.skeletons.common import UNITS, check_up, euler_zxy, length_factor, plain_names
 from kinefit.motion import Motion
 
 
@@ -42,7 +44,7 @@ def write_trc(
     factor = length_factor(unit, UNITS, path)
     points = motion.body.landmarks if points is None else points
     names = plain_names(points.names)
-    values = factor * turned(motion, up, path).positions(points).reshape(len(motion), -1) + 0.0
+    check_up(up, path)
     axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
@@ -52,25 +54,37 @@ def write_trc(
         "\t" + axes,
         "",
     ]
-    row = "\t".join(["%d", "%.9f"] + ["%.8f"] * values.shape[1])
-    lines += [row % (i, t, *v) for i, (t, v) in enumerate(zip(motion.times.tolist(), values.tolist()), 1)]
-    write_text(path, "\n".join(lines) + "\n")
+    row = "\t".join(["%d", "%.9f"] + ["%.8f"] * (3 * len(names)))
+
+    def rows() -> Iterator[str]:
+        number = count(1)
+        for part in motion.parts():
+            values = factor * part.turned(up).positions(points).reshape(len(part), -1) + 0.0
+            yield from (row % (next(number), t, *v) for t, v in zip(part.times.tolist(), values.tolist()))
+
+    write_lines(path, chain(lines, rows()))
 
 
 def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the angles [deg] and the root's way [m] as MOT: the coordinates of the model that `write_osim` writes."""
-    y_up = motion.turned("y")
     tree = motion.body.tree
-    root = np.degrees(euler_zxy(y_up.Ts_world_root[:, :3, :3]))
-    angles = np.where(tree.prismatic, motion.angles, np.degrees(motion.angles))
-    table = np.concatenate([motion.times[:, None], root, y_up.Ts_world_root[:, :3, 3], angles], axis=1) + 0.0
     names = ["time", *root_coordinates(motion.body), *plain_names(tree.coordinates)]
-    lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(table)}", f"nColumns={table.shape[1]}"]
+    lines = [motion.name.replace("\n", " "), "version=1", f"nRows={len(motion)}", f"nColumns={len(names)}"]
     lines += ["inDegrees=yes", "", "Units are S.I. units (second, meters, Newtons, ...)", "Angles are in degrees."]
     lines += ["", "endheader", "\t".join(names)]
-    row = "\t".join(["%.9f"] + ["%.8f"] * (table.shape[1] - 1))
-    lines += [row % tuple(values) for values in table.tolist()]
-    write_text(path, "\n".join(lines) + "\n")
+    row = "\t".join(["%.9f"] + ["%.8f"] * (len(names) - 1))
+
+    def rows() -> Iterator[str]:
+        before = None
+        for part in motion.parts():
+            T = part.turned("y").Ts_world_root
+            turns = euler_zxy(T[:, :3, :3], before)
+            before = turns[-1] if len(turns) else None
+            angles = np.where(tree.prismatic, part.angles, np.degrees(part.angles))
+            table = np.concatenate([part.times[:, None], np.degrees(turns), T[:, :3, 3], angles], axis=1) + 0.0
+            yield from (row % tuple(values) for values in table.tolist())
+
+    write_lines(path, chain(lines, rows()))
 
 
 def write_osim(body: Body, path: str | PathLike[str]) -> None:

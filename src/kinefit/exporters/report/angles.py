@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
+from kinefit.exporters.report.names import NAMES
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
 from kinefit.motion import Motion
@@ -218,7 +219,8 @@ def _stacked(
             **({"range": ranges[row]} if ranges[row] else {}),
         }  # fmt: skip
         unseen = [c.side or "all of it" for c in sides if not np.isfinite(c.std).any()]
-        text = f"<b>{sides[0].stem}</b>"
+        stem = sides[0].stem
+        text = f"<b>{NAMES.get(stem, stem)}</b>" + (f"  {stem}" if stem in NAMES else "")
         text += f"  + {_POSITIVE[sides[0].stem]}" if sides[0].stem in _POSITIVE else ""
         text += f"  <i>not observed: {' and '.join(unseen)}</i>" if unseen else ""
         notes.append({

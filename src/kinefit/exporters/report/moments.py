@@ -120,7 +120,7 @@ def shared_by_prior(motion: Motion) -> dict[str, float]:
 def plain(segment: str) -> str:
     """A segment's name in words: hand_l becomes "left hand"."""
     side = {"_l": "left ", "_r": "right "}.get(segment[-2:], "")
-    return (side + (segment[:-2] if side else segment)).replace("_", " ")
+    return (side + (segment[:-2] if side else segment)).replace("_", " ").replace("upperarm", "upper arm")
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:

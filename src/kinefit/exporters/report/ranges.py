@@ -13,36 +13,13 @@ from numpy.typing import NDArray
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import by_joint
+from kinefit.exporters.report.names import spoken
 from kinefit.motion import Motion
 
 WIDE = 45.0
 """[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
 
 _HEAD = ("lowest", "highest", "range", "fastest")
-
-NAMES = {
-    "hip_flexion": "Hip flexion", "hip_adduction": "Hip adduction", "hip_rotation": "Hip inward rotation",
-    "knee_angle": "Knee flexion", "ankle_angle": "Ankle dorsiflexion", "subtalar_angle": "Subtalar inversion",
-    "mtp_angle": "Toe extension", "clav_prot": "Shoulder girdle protraction", "clav_elev": "Shoulder girdle elevation",
-    "arm_flex": "Shoulder flexion", "arm_add": "Shoulder adduction", "arm_rot": "Shoulder inward rotation",
-    "elbow_flex": "Elbow flexion", "pro_sup": "Forearm pronation", "wrist_flex": "Wrist flexion",
-    "wrist_dev": "Wrist ulnar deviation", "pelvis_tilt": "Pelvic tilt (backward)",
-    "pelvis_list": "Pelvic obliquity (right down)", "pelvis_rotation": "Pelvic rotation (to the left)",
-    "lumbar_extension": "Lumbar extension", "lumbar_bending": "Lumbar bending (to the right)",
-    "lumbar_rotation": "Lumbar rotation (to the left)", "thorax_extension": "Thoracic extension",
-    "thorax_bending": "Thoracic bending (to the right)", "thorax_rotation": "Thoracic rotation (to the left)",
-    "neck_extension": "Neck extension", "neck_bending": "Neck bending (to the right)",
-    "neck_rotation": "Neck rotation (to the left)",
-}  # fmt: skip
-"""Clinical names of OpenSim's coordinates, in the direction that counts as positive."""
-
-
-def spoken(coordinate: str) -> str:
-    """Clinical name of a coordinate, with its side in words: hip_flexion_l becomes "left hip flexion"."""
-    side = {"_l": "left ", "_r": "right "}.get(coordinate[-2:], "")
-    stem = coordinate[:-2] if side else coordinate
-    return side + NAMES.get(stem, stem.replace("_", " ")).lower()
-
 
 @dataclass(frozen=True)
 class Extremes:

@@ -35,9 +35,10 @@ from kinefit.exporters.report.moments import (
     never_observed,
     shared_by_prior,
 )
+from kinefit.exporters.report.names import spoken
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.pictures import report_frames
-from kinefit.exporters.report.ranges import ranges_table, spoken
+from kinefit.exporters.report.ranges import ranges_table
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
@@ -166,19 +167,22 @@ def _summary(
         parts.append(p.callout("bad" if most else "note", title, text))
     shared = shared_by_prior(motion)
     if shared:
-        each = [f"{spoken(name)} (±{std:.0f}°)" for name, std in shared.items()]
+        each = [f"{spoken(name)} (±{2 * std:.0f}°)" for name, std in shared.items()]
         title = f"Shared by the prior posture: {listed(each, 8)}."
         text = (
             "Measured is how far they bend together, hardly how each takes part: points at a joint's centre do not "
-            "tell how the segments turn about it. How people usually share a bend decides; the standard deviation says "
-            "how far one person departs from it. Changes within a take are surer than the values. Whatever shows how "
-            "the segment between them turns would tell, such as markers on the front and the back of a pelvis."
+            "tell how the segments turn about it. How people usually share a bend decides; ±, two standard deviations, "
+            "says how far one person departs from it. Changes within a take are surer than the values. Whatever shows "
+            "how the segment between them turns would tell, such as markers on the front and the back of a pelvis."
         )
         parts.append(p.callout("note", title, text))
     body = motion.body
     session, facts = motion.provenance.get("session"), {}
     if isinstance(session, Mapping):
         facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
+    people = motion.provenance.get("people")
+    if isinstance(people, Mapping):
+        facts["Person"] = f"{people['followed']} of {people['in view']} in view"
     facts |= {
         "Date of the report": date, "Duration": f"{len(motion) / motion.rate:.2f} s", "Frames": f"{len(motion)}",
         "Rate": f"{motion.rate:g} Hz", "Body": f"{body.name}, {len(body.tree.coordinates)} angles",
@@ -188,13 +192,20 @@ def _summary(
     if body.stature:
         facts["Stature of the body"] = f"{body.stature:.2f} m"
     about = (
-        "± is two standard deviations. That of a range takes its two ends to err on their own. A * marks what was "
-        "observed in a part of the frames only; an angle with a standard deviation above 45° counts as not observed. "
-        "That of the greatest speed is what smoothing leaves of a change from frame to frame in lively moments."
+        "± is two standard deviations; that of a range takes its two ends to err on their own, so it is an upper bound "
+        "where an error lasts. * : observed in a part of the frames only."
     )
+    more = (
+        "An angle with a standard deviation above 45° counts as not observed. ± of the greatest speed is what "
+        "smoothing leaves of a change from frame to frame in lively moments."
+    )
+    hint = [] if session else [p.paragraph(
+        "Who was recorded, when and at which movement was not stated: [session] in the take does.", small=True
+    )]  # fmt: skip
     return p.section(
-        "Summary", p.facts(facts), *parts, p.heading("How far every joint moved"), ranges_table(motion),
-        p.paragraph(about, small=True), p.folded("Lengths of the body", lengths_table(motion)),
+        "Summary", p.facts(facts), *hint, *parts, p.heading("How far every joint moved"),
+        p.paragraph(about, small=True), ranges_table(motion), p.paragraph(more, small=True),
+        p.folded("Lengths of the body", lengths_table(motion)),
     )  # fmt: skip
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.exporters.atomic import write_text
-from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, slides, turned
+from kinefit.exporters.atomic import write_lines
+from kinefit.exporters.skeletons.common import UNITS, bone_names, check_up, euler_zxy, length_factor, slides
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion
 
@@ -46,20 +47,28 @@ def write_bvh(
     """
     body, scale, joints = motion.body, length_factor(unit, UNITS, path), bone_names(motion.body, names, path)
     pose = rest_pose(body, rest, names, path)
-    Ts = pose.local_poses(turned(motion, up, path))
+    check_up(up, path)
     with_position = slides(body)
     with_position[0] = True
-    degrees = np.degrees(euler_zxy(Ts[..., :3, :3]))
-    columns: list[NDArray] = []
     order: list[int] = []
-    lines = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
-    for s in order:
-        columns += [scale * Ts[:, s, :3, 3]] * bool(with_position[s]) + [degrees[:, s]]
-    table = np.concatenate(columns, axis=1) + 0.0
-    lines += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}"]
-    row = " ".join(["%.8f"] * table.shape[1])
-    lines += [row % tuple(values) for values in table.tolist()]
-    write_text(path, "\n".join(lines) + "\n")
+    head = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
+    head += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}"]
+
+    def lines() -> Iterator[str]:
+        yield from head
+        before = None
+        for part in motion.parts():
+            Ts = pose.local_poses(part.turned(up))
+            turns = euler_zxy(Ts[..., :3, :3], before)
+            before = turns[-1] if len(turns) else None
+            columns: list[NDArray] = []
+            for s in order:
+                columns += [scale * Ts[:, s, :3, 3]] * bool(with_position[s]) + [np.degrees(turns[:, s])]
+            table = np.concatenate(columns, axis=1) + 0.0
+            row = " ".join(["%.8f"] * table.shape[1])
+            yield from (row % tuple(values) for values in table.tolist())
+
+    write_lines(path, lines())
 
 
 def _hierarchy(

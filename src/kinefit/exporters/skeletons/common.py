@@ -29,15 +29,16 @@ def slides(body: Body) -> NDArray:
     return out
 
 
-def euler_zxy(rotations: NDArray) -> NDArray:
+def euler_zxy(rotations: NDArray, before: NDArray | None = None) -> NDArray:
     """Angles (F, ..., 3) [rad] about body-fixed z, x, y of rotations (F, ..., 3, 3), R = Rz Rx Ry, continuous over F.
 
     Of the two triples that give the same rotation, and of all whole turns, the nearest to the frame before is taken.
-    At gimbal lock the first angle stays as it was, so that the triple always gives the rotation.
+    At gimbal lock the first angle stays as it was, so that the triple always gives the rotation. `before` (..., 3) is
+    the triple of the frame before the first.
     """
     R = np.asarray(rotations, float)
     out = np.empty((*R.shape[:-2], 3))
-    before = np.zeros(R.shape[1:-2] + (3,))
+    before = np.zeros(R.shape[1:-2] + (3,)) if before is None else before
     for frame in range(len(R)):
         out[frame] = before = _nearest_zxy(R[frame], before)
     return out
@@ -89,9 +90,14 @@ def length_factor(unit: str, units: Mapping[str, float], path: str | PathLike[st
 
 def turned(motion: Motion, up: str, path: str | PathLike[str], allowed: Iterable[str] = UP_AXES) -> Motion:
     """The motion in a world whose vertical axis is `up`; ExportError where the format has no such axis."""
+    check_up(up, path, allowed)
+    return motion.turned(up)
+
+
+def check_up(up: str, path: str | PathLike[str], allowed: Iterable[str] = UP_AXES) -> None:
+    """ExportError where a format has no such vertical axis."""
     if up not in allowed:
         raise ExportError(choices("vertical axis of this format", up, allowed), file=path)
-    return motion.turned(up)
 
 
 def plain_names(names: Iterable[str]) -> list[str]:

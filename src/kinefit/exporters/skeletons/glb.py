@@ -15,7 +15,6 @@ from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
 from kinefit.motion import Motion
-from kinefit.motion_columns import continuous_quaternions
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}
@@ -112,7 +111,7 @@ def _material() -> gl.Material:
 
 def _animation(motion: Motion, pose: Rest, buffer: _Buffer) -> gl.Animation:
     tree = motion.body.tree
-    Ts = pose.local_poses(motion.turned("y"))
+    turns, places = pose.local_moves(motion, "y")
     turning = np.zeros(len(tree.segments), bool)
     turning[tree.owners[~tree.prismatic]] = turning[0] = True
     moving = slides(motion.body)
@@ -127,7 +126,7 @@ def _animation(motion: Motion, pose: Rest, buffer: _Buffer) -> gl.Animation:
 
     for s in range(len(tree.segments)):
         if turning[s]:
-            channel(s, "rotation", np.roll(continuous_quaternions(Ts[:, s, :3, :3]), -1, axis=-1))  # glTF: x, y, z, w
+            channel(s, "rotation", np.roll(turns[:, s], -1, axis=-1))  # glTF: x, y, z, w
         if moving[s]:
-            channel(s, "translation", Ts[:, s, :3, 3])
+            channel(s, "translation", places[:, s])
     return out

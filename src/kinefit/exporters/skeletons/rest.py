@@ -18,6 +18,7 @@ from kinefit.exporters.skeletons.common import convention
 from kinefit.exporters.skeletons.tubes import SkinnedMesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion
+from kinefit.motion_columns import continuous_quaternions
 
 RESTS = ("body", "t")
 """Rest poses: the body's own (arms hanging, facing x), or arms out to the sides, palms down, facing z."""
@@ -49,6 +50,21 @@ class Rest:
         out = se3.inverse(Ts_world[:, np.maximum(parents, 0)]) @ Ts_world
         out[:, parents < 0] = Ts_world[:, parents < 0]
         return out
+
+    def local_moves(self, motion: Motion, up: str) -> tuple[NDArray, NDArray]:
+        """Of every bone in its parent, of the root in a world with the vertical axis `up`: how it turns and moves.
+
+        Returns
+        -------
+        (F, S, 4) quaternions w, x, y, z without jumps of sign, (F, S, 3) [m] places
+        """
+        turns: list[NDArray] = []
+        places = []
+        for part in motion.parts():
+            Ts = self.local_poses(part.turned(up))
+            turns.append(continuous_quaternions(Ts[..., :3, :3], turns[-1][-1] if turns else None))
+            places.append(Ts[..., :3, 3].copy())
+        return np.concatenate(turns), np.concatenate(places)
 
     def posed(self, mesh: SkinnedMesh, body: Body) -> SkinnedMesh:
         """A mesh about the body, which rests as the body does, in this rest pose."""

@@ -19,7 +19,6 @@ from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.motion_columns import continuous_quaternions
 
 ENDINGS = (".usd", ".usda", ".usdc")
 _UPS = ("y", "z")
@@ -110,7 +109,7 @@ def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: flo
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
     if motion.body.surfaces:
         _mesh(stage, pose.posed(body_mesh(motion.body), motion.body), bind[0], factor, skeleton)
-    centres = factor * motion.segment_poses()[..., :3, 3]
+    centres = factor * motion.joint_centres
     margin = factor * max((_reach(c) for c in motion.body.surfaces), default=0.0)
     extent = UsdGeom.Boundable(root).CreateExtentAttr()
     for frame, points in enumerate(centres):
@@ -143,12 +142,11 @@ def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor
     animation = UsdSkel.Animation.Define(stage, "/Figure/Skeleton/Animation")
     animation.CreateJointsAttr(joints)
     animation.CreateScalesAttr([Gf.Vec3h(1, 1, 1)] * len(joints))
-    Ts = pose.local_poses(motion)
-    quaternions = np.stack([continuous_quaternions(Ts[:, s, :3, :3]) for s in range(len(joints))], axis=1)
+    quaternions, places = pose.local_moves(motion, motion.up)
     translations, rotations = animation.CreateTranslationsAttr(), animation.CreateRotationsAttr()
     for frame in range(len(motion)):
         at = Usd.TimeCode(frame)
-        translations.Set(Vt.Vec3fArray.FromNumpy(np.float32(factor * Ts[frame, :, :3, 3])), at)
+        translations.Set(Vt.Vec3fArray.FromNumpy(np.float32(factor * places[frame])), at)
         rotations.Set([Gf.Quatf(w, x, y, z) for w, x, y, z in quaternions[frame].tolist()], at)
     return animation
 

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit.errors import CalibrationError, ExportError, FileError
+from kinefit.errors import CalibrationError, ExportError, FileError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -25,8 +25,8 @@ from kinefit.readers.calibration.tables import (
     stated_unit,
     stereo_tables,
 )
+from kinefit.readers.units import LENGTHS, worth
 
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254}  # [m]
 FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML, COLMAP text "
     "(cameras.txt and images.txt)"
@@ -263,11 +263,11 @@ def _factor(unit: str | float, path: Path) -> float | None:
     if isinstance(unit, str):
         if unit == "auto":
             return None
-        if unit not in UNITS:
-            raise CalibrationError(
-                f"unknown unit of length '{unit}'", file=path, remedy=f"Units: {', '.join(UNITS)}, or metres a unit."
-            )
-        return UNITS[unit]
+        metres = worth(unit, LENGTHS)
+        if metres is None:
+            remedy = "Use one of these, or a number of metres."
+            raise CalibrationError(choices("unit of length", unit, LENGTHS), file=path, remedy=remedy)
+        return metres
     if not (np.isfinite(unit) and unit > 0):
         raise CalibrationError(f"unit of length {unit}", file=path, remedy="Give a positive number of metres.")
     return float(unit)

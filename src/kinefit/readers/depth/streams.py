@@ -125,7 +125,7 @@ def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) 
         cameras = json.loads(text.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
         told = next(c["Intrinsics"] for c in cameras if c["Location"] == "CALIBRATION_CameraLocationD0")
         cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = [float(v) for v in told["ModelParameters"][:14]]
-    except (ValueError, KeyError, TypeError, StopIteration) as error:
+    except (ValueError, KeyError, TypeError, StopIteration, RecursionError) as error:
         raise CalibrationError(
             f"its attached calibration cannot be understood ({error})", file=path, remedy="Give intrinsics."
         ) from error

@@ -119,7 +119,7 @@ def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | 
         draft.note("video", "open", f"{draft.name(path)} fits no camera of the calibration: left out")
 
     def rank(trial: Trial) -> tuple[bool, bool, int, int, int]:
-        size = sum(path.stat().st_size for path in trial.files.values())
+        size = sum(path.stat().st_size for path in trial.files.values() if path.exists())
         drawn, deep = bool(DRAWN_ON.search(trial.place)), trial.place.count("/")
         return bool(STATIC.search(trial.place)), drawn, -len(trial.files), deep, -size
 

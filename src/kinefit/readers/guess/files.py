@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit._files import npy_header
 from kinefit._pictures import read_picture
@@ -19,7 +20,7 @@ from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.names import natural
-from kinefit.readers.image_folders import ENDINGS
+from kinefit.readers.image_folders import ENDINGS, ImageFolder
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
@@ -42,6 +43,8 @@ _JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
 _CALISCOPE = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
 _CALLED = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # a broken file of another name may be anything
 _UNITS = ("mm", "cm", "inch", "dm")
+_LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
+_BLACK, _GREY = 10, 0.1  # how far from black or white a mask's pixels are, compressed; share of others in photographs
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,23 +166,45 @@ def _spread(rig: Rig) -> float:
     return float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1))) or 1e-9
 
 
-def find_videos(files: list[Path]) -> list[Path]:
-    """Files that are called videos, and folders of colour images that are numbered."""
-    folders = [folder for folder, group in _by_folder(files) if _is_film(group)]
-    return [path for path in files if path.suffix.lower() in VIDEOS] + folders
+def find_videos(files: list[Path], folder: Path) -> list[Path]:
+    """Files that are called videos; of photographs that are numbered the folder, or a pattern where it has several."""
+    films = [film for parent, group in _by_folder(files) for film in _films(group, parent, alone=parent != folder)]
+    return [path for path in files if path.suffix.lower() in VIDEOS] + films
 
 
-def _is_film(group: list[Path]) -> bool:
-    """Whether the files of one folder are images of a camera: many, in colour, of names that differ by numbers."""
-    images = [path for path in group if path.suffix.lower() in ENDINGS]
-    alike = {re.sub(r"\d+", "#", path.name) for path in images}
-    if len(images) < _MANY or len(alike) > 1:
-        return False
+def _films(group: list[Path], folder: Path, *, alone: bool) -> list[Path]:
+    """Cameras whose images lie in a folder: many photographs each, of names that differ by their last number."""
+    named: dict[str, list[Path]] = {}
+    for path in group:
+        if path.suffix.lower() in ENDINGS:
+            named.setdefault(_LAST_NUMBER.sub("*", path.name), []).append(path)
+    films = [pattern for pattern, images in named.items() if len(images) >= _MANY and _is_film(images[0])]
+    if alone and films and len(named) == 1:
+        return [folder]
+    return [folder / pattern for pattern in films if _is_whole(folder / pattern)]
+
+
+def _is_whole(pattern: Path) -> bool:
+    """Whether the images of a pattern can be a video: none is missing."""
     try:
-        picture = read_picture(images[0], cv2.IMREAD_UNCHANGED)
+        ImageFolder(pattern, 1.0)
+    except KinefitError:
+        return False
+    return True
+
+
+def _is_film(image: Path) -> bool:
+    """Whether an image is a photograph."""
+    try:
+        picture = read_picture(image, cv2.IMREAD_UNCHANGED)
     except FileError:
         return False
-    return picture.dtype == np.uint8 and picture.ndim == 3
+    return picture.dtype == np.uint8 and (picture.ndim == 3 or _is_photograph(picture))
+
+
+def _is_photograph(grey: NDArray) -> bool:
+    """Whether a grey image is more than a mask, whose pixels are all but black or white."""
+    return float(np.mean((grey > _BLACK) & (grey < 255 - _BLACK))) > _GREY
 
 
 def find_markers(files: list[Path]) -> list[Path]:
@@ -223,7 +248,7 @@ def _openpose_points(numbered: list[Path]) -> int | None:
     for path in numbered:
         try:
             people = decode(path.read_bytes()).people
-        except (msgspec.DecodeError, OSError):
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
             if not there:
                 return None
             continue

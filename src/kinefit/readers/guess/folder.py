@@ -59,7 +59,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         raise TakeError("no such folder", file=folder, remedy="Name the folder with videos, keypoints and calibration.")
     draft = Draft(folder, Path(beside).absolute() if beside else folder)
     files = guess_files.list_files(folder)
-    videos, markers = guess_files.find_videos(files), guess_files.find_markers(files)
+    videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
     keypoints, remarks = guess_files.find_keypoints(files)
     for remark in remarks:
         draft.note("keypoints", "open", remark)
@@ -94,7 +94,7 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if len(seen) == 1 and seen[0] in guess_files.find_videos(files):
+        if len(seen) == 1 and seen[0] in guess_files.find_videos(files, draft.folder):
             problem = f"one video and no calibration: {ONE_CAMERA}"
             remedy = "Add videos of other cameras. For keypoints of this one alone: " + command("detect", seen[0])
             raise CalibrationError(problem, file=draft.folder, remedy=remedy)

@@ -94,7 +94,7 @@ def trials(
 def _camera_of(path: Path, folder: Path, names: Sequence[str]) -> tuple[str, str, str] | None:
     """Camera, way and place of one file: from its own name, else from the folders above it."""
     parts = list(path.relative_to(folder).parts)
-    parts[-1] = PurePath(parts[-1]).stem if path.is_file() else parts[-1]
+    parts[-1] = PurePath(parts[-1]).stem if not path.is_dir() else parts[-1]
     for find, how in ((_by_name, "name"), (_by_number, "number")):
         for level in range(len(parts) - 1, -1, -1):
             found = find(parts[level], names)

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.errors import FileError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
+from kinefit.observations.person import PersonChoice
 from kinefit.readers.keypoints import KEYPOINT_SETS
-from kinefit.readers.markers import UNITS
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
+from kinefit.readers.units import LENGTHS, worth
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
@@ -42,7 +43,8 @@ def check_enough(take: Take) -> None:
     TakeError
         With what to add.
     """
-    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines)
+    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
+              take.surface_points)  # fmt: skip
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     if len(seeing) == 1 and not (any(others) or take.start or take.pose):
         raise TakeError(
@@ -78,6 +80,13 @@ def _values(take: Take) -> None:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
         refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+    if take.person is not None:
+        try:
+            PersonChoice.of(take.person)
+        except ObservationError as error:
+            refuse(error.problem, "[take] person", error.remedy or "")
+        if not take.keypoints and (take.depth or take.stereo or take.markers or take.silhouettes or take.skin):
+            refuse("'person' has no use without [[keypoints]]", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
@@ -135,10 +144,14 @@ def _values(take: Take) -> None:
         place = f"markers {entry.file.name}"
         if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
             refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
-        if entry.unit is not None and entry.unit.lower() not in UNITS:
-            refuse(choices("unit", entry.unit, UNITS), place, "Use one of these.")
+        if entry.unit is not None and worth(entry.unit, LENGTHS) is None:
+            refuse(choices("unit", entry.unit, LENGTHS), place, "Use one of these.")
         if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
             refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
+    for surface in take.surface_points:
+        place = f"surface points {surface.file.name}"
+        if not 0 < surface.sigma < 1 or not abs(surface.time_offset) < 1e6:
+            refuse(f"sigma {surface.sigma} m, time offset {surface.time_offset} s", place, "Give metres and seconds.")
     for problem, place, remedy in _odd_depth(take):
         refuse(problem, place, remedy)
 
@@ -223,7 +236,7 @@ def _uses(take: Take) -> None:
 def _names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
     shapes = (*take.silhouettes, *take.regions)
-    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or shapes):
+    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or take.surface_points or shapes):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
@@ -283,6 +296,7 @@ def _files(take: Take) -> None:
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
     named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
     named += [("markers", entry.file) for entry in take.markers]
+    named += [("surface points", entry.file) for entry in take.surface_points]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]

@@ -58,7 +58,7 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
-    unit: str = "auto"  # of its translations, where the format does not state it
+    unit: str | float = "auto"  # of its translations, where the format does not state it; or [m] of one
     position_sigma: float | None = None  # [m] of each camera's position; with rotation_sigma, or neither
     rotation_sigma: float | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
 
@@ -121,6 +121,14 @@ class LinesEntry(_Entry, frozen=True, kw_only=True):
     sigma: float = 2.0  # [px] standard deviation, in the calibration's image
 
 
+class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
+    """`[[surface_points]]`: a surface that was tracked, such as by `kinefit surface`."""
+
+    file: Path  # table of time_s, point, x, y, z, std_x, std_y, std_z [s, m]
+    time_offset: float = 0.0  # [s]
+    sigma: float = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
+
+
 class MarkersEntry(_Entry, frozen=True, kw_only=True):
     """`[[markers]]`: a marker recording."""
 
@@ -179,6 +187,7 @@ class _Head(_Entry, frozen=True, kw_only=True):
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: float | None = None
+    person: int | str | None = None
     subject: Path | None = None
     start: Path | None = None
     size: bool | None = None

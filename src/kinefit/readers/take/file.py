@@ -7,14 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 import msgspec
 
 from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml
 from kinefit.errors import FileError, TakeError, choices, shortened
-from kinefit.readers.markers import UNITS
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
@@ -29,10 +28,13 @@ from kinefit.readers.take.entries import (
     SilhouetteEntry,
     StartEntry,
     StereoEntry,
+    SurfacePointsEntry,
     _Entry,
     _Head,
 )
 from kinefit.readers.take.find import find_take
+from kinefit.readers.take.values import wrong_value
+from kinefit.readers.units import LENGTHS, TIMES, worth
 
 __all__ = [
     "CalibrationEntry",
@@ -46,6 +48,7 @@ __all__ = [
     "SilhouetteEntry",
     "StartEntry",
     "StereoEntry",
+    "SurfacePointsEntry",
     "Take",
     "read_take",
 ]
@@ -64,12 +67,14 @@ class _File(_Entry, frozen=True, kw_only=True):
     silhouette: tuple[SilhouetteEntry, ...] = ()
     region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+    "surface_points": SurfacePointsEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
 
@@ -94,6 +99,8 @@ class Take:
         Name in the catalogue, or absolute path of a body file.
     height : float [m] or None
         Stature of the person, as a first guess.
+    person : int, str or None
+        Who is followed where several people are in view, see `PersonChoice`; None: the one of whom most is seen.
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
@@ -106,8 +113,8 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples of entries
-        `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points : tuples
+        Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
     path: Path
@@ -129,8 +136,10 @@ class Take:
     start: Path | None = None
     pose: StartEntry | None = None
     size: bool | None = None
+    person: int | str | None = None
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
 
 
@@ -155,17 +164,14 @@ def read_take(path: str | PathLike[str]) -> Take:
     _check_keys(raw, path)
     _rename(raw, path)
     for row in raw.get("depth", []):
-        if str(row.get("unit")).lower() in UNITS:
-            row["unit"] = UNITS[str(row["unit"]).lower()]
+        for key, units in (("unit", LENGTHS), ("time_unit", TIMES)):
+            if (value := worth(row.get(key), units)) is not None:
+                row[key] = value
     folder = path.parent
     try:
         content = msgspec.convert(raw, _File, dec_hook=_path_in(folder))
     except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$.")
-        place = place.rstrip("`")
-        listed = ", ".join(map(repr, _options(place)))
-        remedy = f"There are: {listed}." if listed and "enum" in problem else _form(problem, place)
-        raise TakeError(problem.replace("enum ", ""), file=path, place=place or None, remedy=remedy) from error
+        raise wrong_value(error, TABLES, path) from error
     head = content.take
     body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
@@ -175,7 +181,8 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size, session=content.session,
+        pose=content.start, size=head.size, person=head.person, session=content.session,
+        surface_points=content.surface_points,
     )  # fmt: skip
     check_take(take)
     return take
@@ -194,28 +201,6 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
         return folder / value
 
     return make
-
-
-def _options(place: str) -> tuple[Any, ...]:
-    """What may be written at a place such as "camera[0].image", where it is one of a few."""
-    table, _, key = place.rpartition(".")
-    entry = TABLES.get(table.partition("[")[0])
-    if entry is None or key not in _fields(entry):
-        return ()
-    hint = get_type_hints(entry)[key]
-    return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
-
-
-def _form(problem: str, place: str) -> str | None:
-    """How a value is written, of which msgspec says that it is of another type."""
-    wanted, _, given = problem.partition(", got ")
-    if "str" in wanted and place.endswith("unit"):
-        return 'Write it in quotes: unit = "mm", "cm" or "m".'
-    if "str" in given and ("float" in wanted or "int" in wanted):
-        return "Write a number, without quotes and without its unit: 1.75."
-    forms = {"str": "Write it in quotes.", "bool": "Write true or false.", "array": "Write a list: [1, 2].",
-             "object": "Write a table: { key = value }."}  # fmt: skip
-    return next((form for kind, form in forms.items() if kind in wanted), None)
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from kinefit.observations import (
     LineVideo,
     Markers,
     SilhouetteVideo,
+    SurfacePointVideo,
 )
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
@@ -34,8 +35,11 @@ from kinefit.readers.take.lines import load_lines
 from kinefit.readers.take.regions import load_regions
 from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
+from kinefit.readers.take.surface_points import load_surface_points
 from kinefit.readers.video import Video, check_rates, common_frames
 
+_Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo
+_Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
 
@@ -69,6 +73,8 @@ class Observations:
         In the order of `take.skin`: face and hands by colour, followed as their frames are asked for.
     lines : tuple of LineVideo
         In the order of `take.lines`, those frames that have lines.
+    surface_points : tuple of SurfacePointVideo
+        In the order of `take.surface_points`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     """
@@ -86,14 +92,17 @@ class Observations:
     regions: tuple[ColourVideo, ...] = ()
     skin: tuple[KeypointVideo, ...] = ()
     lines: tuple[LineVideo, ...] = ()
+    surface_points: tuple[SurfacePointVideo, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def recordings(
         self,
-    ) -> tuple[DepthVideo | CloudVideo | SilhouetteVideo | ColourVideo | KeypointVideo | LineVideo, ...]:
+    ) -> tuple[_Whole, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
-        return (*self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines)
+        return (
+            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.surface_points
+        )  # fmt: skip
 
 
 @checked
@@ -138,7 +147,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
     skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None})
     lines = load_lines(take, images, rates)
-    recordings: tuple[DepthVideo | CloudVideo, ...] = (*sensors.depth, *sensors.clouds)
+    surfaces = load_surface_points(take)
+    recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces)
     if not (lengths or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
@@ -159,26 +169,25 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
-        regions=load_regions(take, rig, images), skin=skin, lines=lines,
+        regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces,
         notes=sensors.notes(rate),
     )
 
 
-def _span(recordings: Sequence[DepthVideo | CloudVideo | LineVideo], rate: float) -> tuple[int, int]:
+def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:
     """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1
 
 
 def _check_times(
-    recordings: Sequence[DepthVideo | CloudVideo | LineVideo | KeypointVideo], frames: tuple[int, int], rate: float,
-    take: Take,
-) -> None:  # fmt: skip
+    recordings: Sequence[_Timed | KeypointVideo], frames: tuple[int, int], rate: float, take: Take
+) -> None:
     """Refuse what was not recorded at the time of the rest."""
     for recording in recordings:
         first, last = float(recording.times[0]), float(recording.times[-1])
         if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
-            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera"}
+            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface"}
             raise ObservationError(
                 f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
                 f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,

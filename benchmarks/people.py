@@ -1,0 +1,15 @@
+"""Every figure of several people in view: `python -m benchmarks.people`; some parts: `... people people_simulated`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "people_real": "two people in four real videos, by the built-in detector",
+    "people_detectors": "one detector and two, on the real trial",
+    "people_turned": "a camera whose calibration is turned, on the real trial",
+    "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)

@@ -1,0 +1,58 @@
+"""One detector and two on the real trial, judged in a camera that the fit did not have."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import LEFT_OUT, data, figure, quick
+from benchmarks.tracking import Trial, read_trial
+from kinefit import load_body
+from kinefit.multiview.followed import alone
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.video import track
+
+DETECTORS = ("openpose", "mediapipe")
+_GOALS = {"openpose": "<= 12", "mediapipe": "<= 13"}  # px
+_SURE = 0.3  # confidence of keypoints that are held against the fit
+
+
+def run() -> None:
+    """Print every figure."""
+    folder = data("video_balancing_4cam")
+    reason = "no recording" if folder is None else LEFT_OUT if quick() else ""
+    if reason or folder is None:
+        for name, goal in _GOALS.items():
+            figure(f"people_held_out_{name}", None, "px", goal, reason)
+        figure("people_two_detectors", None, "x the better one, its own keypoints held out", "<= 1", reason)
+        return
+    with tempfile.TemporaryDirectory() as where:
+        trials = {name: read_trial(folder, name, Path(where)) for name in DETECTORS}
+    by_itself = {name: _held_out([trials[name]], trials[name]) for name in DETECTORS}
+    together = {name: _held_out(list(trials.values()), trials[name]) for name in DETECTORS}
+    for name in DETECTORS:
+        figure(f"people_held_out_{name}", by_itself[name], "px", _GOALS[name])
+        told = f"{by_itself[name]:.2f} px by itself, {together[name]:.2f} with both"
+        print(f"# keypoints of {name} in a camera left out: {told}")
+    better = min(DETECTORS, key=lambda name: by_itself[name])
+    ratio = together[better] / by_itself[better]
+    figure("people_two_detectors", ratio, "x the better one, its own keypoints held out", "<= 1")
+
+
+def _held_out(used: list[Trial], judge: Trial) -> float:
+    """[px] median distance of one detector's sure keypoints in each camera from the fit to the other three."""
+    rig, body, out = judge.rig, load_body("humanoid"), []
+    whole = judge.recording
+    for record, chosen in zip(whole.keypoints, whole.people, strict=True):
+        seen = [k for trial in used for k in trial.keypoints if k.camera != record.camera]
+        motion = track(Recording.of_keypoints(rig, seen), body)
+        person = alone(record, chosen)
+        uv = np.where((person.confidence[:, 0] > _SURE)[..., None], person.points[:, 0], np.nan)
+        points = motion.body.keypoints(record.keypoint_set)
+        names = tuple(n for n in record.names if n in points.names)
+        fitted: NDArray = rig[record.camera].project(motion.positions(points.select(names)))
+        out.append(np.linalg.norm(fitted - uv[:, [record.names.index(n) for n in names]], axis=-1).ravel())
+    return float(np.nanmedian(np.concatenate(out)))

@@ -1,0 +1,237 @@
+"""Metaballs: ellipsoids on a segment whose fields melt into one surface, Σ w exp(-2 d) = 1/2 (P4, eqs. 7, 8 and 15).
+
+They stand and lie in the segment's frame in shares of its length, so that a longer bone takes them along. The surface
+is exact where the body is fitted (`nearest`); where it is drawn, anchored or exported it is a closed mesh, made of
+cross-sections by ray casting (P4, section 3.1), whose faces stay the same when radii change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.errors import BodyError
+
+LEVEL = 0.5  # of the field on the surface (P4, w_t)
+_AROUND, _RINGS = 32, 24  # corners of a cross-section, and cross-sections
+_SCANNED, _HALVED, _NEWTON = 12, 7, 4  # steps outwards to below the level, halvings of the last one, then secants
+
+
+class Derivatives(NamedTuple):
+    """A field (N,) and its exact derivatives: by the point (N, 3), radii (N, K, 3), weights (N, K) and length (N,).
+
+    That by the length is by the logarithm of a factor on places and radii alike.
+    """
+
+    value: NDArray
+    by_point: NDArray
+    by_radii: NDArray
+    by_weights: NDArray
+    by_length: NDArray
+
+
+def _nothing() -> NDArray:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Metaballs(MeshSurface):
+    """K ellipsoids of one segment; made by `of`.
+
+    Parameters
+    ----------
+    segment, vertices, faces : as of a mesh: the surface's cross-sections.
+    centres : (K, 3) [m] in the segment's frame.
+    radii : (K, 3) [m] at which d = 1 along the axes; one ball of weight 1 alone is seen at 0.589 of them.
+    weights : (K,) of the fields; larger ones have sharper edges.
+    axes : (K, 3, 3) directions of the ellipsoids' axes, as rows.
+    """
+
+    centres: NDArray = field(default_factory=_nothing)
+    radii: NDArray = field(default_factory=_nothing)
+    weights: NDArray = field(default_factory=_nothing)
+    axes: NDArray = field(default_factory=_nothing)
+
+    def __post_init__(self) -> None:
+        """Nothing is checked: cross-sections between two poles are closed and face outwards as they are made."""
+        for value in (self.vertices, self.faces):
+            value.flags.writeable = False
+
+    @classmethod
+    def of(
+        cls, segment: int, centres: ArrayLike, radii: ArrayLike, weights: ArrayLike | None = None,
+        axes: ArrayLike | None = None,
+    ) -> Metaballs:  # fmt: skip
+        """The surface of some ellipsoids.
+
+        Raises
+        ------
+        BodyError
+            Numbers that are not finite, radii or weights that are not positive, balls that do not melt into one.
+        """
+        c = np.array(centres, float)
+        r = np.array(radii, float)
+        if c.ndim != 2 or c.shape[1:] != (3,) or r.shape != c.shape or not len(c):
+            raise BodyError(f"metaballs of centres {c.shape} and radii {r.shape}", remedy="Give (K, 3) each.")
+        w = np.ones(len(c)) if weights is None else np.array(weights, float)
+        A = np.tile(np.eye(3), (len(c), 1, 1)) if axes is None else np.array(axes, float)
+        if w.shape != (len(c),) or A.shape != (len(c), 3, 3):
+            raise BodyError(f"metaballs of weights {w.shape}, axes {A.shape}", remedy="Give (K,) and (K, 3, 3).")
+        if not all(np.isfinite(v).all() for v in (c, r, w, A)) or r.min() <= 0 or w.min() <= 0:
+            k = int(np.argmin(np.minimum(r.min(axis=1), w)))
+            problem = f"ball {k + 1} has radii {np.round(r[k], 4).tolist()} m, weight {w[k]:g}"
+            raise BodyError(problem, remedy="Give positive numbers; radii that collapse need more points.")
+        vertices, faces = _mesh(c, r, w, A)
+        for value in (c, r, w, A):
+            value.flags.writeable = False
+        return cls(segment, vertices, faces, c, r, w, A)
+
+    def changed(self, radii: ArrayLike, weights: ArrayLike | None = None) -> Metaballs:
+        """With other radii (K, 3) [m] and weights (K,)."""
+        return Metaballs.of(self.segment, self.centres, radii, self.weights if weights is None else weights, self.axes)
+
+    def mirrored(self) -> Metaballs:
+        """On the other side of the plane z = 0."""
+        flip = np.array([1.0, 1.0, -1.0])
+        return Metaballs.of(self.segment, self.centres * flip, self.radii, self.weights, self.axes * flip)
+
+    def _like(self, segment: int, vertices: NDArray, factor: float) -> Metaballs:
+        return Metaballs(
+            segment, vertices, self.faces, self.centres * factor, self.radii * factor, self.weights, self.axes
+        )
+
+    def field(self, x: ArrayLike) -> NDArray:
+        """(N,) at points (N, 3) [m] of the segment's frame: above 1/2 inside, below it outside."""
+        return _field(np.asarray(x, float), self.centres, self.radii, self.weights, self.axes)
+
+    def derivatives(self, x: ArrayLike) -> Derivatives:
+        """The field and its derivatives at points (N, 3) [m] of the segment's frame."""
+        x = np.asarray(x, float)
+        count = len(self.radii)
+        value, by_point, by_length = np.zeros(len(x)), np.zeros((len(x), 3)), np.zeros(len(x))
+        by_radii, by_weights = np.empty((len(x), count, 3)), np.empty((len(x), count))
+        for k, (c, r, w, A) in enumerate(zip(self.centres, self.radii, self.weights, self.axes)):
+            B = A / r[:, None]
+            q = (x - c) @ B.T
+            square = q * q
+            by_weights[:, k] = e = np.exp(-2.0 * square.sum(axis=1))
+            part = (w * e)[:, None]
+            along = (-4.0 * part * q) @ B
+            by_radii[:, k] = 4.0 * part * square / r
+            value += part[:, 0]
+            by_point += along
+            by_length += by_radii[:, k] @ r - along @ c
+        return Derivatives(value, by_point, by_radii, by_weights, by_length)
+
+
+def _field(x: NDArray, centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> NDArray:
+    out = np.zeros(x.shape[:-1])
+    for c, r, w, A in zip(centres, radii, weights, axes):
+        q = (x - c) @ (A / r[:, None]).T
+        out += w * np.exp(-2.0 * np.einsum("...i,...i->...", q, q))
+    return out
+
+
+def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
+    """Vertices and faces: two poles, and cross-sections between them, each by rays from the line through the balls."""
+    along, spine = _spine(centres, radii, axes)
+    balls = centres, radii, weights, axes
+    reach = float(np.ptp(centres @ along) + 3.0 * radii.max())
+    out = (spine[0], -along), (spine[-1], along)
+    ends = [_first_outside(at[None], way[None], reach, balls)[0] for at, way in out]
+    low, high = spine[0] @ along - ends[0], spine[-1] @ along + ends[1]
+    share = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, _RINGS + 1) / (_RINGS + 1))
+    heights = low + share * (high - low)
+    knots = spine @ along
+    offsets = spine - knots[:, None] * along
+    middles = np.stack([np.interp(heights, knots, offsets[:, k]) for k in range(3)], axis=1) + heights[:, None] * along
+    hollow = _field(middles, *balls) < LEVEL
+    if hollow.any():
+        at = np.round(middles[np.argmax(hollow)], 3).tolist()
+        problem = f"metaballs do not melt into one: their field is below 1/2 near {at} m"
+        raise BodyError(problem, remedy="Give larger radii along the limb, or another ball between them.")
+    side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    side /= np.linalg.norm(side)
+    angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+    ways = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(along, side)
+    starts = np.repeat(middles, _AROUND, axis=0)
+    rays = np.tile(ways, (_RINGS, 1))
+    rings = starts + _first_outside(starts, rays, 3.0 * float(radii.max()) + reach, balls)[:, None] * rays
+    poles = np.stack([spine[0] - ends[0] * along, spine[-1] + ends[1] * along])
+    return np.concatenate([rings, poles]), _faces()
+
+
+def _spine(centres: NDArray, radii: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
+    """Direction of a limb, and its balls' centres in their order along it."""
+    if len(centres) == 1:
+        return axes[0, int(np.argmax(radii[0]))], centres
+    along = centres[-1] - centres[0]
+    size = float(np.linalg.norm(along))
+    if size < 1e-6:
+        raise BodyError("the first and the last metaball are in one place", remedy="Give them along the limb.")
+    along = along / size
+    height = centres @ along
+    if (np.diff(height) <= 0).any():
+        raise BodyError("metaballs are not in their order along the limb", remedy="Give them from end to end.")
+    return along, centres
+
+
+def _first_outside(starts: NDArray, ways: NDArray, reach: float, balls: tuple[NDArray, ...]) -> NDArray:
+    """(N,) [m] along rays, where the field first falls below the level; zero where it is below it at the start."""
+    steps = reach * (np.arange(1, _SCANNED + 1) / _SCANNED) ** 2  # finer near the middle, where thin limbs end
+    values = _field(starts[:, None] + steps[:, None] * ways[:, None], *balls)
+    first = np.argmax(values < LEVEL, axis=1)
+    low, high = np.where(first > 0, steps[first - 1], 0.0), steps[first]
+    for _ in range(_HALVED):
+        middle = 0.5 * (low + high)
+        inside = _field(starts + middle[:, None] * ways, *balls) >= LEVEL
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    at, step = 0.5 * (low + high), 1e-6 * reach
+    for _ in range(_NEWTON):
+        here, there = (np.log(_field(starts + s[:, None] * ways, *balls) / LEVEL) for s in (at, at + step))
+        at = np.clip(at - step * here / np.where(np.abs(there - here) > 1e-15, there - here, -1e-15), low, high)
+    return at
+
+
+@cache
+def _faces() -> NDArray:
+    j, following = np.arange(_AROUND), (np.arange(_AROUND) + 1) % _AROUND
+    rows = _AROUND * np.arange(_RINGS - 1)[:, None]
+    one, two, three, four = rows + j, rows + following, rows + _AROUND + following, rows + _AROUND + j
+    sides = np.stack([np.stack([one, two, three], -1), np.stack([one, three, four], -1)], 2).reshape(-1, 3)
+    bottom, top, last = _RINGS * _AROUND, _RINGS * _AROUND + 1, (_RINGS - 1) * _AROUND
+    low = np.stack([np.full(_AROUND, bottom), following, j], -1)
+    high = np.stack([np.full(_AROUND, top), last + j, last + following], -1)
+    return np.concatenate([sides, low, high])
+
+
+class BallTable(NamedTuple):
+    """Metaballs of a body for kernels.
+
+    Parameters
+    ----------
+    limbs : (G, 7) segment, first ball, one after the last, centre (3) and radius of a sphere about all of the surface;
+        [m] in the root frame at rest.
+    balls : (B, 13) centre (3) there, axes over radii (9) row by row [1/m], weight.
+    """
+
+    limbs: NDArray
+    balls: NDArray
+
+
+def pack_balls(surfaces: Any, rest: NDArray) -> BallTable:
+    """Table of metaballs; rest (S, 3) [m] joint centres in the root frame at rest."""
+    limbs, balls = list[list[float]](), list[list[float]]()
+    for s in surfaces:
+        first = len(balls)
+        for c, r, w, A in zip(s.centres, s.radii, s.weights, s.axes):
+            balls.append([*(c + rest[s.segment]), *(A / r[:, None]).ravel(), w])
+        middle = 0.5 * (s.vertices.min(axis=0) + s.vertices.max(axis=0))
+        radius = float(np.linalg.norm(s.vertices - middle, axis=1).max())
+        limbs.append([s.segment, first, len(balls), *(middle + rest[s.segment]), 1.01 * radius])
+    return BallTable(np.array(limbs, float), np.array(balls, float))

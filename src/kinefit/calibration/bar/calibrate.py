@@ -1,0 +1,265 @@
+"""Cameras calibrated with a bar: lenses, places and scale from two targets at a known distance (P4, section 2.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked
+from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, Problem
+from kinefit.calibration.bar.placing import place
+from kinefit.calibration.bar.report import CameraReport, advice_of, reports_of
+from kinefit.calibration.bar.start import FEWEST, first_pairs, near, resect
+from kinefit.calibration.bar.targets import BarViews
+from kinefit.calibration.bar.world import on_floor
+from kinefit.errors import CalibrationError, choices
+from kinefit.geometry.camera import Camera, Rig
+
+LENGTH_SIGMA = 1e-4  # [m] to which a bar is usually measured, with a calliper or a good rule
+_UNSURE = 0.03  # of the focal length, one standard deviation: no calibration but a guess
+_OUTLIER = 6.0  # standard deviations: none of 10,000 normal errors
+_LOOSE = 0.02  # of the length by which it may scatter: more is no bar, or cameras out of step
+_SECOND = 4.0  # standard deviations by which a second length may differ
+_TAPE = 0.005  # of a distance between lenses measured with a tape, one standard deviation
+
+
+@dataclass(frozen=True, eq=False)
+class BarCalibration:
+    """Cameras calibrated with a bar.
+
+    Parameters
+    ----------
+    rig : Rig
+    length : float [m] of the bar.
+    cameras : {camera: CameraReport}
+    sigma_px : float [px] standard deviation of a coordinate of a target, as the adjustment finds it.
+    scatter : float [m] standard deviation of the distance of the targets from place to place.
+    frames : (F,) int, of the places used; x_world (F, 2, 3) [m] the ends there, in no constant order.
+    uv, residuals : (F, C, 2, 2) [px] targets used and measured minus seen; NaN where unused.
+    ambiguous : int, places left out because two orders of the targets fit alike.
+    left_out : int, places left out for other reasons.
+    world : str
+        Where the origin is, and what points up.
+    advice : tuple of str
+        What to record more of.
+    covariance : (C · P, C · P), as in `BarBundle`, in the gauge of the first camera.
+    """
+
+    rig: Rig
+    length: float
+    cameras: dict[str, CameraReport]
+    sigma_px: float
+    scatter: float
+    frames: NDArray
+    x_world: NDArray
+    uv: NDArray
+    residuals: NDArray
+    ambiguous: int
+    left_out: int
+    world: str
+    advice: tuple[str, ...]
+    covariance: NDArray
+
+    @property
+    def distances(self) -> dict[tuple[str, str], float]:
+        """{(camera, camera): distance [m]}."""
+        return {
+            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
+            for a, b in combinations(self.rig, 2)
+        }
+
+
+@checked
+def calibrate_bar(
+    seen: Mapping[str, BarViews],
+    length: float,
+    *,
+    interiors: Rig | None = None,
+    length_sigma: float = LENGTH_SIGMA,
+    floor: Sequence[int] = (),
+    known_distance: tuple[str, str, float] | None = None,
+) -> BarCalibration:
+    """Calibrate cameras with a bar; the distance of its targets gives the scale.
+
+    Parameters
+    ----------
+    seen : {camera: BarViews}, as `find_bars` and `read_centroids` give them; images of one number are of one time.
+    length : float [m]
+        From centre to centre of the targets.
+    interiors : Rig, optional
+        Interiors that are kept (their poses are not used); without, they are calibrated too.
+    length_sigma : float [m]
+        Standard deviation of the length given.
+    floor : frames in which the bar lies on the floor, in two directions or more: the targets' height is zero, z up.
+        Without, the world is the first camera's frame.
+    known_distance : (camera, camera, float [m]), optional
+        A second length, from lens to lens, by which the bar's is checked.
+
+    Raises
+    ------
+    CalibrationError
+        Too few places, targets that do not belong together, an arrangement that does not determine the lenses or the
+        cameras, a length that a second one contradicts.
+    """
+    if not (0.01 < length < 20.0 and 0 < length_sigma < length):
+        raise CalibrationError(
+            f"a bar of {length:g} m, known to {length_sigma:g} m", place="length",
+            remedy="Give it in metres, such as 0.9.",
+        )
+    names = list(seen)
+    if len(names) < 2:
+        raise CalibrationError(f"{len(names)} camera", remedy="Give what two cameras or more saw at the same times.")
+    cameras = [_camera(name, views, interiors) for name, views in seen.items()]
+    frames = np.array(sorted({frame for views in seen.values() for frame in views.ends}))
+    uv = np.full((len(frames), len(names), 2, 2), np.nan)
+    for c, views in enumerate(seen.values()):
+        for frame, ends in views.ends.items():
+            uv[np.searchsorted(frames, frame), c] = ends
+    bundle, used_uv, used, ambiguous = _adjusted(cameras, uv, length, interiors is not None)
+    _check(bundle, length, interiors is not None, seen)
+    if known_distance is not None:
+        _check_second(bundle, length, length_sigma, known_distance)
+    rig, T_new_world, world = on_floor(bundle.rig, bundle.x_world, frames[used], floor)
+    reports = reports_of(rig, bundle, used_uv, seen, length, length_sigma)
+    x_world = bundle.x_world @ T_new_world[:3, :3].T + T_new_world[:3, 3]
+    return BarCalibration(
+        rig, length, reports, bundle.sigma, bundle.scatter, frames[used], x_world, used_uv, bundle.residuals,
+        int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)), bundle.covariance,
+    )
+
+
+def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
+    if interiors is None:
+        width, height = views.size
+        K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
+        return Camera(name, views.size, K, np.zeros(5))
+    if name not in interiors:
+        problem = choices("intrinsics of camera", name, interiors.names)
+        raise CalibrationError(problem, remedy="Name the videos as the cameras.")
+    camera = interiors[name].with_pose(np.eye(4))
+    if camera.size != views.size:
+        raise CalibrationError(
+            f"its image has {views.size[0]}x{views.size[1]} px, "
+            f"its intrinsics are of {camera.size[0]}x{camera.size[1]}",
+            place=f"camera {name}", remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
+        )
+    return camera
+
+
+def _adjusted(
+    cameras: list[Camera], uv: NDArray, length: float, known: bool
+) -> tuple[BarBundle, NDArray, NDArray, NDArray]:
+    """Bundle of all cameras; pixels used (U, C, 2, 2), places used (F,) bool, ambiguous (F,) bool."""
+    pairs = first_pairs(cameras, uv, known, length)
+    best: tuple[float, list[int], Rig] | None = None
+    for pair in pairs[:6]:
+        rig, sigma, share = _grown(Rig(pair.cameras), uv[:, [pair.first, pair.second]], length, known)
+        worth = sigma / max(share, 1e-3) ** 2
+        if best is None or worth < best[0]:
+            best = (worth, [pair.first, pair.second], rig)
+    assert best is not None
+    _, members, rig = best
+    while len(members) < len(cameras):
+        known_places = place(rig, uv[:, members], length, _limit(rig, known), 0.1 * length)
+        trials = {}
+        for c in set(range(len(cameras))) - set(members):
+            both = np.isfinite(known_places.x_world).all(axis=(1, 2)) & np.isfinite(uv[:, c]).all(axis=(1, 2))
+            trials[c] = (*resect(cameras[c], known_places.x_world[both], uv[both, c], known), int(both.sum()))
+        c = max(trials, key=lambda c: trials[c][1] * trials[c][2])
+        camera, share, count = trials[c]
+        if share < 0.5:
+            raise CalibrationError(
+                f"it shares {count} places with the cameras before it ({', '.join(rig.names)}), of which "
+                f"{100 * share:.0f} % agree", place=f"camera {cameras[c].name}",
+                remedy=f"Is it in step? Wave the bar where it and another camera see it, in {FEWEST} places or more.",
+            )  # fmt: skip
+        members, rig = [*members, c], Rig((*rig, camera))
+        rig, _, _ = _grown(rig, uv[:, members], length, known)
+    rig = Rig(tuple(rig[camera.name] for camera in cameras))
+    rig = rig.moved(rig.cameras[0].T_camera_world)
+    sigma = 1.0
+    for n in range(4):
+        limit = _limit(rig, known) if n == 0 else max(_OUTLIER * sigma * np.sqrt(2), 0.05)
+        placed = place(rig, uv, length, limit, (0.05, 0.02, 0.01, 0.01)[n] * length)
+        used = np.isfinite(placed.x_world).all(axis=(1, 2))
+        _check_count(int(used.sum()), len(uv))
+        scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
+        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter)
+        rig, x_world = problem.adjust(rig, placed.x_world[used], rounds=3 if n < 3 else 8, iterations=20)
+        sigma = problem.sigma
+    return problem.result(rig, x_world), placed.uv[used], used, placed.ambiguous
+
+
+def _limit(rig: Rig, known: bool) -> float:
+    return max(near(camera, known) * (camera.matrix[0, 0] if known else max(camera.size)) for camera in rig)
+
+
+def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, float, float]:
+    """A rig adjusted to the places that it knows, twice; noise [px] and share of places that fit."""
+    sigma, share = 1.0, 0.0
+    for n in range(2):
+        placed = place(rig, uv, length, _limit(rig, known), (0.2, 0.05)[n] * length)
+        used = np.isfinite(placed.x_world).all(axis=(1, 2))
+        if used.sum() < FEWEST:
+            return rig, np.inf, 0.0
+        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=5e-3 * length)
+        rig, _ = problem.adjust(rig, placed.x_world[used], rounds=2, iterations=15)
+        sigma = problem.sigma
+        share = used.sum() / max(int((np.isfinite(uv).all(axis=(2, 3)).sum(axis=1) >= 2).sum()), 1)
+    return rig, sigma, float(share)
+
+
+def _check_count(used: int, total: int) -> None:
+    if used < FEWEST:
+        raise CalibrationError(
+            f"the cameras agree on {used} of {total} places of the bar",
+            remedy="Are the videos in step, and the two targets the brightest spots that move? Wave it in 50 places.",
+        )  # fmt: skip
+
+
+def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, BarViews]) -> None:
+    if bundle.scatter > _LOOSE * length:
+        raise CalibrationError(
+            f"the distance of the two targets scatters by {100 * bundle.scatter / length:.1f} % from place to place",
+            remedy="Are the videos in step, and the two brightest spots always those of one stiff bar?",
+        )
+    P = POSE + len(INTERIOR) * (not known)
+    std = np.sqrt(np.diag(bundle.covariance)).reshape(-1, P)
+    for c, camera in enumerate(bundle.rig):
+        used = int(np.isfinite(bundle.residuals[:, c]).all(axis=(1, 2)).sum())
+        if used < FEWEST:
+            raise CalibrationError(
+                f"only {used} of its {len(seen[camera.name].ends)} images of the bar agree with the other cameras",
+                place=f"camera {camera.name}", remedy="Is it in step? Wave the bar where it and another camera see it.",
+            )  # fmt: skip
+        if not known and not std[c, POSE] < _UNSURE * camera.matrix[0, 0]:
+            raise CalibrationError(
+                f"the focal length is not determined: {camera.matrix[0, 0]:.0f} px may be off by "
+                f"{100 * std[c, POSE] / camera.matrix[0, 0]:.0f} %", place=f"camera {camera.name}",
+                remedy="Wave the bar near and far, in all directions, set the cameras apart, or give --interiors.",
+            )  # fmt: skip
+    farthest = max(float(np.linalg.norm(camera.centre_world)) for camera in bundle.rig)
+    unsure = float(np.sqrt((std[:, :3] ** 2).sum(axis=1)).max())
+    if unsure > _UNSURE * farthest:
+        raise CalibrationError(
+            f"where the cameras stand is known to {unsure:.2f} m only, of {farthest:.2f} m between them",
+            remedy="Wave the bar near and far and in all directions, and set the cameras 20 degrees apart or more.",
+        )
+
+
+def _check_second(bundle: BarBundle, length: float, sigma: float, known: tuple[str, str, float]) -> None:
+    a, b, metres = known
+    found = float(np.linalg.norm(bundle.rig[a].centre_world - bundle.rig[b].centre_world))
+    if not metres > 0:
+        raise CalibrationError(f"a distance of {metres} m", place=f"{a} to {b}", remedy="Give it in metres.")
+    unsure = np.hypot(_TAPE, sigma / length)
+    if abs(np.log(found / metres)) > _SECOND * unsure:
+        raise CalibrationError(
+            f"with a bar of {length:g} m they stand {found:.3f} m apart, not {metres:g} m",
+            place=f"cameras {a} and {b}",
+            remedy=f"Measure both again, from centre to centre; a bar of {length * metres / found:.4g} m would agree.",
+        )

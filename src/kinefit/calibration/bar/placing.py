@@ -1,0 +1,76 @@
+"""Where the bar was in every frame, and which target is which in every camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Ends (F, 2, 3) [m], NaN where unknown; pixels (F, C, 2, 2) in their order, NaN where unused; ambiguous (F,)."""
+
+    x_world: NDArray
+    uv: NDArray
+    ambiguous: NDArray
+
+
+def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) -> Placement:
+    """The bar in every frame: of all orders the ends that most cameras agree with and that keep the length.
+
+    Frames in which two orders fit alike (two cameras and a bar in the plane through both) are left out.
+
+    Parameters
+    ----------
+    uv : (F, C, 2, 2) [px], targets in any order.
+    limit : float [px] within which a camera agrees.
+    tolerance : float [m] within which the length does.
+    """
+    F, C = uv.shape[:2]
+    seen = np.isfinite(uv).all(axis=(2, 3))
+    costs, ends, orders = [np.full(F, np.inf)], [np.full((F, 2, 3), np.nan)], [np.zeros((F, C), bool)]
+    for i, j in combinations(range(C), 2):
+        both = np.flatnonzero(seen[:, i] & seen[:, j])
+        pair = Rig((rig.cameras[i], rig.cameras[j]))
+        for crossed in (False, True) if len(both) else ():
+            pixels = np.stack([uv[both, i], uv[both, j][:, ::-1] if crossed else uv[both, j]], axis=2)
+            cost, x, order = np.full(F, np.inf), np.full((F, 2, 3), np.nan), np.zeros((F, C), bool)
+            x[both] = triangulate(pair, pixels.reshape(-1, 2, 2)).reshape(-1, 2, 3)
+            off = (np.linalg.norm(x[both, 1] - x[both, 0], axis=1) - length) / tolerance
+            agreed, order[both] = _agreement(rig, x[both], uv[both], limit)
+            cost[both] = agreed + np.minimum(np.nan_to_num(off**2), 25.0)
+            costs, ends, orders = [*costs, cost], [*ends, x], [*orders, order]
+    rows, best = np.arange(F), np.argmin(costs, axis=0)
+    x_world, order = np.array(ends)[best, rows], np.array(orders)[best, rows]
+    differs = (np.array(orders) ^ order) & seen
+    other = differs.any(axis=2) & (differs != seen).any(axis=2)  # all exchanged is the same bar, named the other way
+    rival = np.where(other, costs, np.inf).min(axis=0)
+    least = np.array(costs)[best, rows]
+    ambiguous = np.isfinite(least) & (rival < least + 9.0)  # three standard deviations
+    ordered = np.where(order[:, :, None, None], uv[:, :, ::-1], uv)
+    told = np.stack([camera.project(np.nan_to_num(x_world)) for camera in rig], axis=1)
+    off = np.linalg.norm(told - ordered, axis=3).max(axis=2)
+    used = seen & (off < limit) & ~ambiguous[:, None]
+    keeps = np.abs(np.linalg.norm(x_world[:, 1] - x_world[:, 0], axis=1) - length) < 5 * tolerance
+    used &= ((used.sum(axis=1) >= 2) & keeps)[:, None]
+    x_world[~used.any(axis=1)] = np.nan
+    return Placement(x_world, np.where(used[:, :, None, None], ordered, np.nan), ambiguous)
+
+
+def _agreement(rig: Rig, x: NDArray, uv: NDArray, limit: float) -> tuple[NDArray, NDArray]:
+    """Truncated costs (F,) of ends x (F, 2, 3), a third of the limit being 1, and which cameras exchange them."""
+    cost, exchanged = np.zeros(len(x)), np.zeros(uv.shape[:2], bool)
+    for c, camera in enumerate(rig):
+        seen = np.isfinite(uv[:, c]).all(axis=(1, 2))
+        at = camera.project(np.nan_to_num(x))
+        both = [np.sum((at - uv[:, c][:, order]) ** 2, axis=(1, 2)) for order in ((0, 1), (1, 0))]
+        both = [np.where(np.isfinite(one), one, np.inf) for one in both]
+        exchanged[:, c] = both[1] < both[0]
+        cost += np.where(seen, np.minimum(np.minimum(*both), 2 * limit**2), 0.0) / (limit / 3) ** 2
+    return np.where(np.isfinite(x).all(axis=(1, 2)), cost, np.inf), exchanged

@@ -1,0 +1,213 @@
+"""`kinefit calibrate bar`: cameras from two targets at a known distance, waved through the volume."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.calibration.bar.calibrate import BarCalibration
+    from kinefit.calibration.bar.targets import BarViews
+
+_EXAMPLES = """\b
+Examples:
+  kinefit calibrate bar videos/ --length 0.9
+  kinefit calibrate bar left.mp4 right.mp4 --length 0.5 --floor 12,80 -o room.toml
+  kinefit calibrate bar centroids.csv --length 0.9 --size 1920x1080
+  kinefit calibrate bar videos/ --length 0.9 --interiors lenses.toml --distance cam01:cam03:4.21
+"""
+_MAGNIFIED = 200  # times: residuals in the picture of coverage
+
+
+@click.command(short_help="Lenses, places and scale from a bar with two bright targets.", epilog=_EXAMPLES)
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_FOLDER_OR_CSV...")
+@click.option("--length", type=float, required=True, metavar="M", help="From centre to centre of the targets.")
+@click.option("--length-sigma", type=float, metavar="M", help="Standard deviation of the length.  [default: 0.0001]")
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
+              help="File to write, Pose2Sim TOML; beside it a table of parameters and a picture of coverage.")
+@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration whose lenses are kept.")
+@click.option("--floor", metavar="FRAMES",
+              help="Frames in which the bar lies on the floor in two directions, as 12,80.")
+@click.option("--distance", metavar="A:B:M", help="A second length, from lens to lens of two cameras, as a check.")
+@click.option("--size", metavar="WxH", help="Of the images in which the centroids of a CSV file were measured.")
+@click.option("--max-frames", type=click.IntRange(12), default=400, show_default=True,
+              help="Frames of each camera to look at, evenly over the recording.")
+@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+@_screen.verbose_option
+def bar(
+    sources: tuple[Path, ...], length: float, length_sigma: float | None, out: Path, interiors: Path | None,
+    floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool, verbose: bool,
+) -> None:
+    """Lenses, places and scale from a bar with two bright targets that is waved through the volume.
+
+    Give a synchronised video for each camera, named as the camera, or folders of images; frames of one number are of
+    one time. Or a CSV file of centroids: camera,frame,u,v, two rows an image.
+    """
+    from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar
+    from kinefit.cli._results import check_file
+    from kinefit.errors import ExportError
+    from kinefit.readers.calibration.read import read_calibration, write_calibration
+
+    on_floor, known = _frames(floor), _distance(distance)
+    beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
+    for file in beside:
+        if file.exists() and not overwrite:
+            remedy = "Add --overwrite, or name another."
+            raise ExportError("there is a file of this name already", file=file, remedy=remedy)
+        check_file(file)
+    kept = read_calibration(interiors, exteriors=False) if interiors else None
+    with _screen.bars() as step:
+        seen = _seen(sources, size, kept, max_frames, on_floor, step)
+        step("calibrating", 0, 1)
+        result = calibrate_bar(
+            seen, length, interiors=kept, floor=on_floor, known_distance=known,
+            length_sigma=LENGTH_SIGMA if length_sigma is None else length_sigma,
+        )  # fmt: skip
+        step("calibrating", 1, 1)
+    write_calibration(result.rig, out)
+    _write_table(result, beside[1])
+    _write_picture(result, beside[2])
+    _tell(result, known is not None)
+    _screen.say(f"Written: {out}, {beside[1].name} (all parameters), {beside[2].name} (coverage)")
+
+
+def _seen(
+    sources: tuple[Path, ...], size: str | None, kept: object, max_frames: int, include: tuple[int, ...],
+    step: _screen.Step,
+) -> dict[str, BarViews]:
+    from kinefit.calibration.bar.table import read_centroids
+    from kinefit.calibration.bar.targets import find_bars
+    from kinefit.calibration.board.sources import camera_sources
+    from kinefit.geometry.camera import Rig
+
+    if not any(path.suffix.lower() == ".csv" for path in sources):
+        if size is not None:
+            raise click.BadParameter("images have a size of their own; it is for a CSV file", param_hint="--size")
+        return find_bars(camera_sources(sources), max_frames=max_frames, include=include, progress=step)
+    if len(sources) > 1:
+        raise click.BadParameter("give one CSV file that holds all cameras", param_hint="VIDEO_FOLDER_OR_CSV")
+    if size is not None:
+        given = re.fullmatch(r"(\d+)[xX](\d+)", size)
+        if given is None:
+            raise click.BadParameter(f"'{size}' is no size; write 1920x1080", param_hint="--size")
+        return read_centroids(sources[0], (int(given[1]), int(given[2])))
+    if not isinstance(kept, Rig):
+        problem = "needed with a CSV file, as 1920x1080, where no --interiors state it"
+        raise click.BadParameter(problem, param_hint="--size")
+    return read_centroids(sources[0], {camera.name: camera.size for camera in kept})
+
+
+def _frames(floor: str | None) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in floor.split(",")) if floor else ()
+    except ValueError:
+        raise click.BadParameter(f"'{floor}' names no frames; write 12,80", param_hint="--floor") from None
+
+
+def _distance(text: str | None) -> tuple[str, str, float] | None:
+    if text is None:
+        return None
+    try:
+        a, b, metres = text.rsplit(":", 2)
+        return a, b, float(metres)
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is no distance; write cam01:cam03:4.21", param_hint="--distance") from None
+
+
+def _write_table(result: BarCalibration, file: Path) -> None:
+    """A row a parameter: camera, name, value, standard deviation, what it rests on."""
+    from kinefit.exporters.atomic import writing
+
+    with writing(file) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        table = csv.writer(stream)
+        table.writerow(("camera", "parameter", "unit", "value", "std", "from"))
+        for name, report in result.cameras.items():
+            for parameter, value, std in zip(report.names, report.values, report.std):
+                unit = "px" if parameter in ("fx", "fy", "cx", "cy") else "m" if parameter in "xyz" else ""
+                unit = "rad" if parameter in ("rx", "ry", "rz") else unit
+                origin = "given" if not std else "assumption" if parameter in report.assumed else "recording"
+                table.writerow((name, parameter, unit, f"{value:.9g}", f"{std:.4g}", origin))
+
+
+def _write_picture(result: BarCalibration, file: Path) -> None:
+    """Where in each image targets were, and what is left of them, magnified."""
+    import cv2
+    import numpy as np
+
+    from kinefit.exporters.atomic import writing
+
+    panels = []
+    for c, camera in enumerate(result.rig):
+        scale = 640 / camera.size[0]
+        panel = np.full((round(camera.size[1] * scale), 640, 3), 32, np.uint8)
+        uv, left = (a[:, c].reshape(-1, 2) for a in (result.uv, result.residuals))
+        fine = np.isfinite(left).all(axis=1)
+        for at, off in zip(scale * uv[fine], scale * _MAGNIFIED * left[fine]):
+            cv2.line(panel, _at(at), _at(at + off), (60, 140, 255), 1, cv2.LINE_AA)
+            cv2.circle(panel, _at(at), 2, (90, 240, 255), -1, cv2.LINE_AA)
+        report = result.cameras[camera.name]
+        told = f"{camera.name}: {report.used} places, {report.rms_px:.2f} px, residuals x {_MAGNIFIED}"
+        panels.append(_titled(panel, told))
+    height = max(len(panel) for panel in panels)
+    panels = [np.pad(panel, ((0, height - len(panel)), (4, 4), (0, 0))) for panel in panels]
+    columns = min(len(panels), 2 if len(panels) < 5 else 3)
+    panels += [np.zeros_like(panels[0])] * (-len(panels) % columns)
+    picture = np.vstack([np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)])
+    with writing(file) as temporary:
+        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _titled(panel: NDArray, text: str) -> NDArray:
+    import cv2
+    import numpy as np
+
+    out = np.vstack([np.zeros((28, panel.shape[1], 3), np.uint8), panel])
+    cv2.putText(out, text, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (230, 230, 230), 1, cv2.LINE_AA)
+    return out
+
+
+def _at(uv: NDArray) -> tuple[int, int]:
+    return round(float(uv[0])), round(float(uv[1]))
+
+
+def _tell(result: BarCalibration, checked: bool) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"bar of {result.length:g} m", title_justify="left")
+    for column in ("camera", "focal px", "± px", "centre ± px", "places", "image covered", "rms px", "place ± mm"):
+        left = column == "camera"
+        table.add_column(column, justify="left" if left else "right", no_wrap=left)
+    for camera in result.rig:
+        report = result.cameras[camera.name]
+        lens = report.std_of("fx") > 0
+        place = 1e3 * sum(report.std_of(axis) ** 2 for axis in "xyz") ** 0.5
+        table.add_row(
+            camera.name, f"{camera.matrix[0, 0]:.1f}", f"{report.std_of('fx'):.2f}" if lens else "given",
+            f"{max(report.std_of('cx'), report.std_of('cy')):.2f}" if lens else "given",
+            f"{report.used} of {report.places}",
+            f"{100 * report.coverage:.0f} %", f"{report.rms_px:.3f}", f"{place:.1f}",
+        )  # fmt: skip
+    _screen.console().print(table)
+    _screen.say(
+        f"A target is seen to {result.sigma_px:.3f} px; the bar's length scatters by {1e3 * result.scatter:.2f} mm "
+        f"over {len(result.frames)} places. Left out: {result.left_out} that do not fit, {result.ambiguous} in which "
+        "nothing tells the two targets apart."
+    )
+    for (a, b), distance in result.distances.items():
+        _screen.say(f"{a} to {b}: {distance:.4f} m")
+    _screen.say(result.world)
+    for line in result.advice:
+        _screen.say(f"More: {line}")
+    if not checked:
+        _screen.say(
+            "The scale is that of --length and nothing here can check it: a length that is 1 % too long makes "
+            "everything 1 % too large. Measure the distance of two lenses with a tape and give --distance."
+        )

@@ -1,0 +1,111 @@
+"""Who of the people in view is followed, and what there is to tell of the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import TrackingError
+from kinefit.geometry.camera import Rig
+from kinefit.multiview.people import Person, people_of
+from kinefit.observations import Keypoints
+from kinefit.observations.person import FORMS, PersonChoice
+
+PEOPLE = "people"
+"""Where `Motion.provenance` has who is in view."""
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """One person's keypoints.
+
+    Parameters
+    ----------
+    keypoints : records; of this person alone where there are others
+    people : everybody in view, the one of whom most is seen first; empty where nobody but one was ever detected
+    number : of the person, from 1
+    """
+
+    keypoints: tuple[Keypoints, ...]
+    people: tuple[Person, ...] = ()
+    number: int = 1
+
+    def as_told(self) -> dict[str, Any]:
+        """For `Motion.provenance`: nothing where there is one person."""
+        if len(self.people) < 2:
+            return {}
+        return {PEOPLE: {
+            "in view": len(self.people), "followed": self.number,
+            "each": [{
+                "frames": int(np.sum(one.views > 0)), "views": round(float(one.views.mean()), 2),
+                "speed_m_s": round(one.speed, 3), "height_px": round(one.size, 1),
+                "place_m": [round(float(v), 2) for v in one.place],
+            } for one in self.people],
+        }}  # fmt: skip
+
+
+def follow(rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None) -> Followed:
+    """The keypoints of one of the people in view.
+
+    Parameters
+    ----------
+    rig : Rig
+    keypoints : records of the same number of frames and the same rate, each of one or several people.
+    person : "first" (default), "moving", "largest", "nearest X Y Z" [m], or a number from 1
+
+    Raises
+    ------
+    ObservationError
+        A person in none of these forms.
+    TrackingError
+        A number that is more than there are people.
+    """
+    wanted = PersonChoice.of(person)
+    several = any(k.points.shape[1] > 1 and (k.confidence.max(axis=2) > 0).sum(axis=1).max(initial=0) > 1
+                  for k in keypoints)  # fmt: skip
+    people = tuple(people_of(rig, keypoints)) if several else ()
+    if wanted.way == "number" and wanted.number > max(len(people), 1):
+        there = f"{len(people)} people are" if len(people) > 1 else "one person is"
+        raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")
+    if len(people) < 2:
+        return Followed(tuple(keypoints), people)
+    number = _number(people, wanted)
+    one = people[number]
+    return Followed(tuple(alone(k, chosen) for k, chosen in zip(keypoints, one.chosen)), people, number + 1)
+
+
+def _number(people: Sequence[Person], wanted: PersonChoice) -> int:
+    if wanted.way == "moving":
+        return int(np.argmax([one.speed for one in people]))
+    if wanted.way == "largest":
+        return int(np.argmax([one.size for one in people]))
+    if wanted.place is not None:
+        return int(np.argmin([np.linalg.norm(one.place - wanted.place) for one in people]))
+    return wanted.number - 1
+
+
+def alone(record: Keypoints, chosen: NDArray) -> Keypoints:
+    """One person's keypoints of a record; chosen (F,) is who it is in each frame, -1 for nobody."""
+    if record.points.shape[1] == 0:
+        return record
+    frames, there = np.arange(len(record)), (chosen >= 0)[:, None]
+    points = np.where(there[..., None], record.points[frames, np.maximum(chosen, 0)], np.nan)
+    confidence = np.where(there, record.confidence[frames, np.maximum(chosen, 0)], 0.0)
+    return replace(record, points=points[:, None], confidence=confidence[:, None])
+
+
+def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
+    """Who is in view and who is followed; nothing where there is one person. `asked`: somebody chose the person."""
+    told = provenance.get(PEOPLE)
+    if not told:
+        return []
+    listed = "; ".join(
+        f"{k} near ({', '.join(f'{v:.1f}' for v in one['place_m'])}) m moves {one['speed_m_s']:.2f} m/s, "
+        f"{one['height_px']:.0f} px tall" for k, one in enumerate(told["each"], start=1)
+    )  # fmt: skip
+    why = "" if asked else ", of whom most is seen"
+    return [f"{told['in view']} people are in view, person {told['followed']} is followed{why} ({listed})"]

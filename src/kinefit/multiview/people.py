@@ -1,0 +1,268 @@
+"""All people: who is who in all cameras and over time, among everybody whom detectors saw.
+
+Each person's points in space are carried to the next frame; in every camera people and detections are then paired at
+the least total cost, and views that do not fit the others are let go. Who is seen by enough cameras and is nobody yet
+is a new person, or one who was lost within reach. Whom cameras saw before enough of them did is added backwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.geometry.camera import Rig
+from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
+from kinefit.multiview.boxes import same_people
+from kinefit.observations import Keypoints
+from kinefit.solvers.assignment import assign
+
+_NEAR = 0.25  # a person's points and a detection differ by less, as a share of the detection's height, and by ...
+_TALL = 1.7  # [m] ... how far people go from frame to frame, for one of this stature; half a height at most
+_FITS = 0.08  # views of one person all lie within this share of the height; two, see association, within half of it
+_SAME = 0.2  # [m] points of two people are further apart than detections of one and the same
+_LASTING = 1.0  # [s] for which somebody must be seen to be a person; half of a take that is shorter than two
+_STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as large as a motion
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One of the people in view.
+
+    Parameters
+    ----------
+    chosen : of each record (F,) int, which of the detected it is in each frame, -1 for none
+    views : (F,) how many cameras see the person
+    surety : float, points seen in all frames, each as sure as the detector was
+    speed : float [m/s] of the body's points, the mean over time of their median
+    size : float [px] mean height in the pictures
+    place : (3,) [m] median place of the body's middle
+    """
+
+    chosen: tuple[NDArray, ...]
+    views: NDArray
+    surety: float
+    speed: float
+    size: float
+    place: NDArray
+
+
+def views_needed(cameras: int) -> int:
+    """By how many cameras somebody must be seen to count as a person."""
+    return 3 if cameras > 3 else min(cameras, 2)
+
+
+def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
+    """Everybody whom enough cameras see for a second, the one of whom most is seen first.
+
+    Parameters
+    ----------
+    rig : Rig
+    keypoints : records of the same number of frames and the same rate, each of one or several people.
+    """
+    if not keypoints:
+        return []
+    sets = [k.names for k in keypoints]
+    usual = max(sets, key=sets.count)
+    main = list({k.camera: q for q, k in reversed(list(enumerate(keypoints))) if k.names == usual}.values())
+    search = _Search(rig, [keypoints[q] for q in main])
+    for f in range(search.frames):
+        search.forward(f)
+    for f in reversed(range(search.frames)):
+        search.backward(f)
+    needed = views_needed(len({keypoints[q].camera for q in main}))
+    lasting = min(_LASTING * keypoints[0].rate, 0.5 * search.frames)
+    people = []
+    for track in search.tracks:
+        views = np.zeros(search.frames, int)
+        chosen = [np.full(search.frames, -1) for _ in keypoints]
+        for f, nodes in track.nodes.items():
+            views[f] = len(nodes)
+            for q, p in nodes:
+                chosen[main[q]][f] = p
+        if np.sum(views >= needed) >= lasting:
+            people.append(search.person(track, chosen, views, main))
+    people.sort(key=lambda one: -one.surety)
+    for q in set(range(len(keypoints))) - set(main):
+        own = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
+        if own is not None:
+            there = same_people([one.chosen[own] for one in people], keypoints[own], keypoints[q])
+            for one, places in zip(people, there):
+                one.chosen[q][:] = places
+    return people
+
+
+@dataclass(eq=False)
+class _Track:
+    """One person while the search goes on."""
+
+    x: NDArray  # (k, 3) [m] last known points
+    v: NDArray  # (k, 3) [m] a frame
+    last: int
+    born: int
+    nodes: dict[int, list[Node]] = field(default_factory=dict)
+    path: dict[int, NDArray] = field(default_factory=dict)
+
+    def expected(self, frame: int) -> NDArray:
+        """(k, 3) [m] points at a frame: on their way for one frame, then where they were."""
+        return self.x + self.v if abs(frame - self.last) == 1 else self.x
+
+    def seen(self, frame: int, nodes: list[Node], x: NDArray | None, reach: float) -> None:
+        """Go on with detections, and points (k, 3) where they could be triangulated."""
+        self.nodes[frame] = nodes
+        if x is None:  # one view tells no place in space: slowly to a halt
+            self.x, self.v, self.last = self.expected(frame), 0.5 * self.v, frame
+            self.path[frame] = self.x
+            return
+        moved = x - self.x
+        middle = np.nanmedian(moved, axis=0) if np.isfinite(moved).all(axis=1).any() else np.zeros(3)
+        x = np.where(np.isfinite(x), x, self.x + middle)
+        step = (x - self.x) / max(abs(frame - self.last), 1)
+        step *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
+        self.v = np.nan_to_num(0.5 * self.v + 0.5 * step)
+        self.x, self.last = x, frame
+        self.path[frame] = x
+
+
+class _Search:
+    """Everybody in the records of one detector."""
+
+    def __init__(self, rig: Rig, keypoints: Sequence[Keypoints]) -> None:
+        self.rig, self.keypoints = rig, keypoints
+        self.frames = min(len(k) for k in keypoints)
+        self.rate = keypoints[0].rate
+        self.surety = [surety_of(k, self.frames) for k in keypoints]
+        self.meetings = meetings_of(rig, keypoints, self.surety, self.frames)
+        self.cameras = [rig[k.camera] for k in keypoints]
+        self.tracks: list[_Track] = []
+        self.needed = views_needed(len({k.camera for k in keypoints}))
+        some = some_points(len(keypoints[0].names))
+        self.uv = []
+        for k in keypoints:
+            uv = k.points[: self.frames, :, some]
+            self.uv.append(np.where((k.confidence[: self.frames, :, some] > 0.1)[..., None], uv, np.nan))
+
+    def free(self, frame: int, tracks: Sequence[_Track]) -> list[Node]:
+        """Detections of a frame that nobody has, the surest first."""
+        taken = {node for track in tracks for node in track.nodes.get(frame, ())}
+        ranked = [(float(s[frame, p]), q, int(p)) for q, s in enumerate(self.surety) for p in np.flatnonzero(s[frame])]
+        return [(q, p) for _, q, p in sorted(ranked, reverse=True) if (q, p) not in taken]
+
+    def forward(self, frame: int) -> None:
+        """Who goes on, who comes back and who is new in a frame."""
+        self._go_on(frame, self.tracks)
+        came = self._newcomers(frame)
+        away = [t for t in self.tracks if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
+        cost = np.array([[_apart(t.x, x) for _, x in came] for t in away]).reshape(len(away), len(came))
+        reach = np.array([STRIDE + SPEED * (frame - t.last) / self.rate for t in away])
+        cost[cost > reach[:, None]] = np.inf
+        back = {k: away[i] for i, k in assign(cost)}
+        for k, (nodes, x) in enumerate(came):
+            track = back.get(k)
+            if track is None:
+                track = _Track(x, np.zeros_like(x), frame, frame)
+                self.tracks.append(track)
+            else:
+                track.x, track.v, track.last = x, np.zeros_like(x), frame
+            track.seen(frame, nodes, x, SPEED / self.rate)
+
+    def _newcomers(self, frame: int) -> list[tuple[list[Node], NDArray]]:
+        """Detections that are of one person whom nobody has yet, and its points (k, 3) [m].
+
+        Two people of like height fit each other in two views: the most views go first, then those that fit best.
+        """
+        free = self.free(frame, self.tracks)
+        if len(free) < self.needed:
+            return []
+        full = len(self.keypoints) * len(self.keypoints[0].names)
+        ranked: list[tuple[int, float, int, list[Node], NDArray]] = []
+        for group in groups_of(free, self.meetings, self.surety, frame, full):
+            nodes, x = self._agreeing(frame, list(group.nodes), None)
+            if x is not None and len(nodes) >= self.needed and not self._is_there(frame, x):
+                ranked.append((-len(nodes), float(max(self._off(x, frame, n) for n in nodes)), len(ranked), nodes, x))
+        came: list[tuple[list[Node], NDArray]] = []
+        for *_, nodes, x in sorted(ranked, key=lambda r: r[:3]):
+            if not any(node in taken for taken, _ in came for node in nodes):
+                came.append((nodes, x))
+        return came
+
+    def backward(self, frame: int) -> None:
+        """Who was there before enough cameras saw it."""
+        for track in self.tracks:
+            if track.born == frame + 1:
+                track.x, track.last, track.v = track.path[track.born], track.born, np.zeros_like(track.x)
+        early = [t for t in self.tracks if t.born > frame and t.last - frame <= self.rate]
+        self._go_on(frame, early)
+
+    def _go_on(self, frame: int, tracks: Sequence[_Track]) -> None:
+        """Pair people with detections, camera by camera."""
+        free, views = self.free(frame, self.tracks), [list[Node]() for _ in tracks]
+        expected = [t.expected(frame) for t in tracks]
+        for q in range(len(self.cameras)):
+            mine = [p for r, p in free if r == q]
+            if not mine or not tracks:
+                continue
+            cost = np.array([[self._off(x, frame, (q, p)) for p in mine] for x in expected])
+            waited = np.array([abs(frame - t.last) for t in tracks])
+            near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)
+            cost[cost > near[:, None]] = np.inf
+            for t, p in assign(cost, 0.6):
+                views[t].append((q, mine[p]))
+        for track, x, nodes in zip(tracks, expected, views, strict=True):
+            if nodes:
+                kept, found = self._agreeing(frame, nodes, x)
+                track.seen(frame, kept, found, SPEED / self.rate)
+
+    def _off(self, x: NDArray, frame: int, node: Node) -> float:
+        """How far a detection is from points (k, 3), as a share of its height."""
+        uv = self.uv[node[0]][frame, node[1]]
+        both = np.isfinite(uv).all(axis=1) & np.isfinite(x).all(axis=1)
+        if both.sum() < 3:
+            return np.inf
+        away = np.linalg.norm(self.cameras[node[0]].project(x[both]) - uv[both], axis=1)
+        median = float(np.median(np.where(np.isfinite(away), away, 1e6)))
+        return median / max(float(np.ptp(uv[both, 1])), 1.0)
+
+    def _agreeing(self, frame: int, nodes: list[Node], expected: NDArray | None) -> tuple[list[Node], NDArray | None]:
+        """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
+        while len(nodes) > 1:
+            uv = np.stack([self.uv[q][frame, p] for q, p in nodes], axis=1)
+            height = float(np.nanmedian(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
+            rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
+            x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
+            off = np.array([self._off(x, frame, node) for node in nodes])
+            if off.max() <= _FITS:
+                return nodes, x
+            if len(nodes) == 2 and expected is not None:
+                off = np.array([self._off(expected, frame, node) for node in nodes])
+            nodes = [node for i, node in enumerate(nodes) if i != int(off.argmax())]
+        return nodes, None
+
+    def _is_there(self, frame: int, x: NDArray) -> bool:
+        """Whether somebody stands at these very points: a second detection of one person is no other."""
+        return any(_apart(t.x, x) < _SAME for t in self.tracks if frame in t.nodes)
+
+    def person(self, track: _Track, chosen: list[NDArray], views: NDArray, main: Sequence[int]) -> Person:
+        """What is told of a person."""
+        step = max(round(_STEP * self.rate), 1)
+        speeds = [
+            np.nanmedian(np.linalg.norm(track.path[f + step] - x, axis=1)) * self.rate / step
+            for f, x in track.path.items()
+            if f + step in track.path
+        ]
+        sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
+            self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes
+        )]  # fmt: skip
+        sure = sum(float(self.surety[q][f, p]) for f, nodes in track.nodes.items() for q, p in nodes)
+        place = np.nanmedian([np.nanmedian(x, axis=0) for x in track.path.values()], axis=0)
+        speed = float(np.mean(speeds)) if speeds else 0.0
+        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place)
+
+
+def _apart(a: NDArray, b: NDArray) -> float:
+    """[m] median distance of points (k, 3) from their likes; infinite where none is in both."""
+    d = np.linalg.norm(a - b, axis=1)
+    return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else np.inf

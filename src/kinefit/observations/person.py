@@ -1,0 +1,61 @@
+"""Which of several people: how a take, an argument or an option names one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+
+FORMS = '"first", "moving", "largest", "nearest X Y Z" [m], or a number from 1'
+"""What may be written."""
+
+
+@dataclass(frozen=True, eq=False)
+class PersonChoice:
+    """One of several people.
+
+    Parameters
+    ----------
+    way : "first" (of whom most is seen), "moving" (whose points move most), "largest" (in the pictures), "nearest" or
+        "number"
+    number : int, from 1, of the people as `kinefit track` lists them
+    place : (3,) [m] in the world, that "nearest" is about
+    """
+
+    way: str = "first"
+    number: int = 1
+    place: NDArray | None = None
+
+    @classmethod
+    def of(cls, person: int | str | None) -> PersonChoice:
+        """What somebody wrote; None is "first".
+
+        Raises
+        ------
+        ObservationError
+            Anything else than `FORMS`.
+        """
+        if person is None:
+            return cls()
+        if isinstance(person, bool) or not isinstance(person, int | str):
+            raise _wrong(person)
+        word, *more = str(person).split() or [""]
+        if word.isascii() and word.isdigit() and not more and 0 < int(word[:6]):
+            return cls("number", int(word[:6]))
+        if word in ("first", "moving", "largest") and not more:
+            return cls(word)
+        if word == "nearest" and len(more) == 3:
+            try:
+                place = np.array([float(value) for value in more])
+            except ValueError:
+                raise _wrong(person) from None
+            if np.isfinite(place).all():
+                return cls(word, place=place)
+        raise _wrong(person)
+
+
+def _wrong(person: object) -> ObservationError:
+    return ObservationError(f"person = {str(person)[:60]!r}", remedy=f"Give {FORMS}.")

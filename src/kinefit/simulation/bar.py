@@ -1,0 +1,92 @@
+"""A bar with two targets, waved through a volume: where its ends are, and what cameras see of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit._arguments import checked
+from kinefit.calibration.bar.targets import BarViews
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.se3 import exp_so3, transform
+
+
+@checked
+def bar_rig(count: int = 3, size: tuple[int, int] = (1920, 1080), *, seed: int | None = None) -> Rig:
+    """Cameras 3.8 m round the middle of a room, z up, each with another lens; places and lenses drawn from a seed."""
+    rng = np.random.default_rng(seed)
+    drawn = rng.uniform(-1.0, 1.0, (count, 12)) * (seed is not None)
+    cameras = []
+    for i, d in enumerate(drawn):
+        azimuth = np.radians(20.0 + max(70.0, 300.0 / count) * i + 10.0 * d[0])
+        away = 3.8 + 0.4 * d[1]
+        centre = np.array([away * np.cos(azimuth), away * np.sin(azimuth), 1.2 + 0.4 * (i % 4) + 0.3 * d[2]])
+        forward = np.array([0.1 * d[3], 0.1 * d[4], 1.0]) - centre
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        R = exp_so3(np.array([0.0, 0.0, 0.1 * d[5]])) @ np.stack([right, np.cross(forward, right), forward])
+        f = (0.6 + 0.1 * (i % 3) + 0.08 * d[6]) * size[0]
+        u, v = size[0] / 2 - 9.0 * (i % 3) + 10.0 * d[7], size[1] / 2 + 6.0 * (i % 3) + 10.0 * d[8]
+        K = np.array([[f, 0.0, u], [0.0, (1.001 + 1e-3 * d[9]) * f, v], [0.0, 0.0, 1.0]])
+        lens = np.array([-0.15 + 0.1 * d[10], 0.04 + 0.03 * d[11], 5e-4, -3e-4, 0.0])
+        cameras.append(Camera(f"cam{i}", size, K, lens, "radtan", transform(R, -R @ centre)))
+    return Rig(tuple(cameras))
+
+
+@checked
+def wave_bar(
+    length: float, count: int, *, low: ArrayLike = (-1.0, -1.0, 0.3), high: ArrayLike = (1.0, 1.0, 2.0), seed: int = 0
+) -> NDArray:
+    """(count, 2, 3) [m] ends of a bar: its middle anywhere in a box, its direction anywhere."""
+    if not (length > 0 and count > 0):
+        raise ObservationError(f"a bar of {length} m at {count} places", remedy="Give positive numbers.")
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(np.asarray(low, float), np.asarray(high, float), (count, 3))
+    way = rng.normal(size=(count, 3))
+    half = 0.5 * length * way / np.linalg.norm(way, axis=1, keepdims=True)
+    return np.stack([middle - half, middle + half], axis=1)
+
+
+@checked
+def see_bar(rig: Rig, ends: NDArray, *, noise: float = 0.1, seed: int = 0) -> dict[str, BarViews]:
+    """What the cameras of a rig see of the ends (N, 2, 3) [m], in random order, with noise [px] on each coordinate."""
+    rng, seen = np.random.default_rng([seed, 1]), {}
+    for camera in rig:
+        uv = camera.project(ends) + rng.normal(0.0, noise, (*ends.shape[:2], 2))
+        swapped = rng.random(len(ends)) < 0.5
+        uv[swapped] = uv[swapped, ::-1]
+        inside = (np.isfinite(uv) & (uv > 2.0) & (uv < np.array(camera.size) - 3.0)).all(axis=(1, 2))
+        seen[camera.name] = BarViews(camera.size, {int(f): uv[f] for f in np.flatnonzero(inside)}, len(ends))
+    return seen
+
+
+@checked
+def draw_bar(
+    camera: Camera, ends: ArrayLike, *, radius: float = 0.02, lamps: ArrayLike = (), noise: float = 3.0, seed: int = 0
+) -> NDArray:
+    """(H, W) uint8: shining balls of a radius [m] at the ends (2, 3), and lamps (K, 3) [m] that shine as bright.
+
+    Each pixel is the mean of 4 x 4 rays, on a dark ground with noise.
+    """
+    rng, (width, height) = np.random.default_rng(seed), camera.size
+    image = np.full((height, width), 18.0)
+    grid = (np.arange(4) + 0.5) / 4 - 0.5
+    for x in [*np.asarray(ends, float), *np.asarray(lamps, float).reshape(-1, 3)]:
+        uv = camera.project(x)
+        distance = float(np.linalg.norm(x - camera.centre_world))
+        if not np.isfinite(uv).all():
+            continue
+        reach = int(np.ceil(2 * camera.matrix[0, 0] * radius / distance)) + 3
+        u, v = np.rint(uv).astype(int)
+        us = np.arange(max(u - reach, 0), min(u + reach + 1, width))
+        vs = np.arange(max(v - reach, 0), min(v + reach + 1, height))
+        if not (len(us) and len(vs)):
+            continue
+        fine = np.stack(np.meshgrid((us[:, None] + grid).ravel(), (vs[:, None] + grid).ravel()), axis=-1)
+        away = np.linalg.norm(np.cross(camera.ray(fine), x - camera.centre_world), axis=-1)
+        share = (away < radius).reshape(len(vs), 4, len(us), 4).mean(axis=(1, 3))
+        patch = image[vs[0] : vs[-1] + 1, us[0] : us[-1] + 1]
+        np.maximum(patch, 18.0 + 220.0 * share, out=patch)
+    return np.clip(np.rint(image + rng.normal(0.0, noise, image.shape)), 0, 255).astype(np.uint8)

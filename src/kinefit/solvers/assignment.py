@@ -1,0 +1,71 @@
+"""Who goes with whom: the pairs of least total cost."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+
+
+def assign(cost: ArrayLike, most: float = np.inf) -> list[tuple[int, int]]:
+    """Pairs (row, column) whose costs, each below `most`, fall short of `most` by the greatest total.
+
+    Every row and every column is in one pair at most. Shortest augmenting paths (Jonker and Volgenant 1987), in
+    O(n³); with `most` infinite, as many pairs as finite costs allow.
+
+    Parameters
+    ----------
+    cost : (R, C), infinite where a pair is impossible.
+
+    Raises
+    ------
+    ObservationError
+        NaN among the costs, or no matrix.
+    """
+    cost = np.asarray(cost, float)
+    if cost.ndim != 2 or np.isnan(cost).any():
+        problem = f"costs of shape {cost.shape}" + (", some NaN" if np.isnan(cost).any() else "")
+        raise ObservationError(problem, remedy="Give a matrix; infinity where a pair is impossible.")
+    allowed = np.isfinite(cost) & (cost < most)
+    if not allowed.any():
+        return []
+    spread = float(np.ptp(cost[allowed])) + 1.0
+    alone = most if np.isfinite(most) else float(cost[allowed].max()) + (min(cost.shape) + 1) * spread
+    n = sum(cost.shape)  # everybody may stay alone, at the price of `most` a pair
+    square = np.full((n, n), alone)
+    square[: cost.shape[0], : cost.shape[1]] = np.where(allowed, cost, 3.0 * abs(alone) + 3.0 * spread)
+    square[cost.shape[0] :, cost.shape[1] :] = 0.0
+    square[: cost.shape[0], cost.shape[1] :] *= 0.5
+    square[cost.shape[0] :, : cost.shape[1]] *= 0.5
+    chosen = _least(square)[: cost.shape[0]]
+    return [(r, int(c)) for r, c in enumerate(chosen) if c < cost.shape[1] and allowed[r, c]]
+
+
+def _least(cost: NDArray) -> NDArray:
+    """(n,) column of each row of a square matrix (n, n), with the least total."""
+    n = len(cost)
+    u, v = np.zeros(n + 1), np.zeros(n + 1)
+    owner = np.full(n + 1, -1)  # row of each column; the last column begins every path
+    for row in range(n):
+        owner[n], column = row, n
+        least, before, used = np.full(n, np.inf), np.full(n, n), np.zeros(n + 1, bool)
+        while owner[column] >= 0:
+            used[column] = True
+            free = ~used[:n]
+            reduced = cost[owner[column]] - u[owner[column]] - v[:n]
+            better = free & (reduced < least)
+            least[better], before[better] = reduced[better], column
+            following = int(np.flatnonzero(free)[np.argmin(least[free])])
+            delta = least[following]
+            u[owner[used]] += delta
+            v[used] -= delta
+            least[free] -= delta
+            column = following
+        while column != n:
+            owner[column] = owner[before[column]]
+            column = int(before[column])
+        owner[n] = -1
+    out = np.empty(n, int)
+    out[owner[:n]] = np.arange(n)
+    return out
