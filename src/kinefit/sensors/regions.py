@@ -34,17 +34,10 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
-<<<<<<< HEAD
 _CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
-_FIRST, _OFTEN = 10, 0.05  # images, and then [s] after which, colours of a body of parts are learnt, as that takes long
-=======
-# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
-# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes;
-# of people, who fill more of the image and whose clothes fold, every image is: after a jump of light quality comes back
-# to 0.89 in half a second, to 0.7 without.
+# Images, and then [s] after which, colours of a body of parts are learnt, as that takes long; of people, whose clothes
+# fold, every one: after a jump of light quality comes back to 0.89 in half a second, to 0.7 without.
 _FIRST, _OFTEN = 10, 0.05
-_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
->>>>>>> c52fd8ebd4e0771356e4a1adace39a8149fd27fe
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -182,11 +175,7 @@ class RegionMeasurement(Measurement):
         self._lines: Lines | None = None
         self._told: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
         self._judged: BodyState | None = None
-<<<<<<< HEAD
         self.clear, self.first = 0.0, False
-=======
-        self.clear = 0.0
->>>>>>> c52fd8ebd4e0771356e4a1adace39a8149fd27fe
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
@@ -287,13 +276,8 @@ class RegionMeasurement(Measurement):
         """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
         of, s, none = self.of, self.of.regions, np.zeros(0)
         parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
-<<<<<<< HEAD
-        solid = scene.surface.morphing.is_rigid and not parts.simple and parts.count > 1
-        if not solid or seen is None or self.image is None:
-=======
         known = parts.count > 1 and not parts.simple and scene.surface.morphing.is_rigid
         if not known or seen is None or self.image is None:
->>>>>>> c52fd8ebd4e0771356e4a1adace39a8149fd27fe
             return None, none, none
         drawn = self._drawn(scene)
         seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
