@@ -35,8 +35,7 @@ from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
 _CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
-# Images, and then [s] after which, colours of a body of parts are learnt, as that takes long; of people, whose clothes
-# fold, every one: after a jump of light quality comes back to 0.89 in half a second, to 0.7 without.
+# Images, and then [s], after which colours of a body of parts are learnt; of people, whose clothes fold, of every one.
 _FIRST, _OFTEN = 10, 0.05
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
@@ -108,8 +107,8 @@ class RegionSensor(Sensor):
             self._stated = True
             if self.parts(scene).simple:
                 self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
-        if not self._known:
-            m.first, self.colours = True, RegionColours.none(self.count, self.regions)
+        m.first = not self._known
+        if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
         m.seen = Coloured(frame.image, self.bins, self.ratios)
@@ -120,9 +119,8 @@ class RegionSensor(Sensor):
         if not isinstance(measurement, RegionMeasurement):
             return
         if measurement.waits(scene):
-            if sure:
-                self.colours, self._known = RegionColours.none(self.count, self.regions), True
-                self._know(measurement, scene)
+            self.colours, self._known = RegionColours.none(self.count, self.regions), sure
+            self._know(measurement, scene)
             return
         self._known, told = True, measurement.evidence(scene)
         parts, wrong = self.parts(scene), told.lost | told.hidden
