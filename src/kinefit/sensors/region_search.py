@@ -79,6 +79,10 @@ def region_starts(
     told : what the image says of the state that was found from there
     rigid : whether the body is; one that is not is sought only if it is not where it was found, as a whole
     """
+    agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
+    right = agreeing >= s.poor * (agreeing + contrary)
+    if right and not rigid:
+        return []
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
     x, size, spread = seeker.posed(scene.pose.vertices), seeker.size, np.full(6, np.inf)
     if information is not None:
@@ -86,8 +90,7 @@ def region_starts(
         J = np.block([[R, R @ arm], [np.zeros((3, 3)), R]])
         spread = np.sqrt(np.diag(J @ inverse(information)[:6, :6] @ J.T))
     rough = rigid and (spread[:3].max() > s.far * size or spread[3:].max() > s.turn)
-    agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
-    if not rough and agreeing >= s.poor * (agreeing + contrary):
+    if right and not rough:
         return []
     x = x @ R.T + t
     if x[:, 2].min() < NEAR:

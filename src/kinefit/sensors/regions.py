@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
-from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -35,10 +34,9 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
-# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
-# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes.
-_FIRST, _OFTEN = 10, 0.05
 _CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
+# Images, and then [s], after which colours of a body of parts are learnt; of people, whose clothes fold, of every one.
+_FIRST, _OFTEN = 10, 0.05
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -76,6 +74,7 @@ class RegionSensor(Sensor):
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
         self._starts: Starts | None = None
+        self._known = False  # whether colours were counted where the body was found
         self._learnt = -np.inf  # [s] when colours were blended in last
 
     def parts(self, scene: Scene) -> Parts:
@@ -106,8 +105,9 @@ class RegionSensor(Sensor):
         m = RegionMeasurement(self, frame, scene)
         if not self._stated:
             self._stated = True
-            if scene.body.skin is not None or any(isinstance(s, TaperedCylinder) for s in scene.body.surfaces):
+            if self.parts(scene).simple:
                 self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
+        m.first = not self._known
         if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
@@ -118,7 +118,11 @@ class RegionSensor(Sensor):
         """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
         if not isinstance(measurement, RegionMeasurement):
             return
-        told = measurement.evidence(scene)
+        if measurement.waits(scene):
+            self.colours, self._known = RegionColours.none(self.count, self.regions), sure
+            self._know(measurement, scene)
+            return
+        self._known, told = True, measurement.evidence(scene)
         parts, wrong = self.parts(scene), told.lost | told.hidden
         seen = float((told.agreeing + told.contrary).sum())
         if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
@@ -128,7 +132,8 @@ class RegionSensor(Sensor):
             return
         off = 2.0 * measurement.off(scene)
         self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        if parts.count == 1 or self.colours.images < _FIRST or abs(measurement.time - self._learnt) > _OFTEN:
+        often = parts.count == 1 or parts.simple or self.colours.images < _FIRST
+        if often or abs(measurement.time - self._learnt) > _OFTEN:
             self._know(measurement, scene, wrong)
             self._learnt = measurement.time
 
@@ -150,6 +155,7 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
+    first : whether its colours are those at the state at which the body was only expected
     clear : share of the outline's lines that tell anything at the state that was judged last
     """
 
@@ -165,12 +171,16 @@ class RegionMeasurement(Measurement):
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self._lines: Lines | None = None
-        self._told: tuple[Rim, Evidence] | None = None
+        self._told: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
         self._judged: BodyState | None = None
-        self.clear = 0.0
+        self.clear, self.first = 0.0, False
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+
+    def waits(self, scene: Scene) -> bool:
+        """Whether it tells nothing yet: no colours are known, and depth shows where the body is."""
+        return self.first and any(m.depth_image() is not None for m in scene.measurements)
 
     def pixels_per_metre(self, scene: Scene) -> float:
         """[px/m] at the body's distance."""
@@ -251,6 +261,8 @@ class RegionMeasurement(Measurement):
         # Errors are alike along a piece of the contour, of which several lines tell.
         share = min(self._spacing / self._drawn(scene).scale / s.alike, 1.0)
         weight = np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
+        if self.waits(scene):
+            return RegionMatched(self, rim, place, 0.0 * weight, geman_mcclure(s.loss), None, told[0], told[1])
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
         spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
@@ -262,7 +274,8 @@ class RegionMeasurement(Measurement):
         """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
         of, s, none = self.of, self.of.regions, np.zeros(0)
         parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
-        if parts.count == 1 or seen is None or self.image is None or not scene.surface.morphing.is_rigid:
+        known = parts.count > 1 and not parts.simple and scene.surface.morphing.is_rigid
+        if not known or seen is None or self.image is None:
             return None, none, none
         drawn = self._drawn(scene)
         seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
@@ -277,7 +290,7 @@ class RegionMeasurement(Measurement):
         Of a body of parts that nothing else was measured of, also where its limbs may be.
         """
         of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
-        if self.image is None or seen is None or not of.settings.search:
+        if self.image is None or seen is None or not of.settings.search or self.waits(scene):
             return ()
         whole = of.starts(scene).whole(scene, camera, seen, information, told)
         if whole or information is None or found is None or not self._alone(scene):
@@ -306,10 +319,13 @@ class RegionMeasurement(Measurement):
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
-        rim, areas = self.rim(scene), scene.surface.areas
+        if self.waits(scene):
+            return Evidence.none(len(scene.body.tree.segments))
         self._judged = scene.state
-        if self._told is not None and self._told[0] is rim:
+        about = scene.state, scene.body, scene.placed(self.of.camera)
+        if self._told is not None and all(a is b for a, b in zip(self._told[0], about)):
             return self._told[1]
+        rim, areas = self.rim(scene), scene.surface.areas
         told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
         step = max(_JUDGED, math.ceil(_ROOM * agrees / self.of.regions.half))
         kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, told)
@@ -319,7 +335,7 @@ class RegionMeasurement(Measurement):
         spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
         out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self._told, self.clear = (rim, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
+        self._told, self.clear = (about, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
         return out
 
     def compact(self) -> RegionMeasurement:
