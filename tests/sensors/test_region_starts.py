@@ -7,6 +7,8 @@ from tests.sensors.region_arm import CAMERA, RIG, arm, frame, state
 
 from kinefit.bodies import PointSet
 from kinefit.frame.trust import leapt
+from kinefit.observations import DepthFrame
+from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_limbs import Limbs
@@ -143,3 +145,17 @@ def test_an_arm_that_waves_is_followed_and_a_wrong_start_is_found():
     for k in range(8, 20):
         found = tracker.update([frame(truth(8), k / 30, seed=k)])
     assert np.abs(found.state.angles - truth(8).angles).max() < 0.12 and not found.lost.any()
+
+
+def test_beside_depth_colours_are_learnt_where_depth_found_the_body():
+    """A start that is off by half a radian gives no part the wall's colours, as depth says where it is first."""
+    drawn = render_body(arm(), TRUTH, CAMERA).depth.astype(np.float32)
+    depth = np.where(np.isfinite(drawn), drawn, np.float32(2.0))
+    tracker = Tracker(arm(), RIG, rate=30.0, accuracy={"region cam": 0.3, "cam": 0.003})
+    tracker.start_at(state(-0.1, 0.1, -0.5))
+    silent = tracker.update([DepthFrame("cam", 0.0, depth), frame(TRUTH)])
+    assert not any((m.weight > 0).any() for m in silent.matched if m.sensor == "region cam")
+    for k in range(1, 6):
+        found = tracker.update([DepthFrame("cam", k / 30, depth), frame(TRUTH, k / 30, seed=k)])
+    assert any((m.weight > 0).any() for m in found.matched if m.sensor == "region cam")
+    assert np.abs(found.state.angles - TRUTH.angles).max() < 0.1 and not found.lost.any()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.people import Person, people_of
+from kinefit.multiview.people import Person, may_be_several, people_of
 from kinefit.observations import Keypoints
 from kinefit.observations.person import FORMS, PersonChoice
 
@@ -65,9 +65,7 @@ def follow(rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = 
         A number that is more than there are people.
     """
     wanted = PersonChoice.of(person)
-    several = any(k.points.shape[1] > 1 and (k.confidence.max(axis=2) > 0).sum(axis=1).max(initial=0) > 1
-                  for k in keypoints)  # fmt: skip
-    people = tuple(people_of(rig, keypoints)) if several else ()
+    people = tuple(people_of(rig, keypoints)) if may_be_several(keypoints) else ()
     if wanted.way == "number" and wanted.number > max(len(people), 1):
         there = f"{len(people)} people are" if len(people) > 1 else "one person is"
         raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")

@@ -55,6 +55,23 @@ def views_needed(cameras: int) -> int:
     return 3 if cameras > 3 else min(cameras, 2)
 
 
+def may_be_several(keypoints: Sequence[Keypoints]) -> bool:
+    """Whether records have enough detections, for long enough, for two people to be in view."""
+    frames = min((len(k) for k in keypoints), default=0)
+    of_camera: dict[str, NDArray] = {}
+    for k in keypoints:
+        count = (surety_of(k, frames) > 0).sum(axis=1)
+        of_camera[k.camera] = np.maximum(of_camera.get(k.camera, 0), count)
+    two = np.sum([np.minimum(count, 2) for count in of_camera.values()], axis=0)
+    enough = two >= 2 * views_needed(len(of_camera))
+    return bool(frames) and np.sum(enough) >= _lasting(keypoints[0].rate, frames)
+
+
+def _lasting(rate: float, frames: int) -> float:
+    """For how many frames somebody must be seen to be a person."""
+    return min(_LASTING * rate, 0.5 * frames)
+
+
 def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
     """Everybody whom enough cameras see for a second, the one of whom most is seen first.
 
@@ -73,8 +90,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
         search.forward(f)
     for f in reversed(range(search.frames)):
         search.backward(f)
-    needed = views_needed(len({keypoints[q].camera for q in main}))
-    lasting = min(_LASTING * keypoints[0].rate, 0.5 * search.frames)
+    needed, lasting = search.needed, _lasting(keypoints[0].rate, search.frames)
     people = []
     for track in search.tracks:
         views = np.zeros(search.frames, int)

@@ -34,11 +34,9 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
 _LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
-# A body of parts is large in the image, and its light changes no faster than it moves: of these first images, and then
-# after so many seconds, colours are learnt. Of every image they cost a tenth of a frame's time, and no figure changes;
-# of people every image is: after a jump of light quality is 0.77 to 0.82 in half a second, else 0.73.
-_FIRST, _OFTEN = 10, 0.05
 _CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
+# Images, and then [s], after which colours of a body of parts are learnt; of people, whose clothes fold, of every one.
+_FIRST, _OFTEN = 10, 0.05
 _WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
 _FEW = 16  # one vertex in so many tells how far a body has moved
 _GAIN = 20.0  # logarithms by which a mirrored limb must explain the image better
@@ -76,6 +74,7 @@ class RegionSensor(Sensor):
         self.reach = _WIDE  # [px] how far from where it is expected the contour may be
         self._parts: Parts | None = None
         self._starts: Starts | None = None
+        self._known = False  # whether colours were counted where the body was found
         self._learnt = -np.inf  # [s] when colours were blended in last
 
     def parts(self, scene: Scene) -> Parts:
@@ -108,6 +107,7 @@ class RegionSensor(Sensor):
             self._stated = True
             if self.parts(scene).simple:
                 self.sigma = max(self.sigma, self.settings.shape * m.pixels_per_metre(scene))
+        m.first = not self._known
         if not self.colours.images:
             self._know(m, scene)
         assert self.ratios is not None
@@ -118,7 +118,11 @@ class RegionSensor(Sensor):
         """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
         if not isinstance(measurement, RegionMeasurement):
             return
-        told = measurement.evidence(scene)
+        if measurement.waits(scene):
+            self.colours, self._known = RegionColours.none(self.count, self.regions), sure
+            self._know(measurement, scene)
+            return
+        self._known, told = True, measurement.evidence(scene)
         parts, wrong = self.parts(scene), told.lost | told.hidden
         seen = float((told.agreeing + told.contrary).sum())
         if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
@@ -151,6 +155,7 @@ class RegionMeasurement(Measurement):
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
     seen : Coloured, what lines look at
+    first : whether its colours are those at the state at which the body was only expected
     clear : share of the outline's lines that tell anything at the state that was judged last
     """
 
@@ -168,10 +173,14 @@ class RegionMeasurement(Measurement):
         self._lines: Lines | None = None
         self._told: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
         self._judged: BodyState | None = None
-        self.clear = 0.0
+        self.clear, self.first = 0.0, False
 
     def _few(self, scene: Scene) -> NDArray:
         return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+
+    def waits(self, scene: Scene) -> bool:
+        """Whether it tells nothing yet: no colours are known, and depth shows where the body is."""
+        return self.first and any(m.depth_image() is not None for m in scene.measurements)
 
     def pixels_per_metre(self, scene: Scene) -> float:
         """[px/m] at the body's distance."""
@@ -253,6 +262,8 @@ class RegionMeasurement(Measurement):
         # Errors are alike along a piece of the contour, of which several lines tell.
         share = min(self._spacing / self._drawn(scene).scale / s.alike, 1.0)
         weight = np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
+        if self.waits(scene):
+            return RegionMatched(self, rim, place, 0.0 * weight, geman_mcclure(s.loss), None, told[0], told[1])
         # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
         off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
         spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
@@ -280,7 +291,7 @@ class RegionMeasurement(Measurement):
         Of a body of parts that nothing else was measured of, also where its limbs may be.
         """
         of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
-        if self.image is None or seen is None or not of.settings.search:
+        if self.image is None or seen is None or not of.settings.search or self.waits(scene):
             return ()
         whole = of.starts(scene).whole(scene, camera, seen, information, told)
         if whole or information is None or found is None or not self._alone(scene):
@@ -309,6 +320,8 @@ class RegionMeasurement(Measurement):
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""
+        if self.waits(scene):
+            return Evidence.none(len(scene.body.tree.segments))
         self._judged = scene.state
         about = scene.state, scene.body, scene.placed(self.of.camera)
         if self._told is not None and all(a is b for a, b in zip(self._told[0], about)):
