@@ -12,7 +12,7 @@ from kinefit.bodies import Body
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, TaperedCylinder
 from kinefit.correspondences.rims import Rim
 
-AROUND = -1  # label of what is around the body
+AROUND, OTHER = -1, -2  # labels of what is around the body, and of what is neither that nor the body
 _BESIDE = 1.0  # [px] of the drawing from a contour to what is beyond it
 
 

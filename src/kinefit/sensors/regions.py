@@ -27,7 +27,7 @@ from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_image import Coloured, kept
 from kinefit.sensors.region_matched import RegionMatched
-from kinefit.sensors.region_parts import Drawn, Lines, Parts
+from kinefit.sensors.region_parts import OTHER, Drawn, Lines, Parts
 from kinefit.sensors.region_seams import SPACING, Seams
 from kinefit.sensors.region_starts import Starts
 from kinefit.sensors.scene import Scene
@@ -230,6 +230,9 @@ class RegionMeasurement(Measurement):
         low, high = rim.outline[:2].min(axis=1), rim.outline[:2].max(axis=1)
         margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
         box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
+        if wrong is not None and wrong.any():
+            faces = scene.surface.rims(scene.placed(of.camera)).face_segment
+            drawn = drawn._replace(label=np.where(wrong[faces], OTHER, drawn.label))
         inside, outside = np.zeros((parts.count, of.count)), np.zeros((2, of.count))
         kernels.count(image, of.bins, *drawn[:5], box, inside, *outside)
 
@@ -237,8 +240,6 @@ class RegionMeasurement(Measurement):
             at = parts.lines(rim, drawn)
             kernels.count_lines(image, of.bins, at.outline, at.anchor, s.half, *drawn, at.own, weight, into)
 
-        if wrong is not None:
-            inside[parts.group[wrong]] = 0.0
         return before.blended(inside, outside, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
