@@ -124,9 +124,9 @@ class RegionSensor(Sensor):
             return
         self._known, told = True, measurement.evidence(scene)
         parts, wrong = self.parts(scene), told.lost | told.hidden
-        seen = float((told.agreeing + told.contrary).sum())
         if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
-            sure = float(told.agreeing.sum()) > _LEARNT * seen and measurement.clear > _CLEAR
+            share = float(told.agreeing.sum()) / max(float((told.agreeing + told.contrary).sum()), 1e-9)
+            sure = share > _LEARNT and measurement.clear > _CLEAR
         if not sure or told.hidden.all():
             self.reach = _WIDE
             return
@@ -231,8 +231,7 @@ class RegionMeasurement(Measurement):
         margin = 0.25 * (high - low).sum() + 8.0  # about as wide as half the body
         box, drawn = np.concatenate([low - margin, high + margin]).astype(np.int64), self._drawn(scene)
         if wrong is not None and wrong.any():
-            faces = scene.surface.rims(scene.placed(of.camera)).face_segment
-            drawn = drawn._replace(label=np.where(wrong[faces], OTHER, drawn.label))
+            drawn = drawn._replace(label=np.where(wrong[scene.surface.morphing.mesh.face_segment], OTHER, drawn.label))
         inside, outside = np.zeros((parts.count, of.count)), np.zeros((2, of.count))
         kernels.count(image, of.bins, *drawn[:5], box, inside, *outside)
 
