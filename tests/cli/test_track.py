@@ -384,4 +384,4 @@ def test_the_session_of_a_take_heads_its_report(take, tmp_path):
     assert kinefit.read_motion(tmp_path / "out" / "motion.npz").provenance["session"]["side"] == "left"
     take.write_text(f"{text}\n[session]\nside = 'port'\n")
     told = run("track", take, "--out", tmp_path / "bad")
-    assert told.exit_code == 2 and "session.side" in told.stderr and "'left'" in told.stderr
+    assert told.exit_code == 2 and "[session] side" in told.stderr and "'left'" in told.stderr
