@@ -114,8 +114,10 @@ class FrameFit:
                 free = None if held is None else leapt(*held, state)
                 other = self._fitted(scene.at(state), released_from(held, free), measurements)
                 also = evidence_of(other.scene, other.matched)
-                gain = sum(e.balance for e in also) - sum(e.balance for e in told)
-                if gain > 0.0 if (better := m.better(other.scene, found.scene)) is None else better:
+                better = m.better(other.scene, found.scene)
+                if better is None:
+                    better = sum(e.balance for e in also) > sum(e.balance for e in told)
+                if better:
                     found, told, released = other, also, free
         return replace(self._judged(found, released_from(held, released), told, known), released=released)
 
