@@ -161,9 +161,9 @@ class _Search:
             uv = k.points[: self.frames, :, some]
             self.uv.append(np.where((k.confidence[: self.frames, :, some] > 0.1)[..., None], uv, np.nan))
 
-    def free(self, frame: int, tracks: Sequence[_Track]) -> list[Node]:
+    def free(self, frame: int) -> list[Node]:
         """Detections of a frame that nobody has, the surest first."""
-        taken = {node for track in tracks for node in track.nodes.get(frame, ())}
+        taken = {node for track in self.tracks for node in track.nodes.get(frame, ())}
         ranked = [(float(s[frame, p]), q, int(p)) for q, s in enumerate(self.surety) for p in np.flatnonzero(s[frame])]
         return [(q, p) for _, q, p in sorted(ranked, reverse=True) if (q, p) not in taken]
 
@@ -190,7 +190,7 @@ class _Search:
 
         Two people of like height fit each other in two views: the most views go first, then those that fit best.
         """
-        free = self.free(frame, self.tracks)
+        free = self.free(frame)
         if len(free) < self.needed:
             return []
         full = len(self.keypoints) * len(self.keypoints[0].names)
@@ -215,7 +215,7 @@ class _Search:
 
     def _go_on(self, frame: int, tracks: Sequence[_Track]) -> None:
         """Pair people with detections, camera by camera."""
-        free, views = self.free(frame, self.tracks), [list[Node]() for _ in tracks]
+        free, views = self.free(frame), [list[Node]() for _ in tracks]
         expected = [t.expected(frame) for t in tracks]
         for q in range(len(self.cameras)):
             mine = [p for r, p in free if r == q]
