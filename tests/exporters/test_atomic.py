@@ -1,7 +1,7 @@
 """Files come whole or not at all, whatever goes wrong."""
 
-import gc
 import errno
+import gc
 import os
 
 import av
