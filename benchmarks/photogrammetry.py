@@ -12,6 +12,7 @@ PARTS = {
     "surface_body": "a drawn textured arm through `kinefit surface` and `kinefit track`",
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",
+    "retarget": "recorded motions on other characters, in the Khronos validator",
 }
 
 if __name__ == "__main__":
