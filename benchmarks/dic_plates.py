@@ -77,8 +77,9 @@ def _compare(place: Path, case: str, window: int, kind: str, told: dict) -> None
     error = [float(np.sqrt(np.mean(d**2))) for d in off]
     noise = [float(np.sqrt(np.mean(d.var(axis=0)))) for d in off]
     rate, theirs_rate = len(ours) / min(spent), told[key]["points"] / told[key]["seconds"]
-    print(f"# {label}, kinefit / pyvale: {len(both)} points of {len(ours)} / {len(theirs)}; {rate:.0f} / {theirs_rate:.0f} "
-          f"points/s; error {error[0]:.6f} / {error[1]:.6f}, noise {noise[0]:.6f} / {noise[1]:.6f} {unit}")  # fmt: skip
+    print(f"# {label}, kinefit / pyvale: {len(both)} points of {len(ours)} / {len(theirs)}; "
+          f"{rate:.0f} / {theirs_rate:.0f} points/s; "
+          f"error {error[0]:.6f} / {error[1]:.6f}, noise {noise[0]:.6f} / {noise[1]:.6f} {unit}")  # fmt: skip
     figure(f"plate_{label}_error_against_pyvale", error[0] / error[1], "x", "<= 1.02")
     figure(f"plate_{label}_noise_against_pyvale", noise[0] / noise[1], "x", "<= 1.02")
     figure(f"plate_{label}_times_faster_than_pyvale", rate / theirs_rate, "x", ">= 5")

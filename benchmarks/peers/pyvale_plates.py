@@ -1,10 +1,10 @@
 """pyvale on its own example pictures, drawn here by its renderer, with the truth: a rigid plate, a plate with a hole.
 
 Run by `benchmarks.peers.environments` as `python -m benchmarks.peers.pyvale_plates FOLDER` with a Python that has
-pyvale. FOLDER holds ``plates.json``: windows, step, margin, repeats, and of each case its frame. Each case gets a folder
-with its pictures, ``truth.npz`` (nodes (N, 2) [px] of the first camera, how they move (N, 3) [mm] along its axes) and
-for each window ``mono_WINDOW.npz`` and ``stereo_WINDOW.npz``: points (N, 2) [px] and shift (N, 2) [px] or (N, 3) [mm].
-Time is the processor's, of the whole call, least of several.
+pyvale. FOLDER holds ``plates.json``: windows, step, margin, repeats, and of each case its frame. Each case gets a
+folder with its pictures, ``truth.npz`` (nodes (N, 2) [px] of the first camera, how they move (N, 3) [mm] along its
+axes) and for each window ``mono_WINDOW.npz`` and ``stereo_WINDOW.npz``: points (N, 2) [px] and shift (N, 2) [px] or
+(N, 3) [mm]. Time is the processor's, of the whole call, least of several.
 
 The lengths of the calibration that comes with the pictures are a tenth of those by which they are drawn, and motion is
 counted from the deformed state back: both are put right here.
