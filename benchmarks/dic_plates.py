@@ -86,7 +86,7 @@ def _compare(place: Path, case: str, window: int, kind: str, told: dict) -> None
 
 
 def _grid(window: int) -> Grid:
-    return Grid.of(SIZE, STEP, margin=MARGIN)
+    return Grid.of(SIZE, STEP, margin=MARGIN + window // 2)
 
 
 def _mono(images: list, window: int) -> tuple[NDArray, NDArray]:

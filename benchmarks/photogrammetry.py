@@ -13,6 +13,7 @@ PARTS = {
     "surface_body": "a drawn textured arm through `kinefit surface` and `kinefit track`",
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",
+    "clicked": "poses from joints clicked in three images",
     "retarget": "recorded motions on other characters, in the Khronos validator",
 }
 
