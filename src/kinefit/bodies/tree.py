@@ -7,7 +7,7 @@ The degrees of freedom of a body are the root's twist (v, ω) in the world about
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -185,7 +185,10 @@ class KinematicTree:
 
     def with_offsets(self, offsets: NDArray) -> KinematicTree:
         """The same tree with other joint centres, (S, 3) [m]."""
-        return replace(self, offsets=offsets)
+        out = object.__new__(KinematicTree)  # what does not depend on them is not made again
+        out.__dict__.update(self.__dict__, offsets=_frozen(offsets))
+        out.__dict__.pop("rest", None)
+        return out
 
     def forward(self, T_world_root: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
         """Frames (S, 12) and screws (D, 6) of one pose; see `_kernels.forward`."""
