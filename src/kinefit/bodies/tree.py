@@ -94,6 +94,13 @@ class KinematicTree:
         """(D, D) inverse covariance of the posture prior, a Gaussian about `usual`; zero where there is no prior."""
         return _frozen(np.diag(np.square(1.0 / self.spread)) + self.couplings.T @ self.couplings)
 
+    @cached_property
+    def held_by_posture(self) -> tuple[NDArray, NDArray]:
+        """(H,) coordinates with a posture prior, and their (H, H) inverse covariance; (H,) where none are coupled."""
+        held = np.flatnonzero(np.isfinite(self.spread))
+        precision = self.posture_precision[np.ix_(held, held)]
+        return _frozen(held, np.int64), _frozen(precision if self.coupled else np.diag(precision))
+
     def posture_cost(self, angles: NDArray, share: float = 1.0) -> float:
         """A share of the posture prior's cost of angles (D,)."""
         away = angles - self.usual

@@ -10,6 +10,7 @@ import weakref
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import IO, Any, Generic, TypeVar, overload
 
@@ -41,6 +42,14 @@ _PLAIN = {
 def stretches(frames: int) -> list[slice]:
     """Of a take, so long that what is computed of all channels in one stays small."""
     return [slice(start, min(start + STRETCH, frames)) for start in range(0, max(frames, 1), STRETCH)]
+
+
+@cache
+def _written(kind: type) -> bool:
+    """Whether things of a type go into the file."""
+    if kind in _PLAIN or issubclass(kind, np.generic | np.dtype):
+        return True
+    return kind.__module__.startswith("kinefit.") and not issubclass(kind, _OF_ALL_FRAMES)
 
 
 class Spool(Sequence[T], Generic[T]):
@@ -204,10 +213,7 @@ class _Store:
 
     def _number(self, thing: Any) -> int | None:
         """Of what is kept as it is; None for what is written."""
-        kind = type(thing)
-        if kind in _PLAIN or issubclass(kind, np.generic | np.dtype):
-            return None
-        if kind.__module__.startswith("kinefit.") and not issubclass(kind, _OF_ALL_FRAMES):
+        if _written(type(thing)):
             return None
         number = self._numbers.get(id(thing))
         if number is None:

@@ -109,9 +109,10 @@ def normal_equations(
         _kernels_linear.unpack(C, chain, depth, H)
         for p in joint:
             pull = p.weight @ p.residual
-            if len(p) == n and (np.diff(p.index) == 1).all():
-                H += p.weight
-                g += pull
+            if len(p) and (p.index[1:] - p.index[:-1] == 1).all():
+                own = slice(int(p.index[0]), int(p.index[-1]) + 1)
+                H[own, own] += p.weight
+                g[own] += pull
             else:
                 H[np.ix_(p.index, p.index)] += p.weight
                 g[p.index] += pull

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
@@ -103,6 +104,7 @@ def _fitted(
     would move cameras: their calibration counts for more by the excess of the round before.
     """
     spread, excess_of, start, gear = _SHIFT, 1.0, None, Gear(body)
+    bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     for k in range(_ROUNDS):
         parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
@@ -118,7 +120,7 @@ def _fitted(
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            body, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
+            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
         )
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
@@ -129,6 +131,8 @@ def _fitted(
         told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
         excess_of = max(excess_of, 1.0)
+    prior_world = World(body, channels.rig)
+    found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
     return found, wider[:, None] * covariance * wider
 
