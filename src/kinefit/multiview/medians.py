@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.geometry.camera import Camera
 from kinefit.multiview import _kernels_medians
 
 
@@ -14,3 +15,14 @@ def medians(values: NDArray) -> NDArray:
     out = np.empty(len(rows))
     _kernels_medians.medians(rows, np.empty(rows.shape[1]), out)
     return out.reshape(values.shape[:-1])
+
+
+def distances(camera: Camera, x_world: NDArray, uv: NDArray) -> NDArray:
+    """(T, P) median distance of people (T, k, 3) [m] from detections (P, k, 2) [px] in a camera, over their heights.
+
+    Infinite where fewer than three points are finite in both.
+    """
+    x, seen = np.ascontiguousarray(x_world, float), np.ascontiguousarray(uv, float)
+    out = np.empty((len(x), len(seen)))
+    _kernels_medians.distances(camera.packed, x, seen, out)
+    return out

@@ -17,7 +17,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
 from kinefit.multiview.boxes import same_people
-from kinefit.multiview.medians import medians
+from kinefit.multiview.medians import distances, medians
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
 
@@ -222,7 +222,7 @@ class _Search:
             mine = [p for r, p in free if r == q]
             if not mine or not tracks:
                 continue
-            cost = np.array([[self._off(x, frame, (q, p)) for p in mine] for x in expected])
+            cost = distances(self.cameras[q], np.array(expected), self.uv[q][frame, mine])
             waited = np.array([abs(frame - t.last) for t in tracks])
             near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)
             cost[cost > near[:, None]] = np.inf
@@ -235,13 +235,7 @@ class _Search:
 
     def _off(self, x: NDArray, frame: int, node: Node) -> float:
         """How far a detection is from points (k, 3), as a share of its height."""
-        uv = self.uv[node[0]][frame, node[1]]
-        both = np.isfinite(uv).all(axis=1) & np.isfinite(x).all(axis=1)
-        if both.sum() < 3:
-            return np.inf
-        away = np.linalg.norm(self.cameras[node[0]].project(x[both]) - uv[both], axis=1)
-        median = float(np.median(np.where(np.isfinite(away), away, 1e6)))
-        return median / max(float(np.ptp(uv[both, 1])), 1.0)
+        return float(distances(self.cameras[node[0]], x[None], self.uv[node[0]][frame, node[1]][None])[0, 0])
 
     def _agreeing(self, frame: int, nodes: list[Node], expected: NDArray | None) -> tuple[list[Node], NDArray | None]:
         """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
