@@ -264,7 +264,7 @@ class _Search:
             self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes
         )]  # fmt: skip
         sure = sum(float(self.surety[q][f, p]) for f, nodes in track.nodes.items() for q, p in nodes)
-        place = medians(medians(np.moveaxis(list(track.path.values()), 1, 2)).T)
+        place = medians(medians(np.moveaxis(np.array(list(track.path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
         return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place)
 

@@ -86,7 +86,7 @@ def joint_columns(parents, frames, offsets, out):
 
 @jit
 def point_columns(data, segment, group, frames, joints, places, out):
-    """out (N, q): how far points of rows move, whitened: with their joints (S, 3, q), and in their segments (M, 3, q)."""
+    """out (N, q): how far points of rows move, whitened: with joints (S, 3, q), and in their segments (M, 3, q)."""
     for i in range(segment.size):
         f, joint, place, row = frames[segment[i]], joints[segment[i]], places[group[i]], out[i]
         w = math.sqrt(data[7, i])

@@ -64,10 +64,11 @@ def fit_subject(
         progress("bone lengths", 0, 1)
     x = triangulated(channels, chosen)
     scales = first_scales(body, channels.points, x, height=height) if trial is None else trial.scales
-    sized = channels.with_points(body.scaled(scales))
+    near = body.scaled(scales)
+    sized = channels.with_points(near)
     states: dict[int, BodyState] = {}
     for i, f in enumerate(chosen):
-        state = _pose(body.scaled(scales), sized, x[i], next(reversed(states.values()), None))
+        state = _pose(near, sized, x[i], next(reversed(states.values()), None))
         if state is not None:
             states[int(f)] = state
         if progress:
@@ -77,7 +78,7 @@ def fit_subject(
             "no frame shows enough of the person in two cameras to start from",
             remedy="Check the calibration and that the cameras are in step (kinefit track -v).",
         )
-    weight = _weights(body.scaled(scales), sized, states)
+    weight = _weights(near, sized, states)
     sensor, layout = KeypointSensor(channels.rig, {}, 0.0, geman_mcclure(), joint.REACH[0]), Layout(channels, body)
     variance = np.square(channels.sigma)
     steps = [[KeypointMeasurement(sensor, layout, channels.uv[f], w * variance, 0.0)] for f, w in zip(states, weight)]

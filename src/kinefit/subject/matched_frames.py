@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,12 +84,14 @@ class Worlds:
     def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
         """How points move with some parameters, all of which move nothing else; by differences where not told."""
         chain = self._chain(theta)
-        made = [
+        moving = [
             (one, own, after.body) for (one, own), before, after in zip(self._applied, [self._first, *chain], chain)
             if after.body is not before.body
         ]  # fmt: skip
-        if all(hasattr(one, "slopes") for one, _, _ in made):
-            return PointMoves.told(chain[-1].body, [(one.slopes, theta[own], own, body) for one, own, body in made], some, len(theta))
+        slopes: list[Any] = [getattr(one, "slopes", None) for one, _, _ in moving]
+        if all(slopes):
+            made = [(tell, theta[own], own, body) for tell, (_, own, body) in zip(slopes, moving)]
+            return PointMoves.told(chain[-1].body, made, some, len(theta))
         worlds = self
         others = [one for one, _ in self._parameters if not isinstance(one, CameraExtrinsics)]
         if all(getattr(one, "of_points", False) for one in others):  # surfaces would be stretched for nothing

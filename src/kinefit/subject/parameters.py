@@ -47,10 +47,10 @@ class Parameters(Protocol):
     """One kind of parameters: names, a prior, and a function from values to a world.
 
     It may have `of_points`, True where the values move nothing but points and joints of the body: derivatives of rows
-    of points then take no rows of other worlds. They take no other bodies either where it has `slopes(values, own, name,
-    segment, points, out)`: of points (K, 3) of a set by name, or of joints for None, on segments (K,), where its body has
-    them, it carries derivatives out (K, 3, p) by all parameters before it on, and adds its own in columns `own`. It may
-    have `touches`, of each parameter the segments on which alone rows can feel it.
+    of points then take no rows of other worlds. They take no other bodies either where it has `slopes(values, own,
+    name, segment, points, out)`: of points (K, 3) of a set by name, or of joints for None, on segments (K,), where its
+    body has them, it carries derivatives out (K, 3, p) by all parameters before it on, and adds its own in columns
+    `own`. It may have `touches`, of each parameter the segments on which alone rows can feel it.
     """
 
     @property

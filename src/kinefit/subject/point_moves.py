@@ -55,8 +55,10 @@ class PointMoves:
                 tell(values, own, name, segment, points(there), out)
             return out[:, :, some]
 
-        joints = slopes(None, np.maximum(body.tree.parents, 0), lambda b: b.tree.offsets)
-        return cls(body, joints, lambda name: slopes(name, _points(body, name).segments, lambda b: _points(b, name).points))
+        def of_set(name: str) -> NDArray:
+            return slopes(name, _points(body, name).segments, lambda b: _points(b, name).points)
+
+        return cls(body, slopes(None, np.maximum(body.tree.parents, 0), lambda b: b.tree.offsets), of_set)
 
     @classmethod
     def between(
