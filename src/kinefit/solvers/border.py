@@ -32,7 +32,7 @@ from kinefit.solvers.border_frames import (
 )
 from kinefit.solvers.equations import lock
 
-_FIRST = 1e-4  # damping to begin with, as a share of the poses' mean diagonal
+_FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
 _LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
