@@ -18,7 +18,8 @@ import zlib
 from pathlib import Path
 
 from benchmarks.fuzz_mutations import mutated
-from benchmarks.fuzz_seeds import Seed, seed_of
+from benchmarks.fuzz_readers import seed_of
+from benchmarks.fuzz_seeds import Seed
 
 _KEPT = 200  # [MB]
 LONGEST = 600

@@ -55,16 +55,16 @@ def _text(name_or_file: str | Path) -> tuple[str, str]:
     if path.suffix == ".toml":
         try:
             return path.read_text(encoding="utf-8"), str(path)
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, ValueError) as error:
             remedy = "Give the path of a text file (UTF-8) in TOML."
             raise BodyError(f"cannot read the body file ({error})", file=path, remedy=remedy) from error
     else:
-        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
-        if not entry.is_file():
+        if str(name_or_file) not in catalogue():
             raise BodyError(
                 choices("body in the catalogue named", str(name_or_file), catalogue()),
                 remedy="A body file of your own is given by its path, ending in .toml.",
             )
+        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
         return entry.read_text(encoding="utf-8"), f"catalogue body {name_or_file}"
 
 
