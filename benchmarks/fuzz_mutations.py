@@ -59,16 +59,17 @@ def _inside(data: bytes, rng: np.random.Generator) -> bytes:
 _TABLE = re.compile(rb"(?m)^\[\[?[\w.]+\]\]?[ \t]*$")
 _LINE = re.compile(rb"(?m)^[ \t]*[\w.\"]+[ \t]*=[ \t]*(.*)$")
 _VALUES = (
-    "0", "-1", "1", "2", "0.5", "-0.0", "1e-320", "1e-9", "1e9", "1e308", "-1e308", "9223372036854775807", "nan", "inf",
-    "-inf", "true", '""', '"text"', '"1"', '"."', '"/"', '"../.."', '"*"', '"[\\u0000"', '"\u00e4\u4eba"', '"m"', '"x"',
-    '"%s"' % ("a" * 5000), "[]", "[[]]", "[0]", "[0, 0]", "[1, 0]", "[0, 0, 0]", "[0, 0, 0, 0]", "[1e308, 1e308, 1e308]",
-    "[1, 1, 1e-300]", '["a", "a"]', "{}", "[%s]" % ", ".join(["1"] * 3000), "[[1, 2], [3]]",
+    "0", "-1", "1", "2", "0.5", "-0.0", "1e-320", "1e-9", "1e9", "1e308", "-1e308", "9223372036854775807", "nan",
+    "inf", "-inf", "true", '""', '"text"', '"1"', '"."', '"/"', '"../.."', '"*"', '"a**"', '"[\\u0000"',
+    '"\u00e4\u4eba"', '"m"', '"x"', '"%s"' % ("a" * 5000), '"%s"' % ("a/" * 3000), "[]", "[[]]", "[0]", "[0, 0]",
+    "[1, 0]", "[0, 0, 0]", "[0, 0, 0, 0]", "[1e308, 1e308, 1e308]", "[1, 1, 1e-300]", '["a", "a"]', "{}",
+    "[%s]" % ", ".join(["1"] * 3000), "[[1, 2], [3]]",
 )  # fmt: skip
 """Values that TOML has, and JSON but for a few: what follows them is read."""
 
 
 def _entry(data: bytes, rng: np.random.Generator) -> bytes:
-    """A TOML file that still is one: a value of its own replaced, by another line's too, or a line left out or twice."""
+    """A TOML file that still is one: a value replaced, by another line's too, or a line left out or twice."""
     lines = list(_LINE.finditer(data[:200_000]))
     if not lines:
         return _once(data, rng)

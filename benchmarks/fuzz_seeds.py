@@ -481,7 +481,8 @@ FIRST: dict[str, Callable[[Path], Seed]] = {
     "pcd": _clouds("pcd"),
     "binary pcd": _clouds("binary pcd"), "packed pcd": _clouds("packed pcd"), "video mp4": _video("mpeg4", ".mp4"),
     "video avi": _video("mpeg4", ".avi"), "video webm": _video("libvpx", ".webm"), "images png": _images(".png"),
-    "images jpg": _images(".jpg"), "masks": _masks, "body toml": body_of("humanoid_morphing"), "arm toml": body_of("arm"),
+    "images jpg": _images(".jpg"), "masks": _masks, "body toml": body_of("humanoid_morphing"),
+    "arm toml": body_of("arm"),
     "body npz": _saved_body, "body mesh": _mesh_body, "marker set": _marker_set, "subject": _subject, "init": _folder,
 }  # fmt: skip
 """{reader: maker of its seed}."""

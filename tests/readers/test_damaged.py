@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import time
-import tomllib
 import zlib
 from pathlib import Path
 
@@ -19,15 +18,20 @@ from benchmarks.fuzz_readers import READERS, seed_of
 from benchmarks.fuzz_seeds import ASF
 from benchmarks.fuzz_worker import LONGEST
 
+from kinefit._files import parse_toml
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.cli._surface import read_seeds
 from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
+from kinefit.readers.depth.images import listed
+from kinefit.readers.guess.names import camera_number, natural
 from kinefit.readers.keypoints import read_caliscope_csv
 from kinefit.readers.skeletons.asf import read_asf
 from kinefit.readers.static_points import read_static_points
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.surface_points import read_surface_points
 from kinefit.readers.video import Video
 
 COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
@@ -67,7 +71,8 @@ def test_damage_is_the_same_in_every_run():
 @linux
 def test_a_reader_that_fails_is_counted(tmp_path):
     code = (
-        "import benchmarks.fuzz_readers as r, benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w, os, sys, numpy as np\n"
+        "import os, numpy as np\n"
+        "import benchmarks.fuzz_readers as r, benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w\n"
         "def make(folder):\n"
         "    (folder / 'a').write_bytes(b'1')\n"
         "    whole = [True]\n"
@@ -215,12 +220,57 @@ def test_a_table_of_seeds_that_is_none_is_told(tmp_path, text, told):
 def test_a_file_that_still_can_be_read_is_damaged_within():
     toml = b'[take]\nrate = 30.0\nname = "a"\n[[camera]]\nname = "b"\nsize = [64, 48]\n'
     tree = b'{"version": 1.3, "people": [{"points": [1, 2, 3]}]}'
-    for data, parse in ((toml, lambda text: tomllib.loads(text.decode())), (tree, json.loads)):
+    for data, parse in ((toml, lambda text: parse_toml(text.decode(), "a")), (tree, json.loads)):
         read = 0
         for i in range(100):
             damaged = mutated(data, [2, i])
             try:
                 read += parse(damaged) != parse(data)
-            except ValueError:
+            except (KinefitError, ValueError):
                 continue
         assert read > 20
+
+
+def test_times_of_a_surface_that_cannot_be_are_told(tmp_path):
+    head = "time_s,point,x,y,z,std_x,std_y,std_z\n"
+    odd = (((0, 1e-320), "apart"), ((0, 1e20), "apart"), ((1e308, 2e307), "apart"), ((1e12, 1e12 + 1), "from 1e"))
+    for times, told in odd:
+        rows = "".join(f"{time!r},1,0,0,1,0.1,0.1,0.1\n" for time in times)
+        (tmp_path / "a.csv").write_text(head + rows)
+        with pytest.raises(ObservationError, match=told):
+            read_surface_points(tmp_path / "a.csv")
+
+
+def test_a_camera_of_five_thousand_digits_has_a_number():
+    assert camera_number("cam" + "0" * 5000 + "12") == 12
+    assert natural("1\u00b22.png") > natural("1a.png")
+
+
+def test_a_video_that_claims_more_than_there_is_memory_for_is_told(tmp_path):
+    seed = seed_of("video mp4", tmp_path)
+    data = bytearray(seed.files[0].read_bytes())
+    at = data.index(b"stsz") + 12
+    data[at : at + 4] = bytes([0xFF, 0xFF, 0xFF, 0x0F])
+    seed.files[0].write_bytes(data)
+    with pytest.raises(FileError):
+        seed.read()
+
+
+@pytest.mark.parametrize(("name", "told"), [("a**.png", "no such file"), ("a/" * 3000, "too long"), ("[*", "no such")])
+def test_a_pattern_that_cannot_be_is_told(tmp_path, name, told):
+    entry = f'[[depth]]\nname = "d"\nfile = "{name}"\nintrinsics = [60.0, 60.0, 32.0, 24.0]\n'
+    (tmp_path / "take.toml").write_text(f"[take]\nrate = 30.0\n{entry}")
+    with pytest.raises(KinefitError, match=told):
+        read_take(tmp_path / "take.toml")
+
+
+def test_two_stars_are_one(tmp_path):
+    (tmp_path / "a1.png").touch()
+    assert listed(tmp_path / "a**.png") == [tmp_path / "a1.png"]
+
+
+@pytest.mark.parametrize("stature", ["nan", "inf", "-1.0"])
+def test_a_stature_that_is_none_is_told(tmp_path, stature):
+    (tmp_path / "a.toml").write_text(f'[body]\nname = "a"\nbase = "arm"\nstature = {stature}\n')
+    with pytest.raises(BodyError, match="a stature of"):
+        load_body(tmp_path / "a.toml")

@@ -89,7 +89,8 @@ class Metaballs(MeshSurface):
             k = int(np.argmin(np.minimum(r.min(axis=1), w)))
             problem = f"ball {k + 1} has radii {np.round(r[k], 4).tolist()} m, weight {w[k]:g}"
             raise BodyError(problem, remedy="Give positive numbers; radii that collapse need more points.")
-        odd = (np.abs(c).max(1) > LONGEST) | (r.max(1) > LONGEST) | (r.min(1) < _THINNEST) | (np.abs(np.log(w)) > _HEAVIEST)
+        odd = (np.maximum(np.abs(c), r).max(axis=1) > LONGEST) | (r.min(axis=1) < _THINNEST)
+        odd |= np.abs(np.log(w)) > _HEAVIEST
         if odd.any():
             k = int(np.argmax(odd))
             problem = f"ball {k + 1} at {c[k].tolist()} m has radii {r[k].tolist()} m, weight {w[k]:g}"

@@ -188,14 +188,17 @@ def read_take(path: str | PathLike[str]) -> Take:
     return take
 
 
+_LONGEST = 2048  # bytes of a path within a take: systems allow 4096 in all
+
+
 def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     """Maker of absolute paths from the texts of a take file."""
 
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder is a text")
-        if any(len(part.encode()) > 255 for part in Path(value).parts):
-            raise ValueError(f"{shortened(value, 60)!r} is no path: a name in it is too long")
+        if len(value.encode()) > _LONGEST or any(len(part.encode()) > 255 for part in Path(value).parts):
+            raise ValueError(f"{shortened(value, 60)!r} is no path: it is too long")
         if any(ord(character) < 32 for character in value):
             raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
         return folder / value
