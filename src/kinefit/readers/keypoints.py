@@ -261,7 +261,8 @@ def _caliscope_camera(
 def _numbered_files(folder: Path) -> list[Path]:
     """Json files of a folder by frame number, without gaps."""
     if not folder.is_dir():
-        raise FileError("no such folder of json files", file=folder, remedy="Name the folder, not one of its files.")
+        remedy = 'Name the folder, not one of its files; .npy files are of format = "mediapipe", .csv of "caliscope".'
+        raise FileError("no such folder of json files", file=folder, remedy=remedy)
     numbered: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() != ".json":

@@ -225,7 +225,14 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
                 raise TakeError("not a table", file=path, place=place, remedy=f"Write [[{table}]] and its keys below.")
             for key in row:
                 if key not in _fields(TABLES[table]) and key not in RENAMED.get(table, {}):
-                    raise TakeError(choices("key", key, _fields(TABLES[table])), file=path, place=place)
+                    problem = choices("key", key, _fields(TABLES[table]))
+                    raise TakeError(problem, file=path, place=place, remedy=_belongs(key))
+
+
+def _belongs(key: str) -> str | None:
+    """Which tables have a key."""
+    tables = [f"[{name}]" if name in _ONCE else f"[[{name}]]" for name in TABLES if key in _fields(TABLES[name])]
+    return f"'{key}' belongs to {', '.join(tables)}." if tables else None
 
 
 def _rename(raw: dict[str, Any], path: Path) -> None:
