@@ -52,17 +52,13 @@ def bar(
     one time. Or a CSV file of centroids: camera,frame,u,v, two rows an image.
     """
     from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar
-    from kinefit.cli._results import check_file
-    from kinefit.errors import ExportError
+    from kinefit.cli._results import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     on_floor, known = _frames(floor), _distance(distance)
     beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
     for file in beside:
-        if file.exists() and not overwrite:
-            remedy = "Add --overwrite, or name another."
-            raise ExportError("there is a file of this name already", file=file, remedy=remedy)
-        check_file(file)
+        check_new(file, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     with _screen.bars() as step:
         seen = _seen(sources, size, kept, max_frames, on_floor, step)
@@ -201,7 +197,7 @@ def _tell(result: BarCalibration, checked: bool) -> None:
         f"over {len(result.frames)} places. Left out: {result.left_out} that do not fit, {result.ambiguous} in which "
         "nothing tells the two targets apart."
     )
-    for (a, b), distance in result.distances.items():
+    for (a, b), distance in result.rig.distances.items():
         _screen.say(f"{a} to {b}: {distance:.4f} m")
     _screen.say(result.world)
     for line in result.advice:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -309,6 +310,14 @@ class Rig:
         if len(self.cameras):
             kernels.project_each(self.packed, camera, np.array(x_world, float, order="C"), uv)
         return uv
+
+    @property
+    def distances(self) -> dict[tuple[str, str], float]:
+        """{(camera, camera): distance of their centres [m]}, of every two."""
+        return {
+            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
+            for a, b in combinations(self.cameras, 2)
+        }
 
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.bodies.surfaces import segment_middles
 from kinefit.geometry.camera import Camera
 from kinefit.sensors.evidence import BELIEVED, Evidence
 from kinefit.sensors.region_flips import Flips
@@ -39,10 +40,8 @@ class Starts:
 
     @cached_property
     def _flips(self) -> Flips:
-        mesh = self._mesh
-        count = np.maximum(np.bincount(mesh.segment, minlength=len(self._body.tree.segments)), 1)
-        sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
-        return Flips(self._body, np.array(sums).T / count[:, None] - self._body.tree.rest)
+        tree, mesh = self._body.tree, self._mesh
+        return Flips(self._body, segment_middles(mesh.vertices, mesh.segment, len(tree.segments)) - tree.rest)
 
     @cached_property
     def _limbs(self) -> Limbs:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,8 @@ from kinefit.calibration.bar.report import CameraReport, advice_of, reports_of
 from kinefit.calibration.bar.start import FEWEST, first_pairs, near, resect
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.bar.world import on_floor
-from kinefit.errors import CalibrationError, choices
+from kinefit.calibration.known import known_camera
+from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 
 LENGTH_SIGMA = 1e-4  # [m] to which a bar is usually measured, with a calliper or a good rule
@@ -63,14 +63,6 @@ class BarCalibration:
     world: str
     advice: tuple[str, ...]
     covariance: NDArray
-
-    @property
-    def distances(self) -> dict[tuple[str, str], float]:
-        """{(camera, camera): distance [m]}."""
-        return {
-            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
-            for a, b in combinations(self.rig, 2)
-        }
 
 
 @checked
@@ -137,17 +129,7 @@ def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
         width, height = views.size
         K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
         return Camera(name, views.size, K, np.zeros(5))
-    if name not in interiors:
-        problem = choices("intrinsics of camera", name, interiors.names)
-        raise CalibrationError(problem, remedy="Name the videos as the cameras.")
-    camera = interiors[name].with_pose(np.eye(4))
-    if camera.size != views.size:
-        raise CalibrationError(
-            f"its image has {views.size[0]}x{views.size[1]} px, "
-            f"its intrinsics are of {camera.size[0]}x{camera.size[1]}",
-            place=f"camera {name}", remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
-        )
-    return camera
+    return known_camera(interiors, name, views.size)
 
 
 def _adjusted(
