@@ -280,6 +280,21 @@ def _names(take: Take) -> None:
         for camera in cameras:
             if cameras.count(camera) > 1:
                 raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
+    told = [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
+    told += [(f"markers {m.file.name}", m.file, m.set or "", None) for m in take.markers]
+    told += [(f"surface points {p.file.name}", p.file, "", None) for p in take.surface_points]
+    for one in told:
+        if told.count(one) > 1:
+            remedy = "Leave one out: what is there twice would count twice."
+            raise TakeError("the same file twice", file=take.path, place=one[0], remedy=remedy)
+    of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]
+    of_one += [(f"keypoints of camera {k.camera}", k.camera, k.file) for k in take.keypoints
+               if k.file is not None and k.format != "caliscope"]  # fmt: skip
+    for place, camera, file in of_one:
+        others = [other for _, other, same in of_one if same == file and other != camera]
+        if others:
+            problem = f"{file.name} is of camera {others[0]}, too"
+            raise TakeError(problem, file=take.path, place=place, remedy="Give each camera its own file.")
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(
