@@ -229,3 +229,17 @@ def test_check_of_one_camera_says_that_one_is_too_few(take):
     take.write_text(start + "".join(table for table in tables if "cam01" in table))
     told = run("check", take)
     assert "One camera does not tell how far a person is; two cameras do" in told.stdout
+
+
+def test_a_take_of_any_table_is_found_in_its_folder(take):
+    text = take.read_text() + '[session]\nsubject = "P07"\n'
+    take.unlink()
+    take.with_name("monday.toml").write_text(text)
+    assert read_take(take.parent).path.name == "monday.toml"
+
+
+def test_another_file_than_a_motion_is_answered_with_its_command(take, monkeypatch):
+    monkeypatch.chdir(take.parent)
+    for name, told in (("take.toml", "kinefit track take.toml"), ("cam01.mp4", "that `kinefit track` wrote")):
+        answer = run("export", name, "--to", "bvh")
+        assert answer.exit_code == 2 and told in answer.stderr and "Zip" not in answer.stderr

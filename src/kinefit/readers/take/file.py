@@ -17,6 +17,7 @@ from kinefit.errors import FileError, TakeError, choices, shortened
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
+    TABLES,
     CalibrationEntry,
     CameraEntry,
     DepthEntry,
@@ -69,14 +70,6 @@ class _File(_Entry, frozen=True, kw_only=True):
     lines: tuple[LinesEntry, ...] = ()
     surface_points: tuple[SurfacePointsEntry, ...] = ()
 
-
-TABLES: dict[str, type[msgspec.Struct]] = {
-    "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
-    "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
-    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
-    "surface_points": SurfacePointsEntry,
-}  # fmt: skip
-"""Every table of a take file, and its keys as the fields of a record."""
 
 _ONCE = ("take", "session", "start", "calibration")
 
