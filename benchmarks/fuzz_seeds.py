@@ -87,7 +87,7 @@ def finite(thing: object, name: str = "") -> object:
     return thing
 
 
-_ENDLESS = ("lower", "upper", "spread", "range")
+_ENDLESS = ("lower", "upper", "spread", "radii")  # of a bulge, too
 
 
 def _motion():

@@ -274,3 +274,12 @@ def test_a_stature_that_is_none_is_told(tmp_path, stature):
     (tmp_path / "a.toml").write_text(f'[body]\nname = "a"\nbase = "arm"\nstature = {stature}\n')
     with pytest.raises(BodyError, match="a stature of"):
         load_body(tmp_path / "a.toml")
+
+
+def test_a_morph_of_a_segment_without_a_name_is_told(tmp_path):
+    seed = seed_of("body toml", tmp_path)
+    body = tmp_path / "body.toml"
+    kind = re.search(r'kind = "joint"\n(?:[^\n\[]*\n)*?segment = "(\w+)"', body.read_text())
+    body.write_text(body.read_text().replace(kind[0], kind[0].replace(kind[1], "")))
+    with pytest.raises(BodyError, match="no segment ''"):
+        seed.read()

@@ -102,7 +102,7 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
     _check_keys(record)
     if record.angle not in tree.coordinates:
         raise BodyError(choices("angle", record.angle, tree.coordinates), remedy="Use one of these.")
-    for name in [*([record.segment] if record.segment else []), *(record.on or [])]:
+    for name in [*([] if record.segment is None else [record.segment]), *(record.on or [])]:
         if name not in tree.segments:
             raise BodyError(choices("segment", name, tree.segments), remedy="Use one of these, or add it.")
     for what, value in (("shift", record.shift), ("turn", record.turn), ("centre", record.centre)):
