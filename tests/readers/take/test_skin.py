@@ -91,7 +91,7 @@ def test_what_cannot_be_is_told(folder):
         load(folder, SKIN_ENTRY + "face = [0, 0, 36, 1e308]\n")
     for keys, said in (
         ("face = [1, 2, 0, 4]\n", "face = "), (FACE + 'set = "BODY_25B"\n', "no keypoint set of skin 'BODY_25B'"),
-        (FACE + "frames = [30, 40]\n", "none of its frames"),
+        (FACE + "frames = [30, 40]\n", "none of its frames"), ("face = [1, 2, 3, nan]\n", "face = "),
     ):
         with pytest.raises(TakeError, match=said):
             load(folder, SKIN_ENTRY + keys)

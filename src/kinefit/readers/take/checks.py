@@ -110,7 +110,7 @@ def _values(take: Take) -> None:
             refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
         if source.file is None and source.format not in ("detect", "skin"):
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
-        if source.face is not None and not min(source.face[2:]) > 0:
+        if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
         if not 0 < source.sigma < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
             refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
@@ -210,7 +210,7 @@ def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
             yield f"camera = {entry.camera}, but no [calibration]", place, "Add one, or give intrinsics."
         if entry.distortion and entry.intrinsics is None:
             yield "distortion without intrinsics", place, "Write intrinsics = [fx, fy, cx, cy] too."
-        if entry.intrinsics is not None and not min(entry.intrinsics[:2]) > 0:
+        if entry.intrinsics is not None and not all(v > 0 for v in entry.intrinsics[:2]):
             yield f"intrinsics = {list(entry.intrinsics)}", place, "Give [fx, fy, cx, cy] in pixels."
     for pair in take.stereo:
         if not (0 < pair.range[0] < pair.range[1] and 0 < pair.sigma < 100):
