@@ -244,3 +244,16 @@ def test_another_file_than_a_motion_is_answered_with_its_command(take, monkeypat
     for name, told in (("take.toml", "kinefit track take.toml"), ("cam01.mp4", "that `kinefit track` wrote")):
         answer = run("export", name, "--to", "bvh")
         assert answer.exit_code == 2 and told in answer.stderr and "Zip" not in answer.stderr
+
+
+def test_units_and_axes_of_an_export_are_spelled_as_people_do(tmp_path):
+    write_motion(cut(squat_and_wave(), 0, 4), tmp_path / "motion.npz")
+    told = run("export", tmp_path, "--to", "trc", "--unit", "Millimetres", "--up", "Z", "--out", tmp_path / "a.trc")
+    assert told.exit_code == 0 and "unit mm, up z" in told.stdout
+    told = run("export", tmp_path, "--to", "trc", "--unit", "inch")
+    assert told.exit_code == 2 and "m, cm, mm; not inch" in told.stderr
+
+
+def test_static_points_are_looked_for_before_any_work(take):
+    told = run("check", take, "--refine", "--points", "nothing.toml")
+    assert told.exit_code == 2 and "no such file: nothing.toml" in told.stderr and not told.stdout
