@@ -27,7 +27,7 @@ from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
 from kinefit.readers.guess.names import camera_number, natural
-from kinefit.readers.keypoints import read_caliscope_csv
+from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.asf import read_asf
 from kinefit.readers.static_points import read_static_points
 from kinefit.readers.take.file import read_take
@@ -283,3 +283,10 @@ def test_a_morph_of_a_segment_without_a_name_is_told(tmp_path):
     body.write_text(body.read_text().replace(kind[0], kind[0].replace(kind[1], "")))
     with pytest.raises(BodyError, match="no segment ''"):
         seed.read()
+
+
+def test_a_camera_of_five_thousand_digits_is_none_of_a_table(tmp_path):
+    path = caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", "1,0,0.1,3,5,6")
+    with pytest.raises(ObservationError, match="no camera in this table") as error:
+        read_keypoints(path, format="caliscope", camera="cam" + "9" * 5000, rate=10.0)
+    assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST

@@ -251,7 +251,7 @@ def _caliscope_camera(
     path: Path, *, camera: str, rate: float, time_offset: float = 0.0, image_frame: ImageFrame | None = None
 ) -> Keypoints:
     ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
-    port = ports.get(f"cam_{int(numbers[-1])}" if numbers else "")
+    port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
     if port is None:
         raise ObservationError(choices("camera in this table named", camera, ports), file=path)
     points = port.points if image_frame is None else image_frame.to_calibration(port.points)

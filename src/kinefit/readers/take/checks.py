@@ -280,13 +280,14 @@ def _names(take: Take) -> None:
         for camera in cameras:
             if cameras.count(camera) > 1:
                 raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
-    told = [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
-    told += [(f"markers {m.file.name}", m.file, m.set or "", None) for m in take.markers]
-    told += [(f"surface points {p.file.name}", p.file, "", None) for p in take.surface_points]
+    told: list[tuple[object, ...]] = []
+    told += [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
+    told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
+    told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
     for one in told:
         if told.count(one) > 1:
             remedy = "Leave one out: what is there twice would count twice."
-            raise TakeError("the same file twice", file=take.path, place=one[0], remedy=remedy)
+            raise TakeError("the same file twice", file=take.path, place=str(one[0]), remedy=remedy)
     of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]
     of_one += [(f"keypoints of camera {k.camera}", k.camera, k.file) for k in take.keypoints
                if k.file is not None and k.format != "caliscope"]  # fmt: skip
