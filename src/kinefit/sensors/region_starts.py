@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.bodies.surfaces import segment_middles
 from kinefit.geometry.camera import Camera
-from kinefit.sensors.evidence import BELIEVED, Evidence
+from kinefit.motion import BELIEVED
+from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_image import Coloured
 from kinefit.sensors.region_limbs import Limbs
