@@ -68,7 +68,7 @@ def test_one_is_followed_by_option_or_by_key(who, index, take, tmp_path):
 @pytest.mark.parametrize("wrong", ["0", "tallest", "nearest 1 2", "nearest 1 2 x", "-1", "nearest nan 0 0", ""])
 def test_a_person_that_cannot_be_is_told(wrong, take, tmp_path):
     told = run("track", take, "--person", wrong, "--out", tmp_path / "out")
-    assert told.exit_code == 2 and "[take] person" in told.stderr and '"moving"' in told.stderr
+    assert told.exit_code == 2 and "--person" in told.stderr and '"moving"' in told.stderr
     assert not (tmp_path / "out").exists()
 
 

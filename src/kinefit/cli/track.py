@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     """Formats of a list such as "bvh,csv"."""
-    formats = tuple(dict.fromkeys(part.strip().lower() for part in value.split(",") if part.strip()))
+    formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
     for name in formats:
         if name not in _results.NAMES:
             raise click.BadParameter(_results.no_format(name, _results.NAMES))
@@ -112,7 +112,10 @@ def run(
     take = read_take(path)
     if person is not None:
         take = replace(take, person=person)
-        check_take(take)
+        try:
+            check_take(take)
+        except KinefitError as error:  # of this option: the take alone is right
+            raise type(error)(error.problem, place="--person", remedy=error.remedy) from None
     check_enough(take)
     if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
         raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")

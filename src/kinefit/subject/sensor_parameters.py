@@ -43,7 +43,7 @@ class CameraExtrinsics:
     def __post_init__(self) -> None:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
             self.rig.index(name)
-        if not min(self.std) > 0:
+        if not all(std > 0 for std in self.std):
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
 
     @property
@@ -131,7 +131,7 @@ class SensorFrames:
     arms: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not min(self.std) > 0:
+        if not all(std > 0 for std in self.std):
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give m, rad and s above 0.")
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 
 LENGTH_SIGMA = 1e-4  # [m] to which a bar is usually measured, with a calliper or a good rule
+_SHORTEST, _LONGEST = 0.01, 20.0  # [m] of a bar
 _UNSURE = 0.03  # of the focal length, one standard deviation: no calibration but a guess
 _OUTLIER = 6.0  # standard deviations: none of 10,000 normal errors
 _LOOSE = 0.02  # of the length by which it may scatter: more is no bar, or cameras out of step
@@ -97,14 +98,9 @@ def calibrate_bar(
         Too few places, targets that do not belong together, an arrangement that does not determine the lenses or the
         cameras, a length that a second one contradicts.
     """
-    if not (0.01 < length < 20.0 and 0 < length_sigma < length):
-        raise CalibrationError(
-            f"a bar of {length:g} m, known to {length_sigma:g} m", place="length",
-            remedy="Give it in metres, such as 0.9.",
-        )
     names = list(seen)
-    if len(names) < 2:
-        raise CalibrationError(f"{len(names)} camera", remedy="Give what two cameras or more saw at the same times.")
+    check_bar(length, length_sigma)
+    check_cameras(names)
     cameras = [_camera(name, views, interiors) for name, views in seen.items()]
     frames = np.array(sorted({frame for views in seen.values() for frame in views.ends}))
     uv = np.full((len(frames), len(names), 2, 2), np.nan)
@@ -122,6 +118,22 @@ def calibrate_bar(
         rig, length, reports, bundle.sigma, bundle.scatter, frames[used], x_world, used_uv, bundle.residuals,
         int(ambiguous.sum()), int((~used & ~ambiguous).sum()), world, tuple(advice_of(rig, reports)), bundle.covariance,
     )
+
+
+def check_bar(length: float, length_sigma: float = LENGTH_SIGMA) -> None:
+    """CalibrationError where a length [m] is that of no bar."""
+    if not (_SHORTEST < length < _LONGEST and 0 < length_sigma < length):
+        known = "" if 0 < length_sigma < length else f", known to {length_sigma:g} m"
+        metres = next((length * unit for unit in (0.001, 0.01) if 0.1 < length * unit < _LONGEST), 0.9)
+        remedy = f"Give it in metres, such as {metres:g}."
+        raise CalibrationError(f"a bar of {length:g} m{known}", place="length", remedy=remedy)
+
+
+def check_cameras(names: Collection[str]) -> None:
+    """CalibrationError where too few cameras are there."""
+    if len(names) < 2:
+        problem = f"{len(names)} camera: a bar calibrates two or more together"
+        raise CalibrationError(problem, remedy="Give what two cameras or more saw at the same times.")
 
 
 def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
