@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import click
 
 from kinefit.cli import _results, _screen
 from kinefit.errors import spelled
+from kinefit.readers.units import LENGTHS, worth
 
 
 class Freedom(NamedTuple):
@@ -108,7 +110,7 @@ def export(
     if format is None:
         raise click.UsageError("Missing option '--to' (or --retarget CHARACTER).")
     options = {
-        key: _choice(format, key, value if key == "up" else spelled(value, getattr(FREEDOM[format], key)))
+        key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
     }  # fmt: skip
     from kinefit.readers.motion import find_motion, read_motion
@@ -120,6 +122,14 @@ def export(
     _results.write_format(recorded, format, out, **options)
     told = ", ".join(f"{key} {value}" for key, value in options.items())
     _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+
+
+def _meant(key: str, value: str, valid: Sequence[str]) -> str:
+    """A value as it is called here: "MM" and "millimetres" are mm, "OpenSim" is opensim, "Z" is z."""
+    if key == "up":
+        return value.strip().lower()
+    metres = worth(value, LENGTHS) if key == "unit" else None
+    return next((unit for unit in valid if metres == LENGTHS.get(unit)), value) if metres else spelled(value, valid)
 
 
 def _retarget(motion: Path, character: Path, table: Path | None, out: Path | None, others: list[str]) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.surfaces import body_mesh, segment_middles
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
@@ -149,7 +149,4 @@ def _jacobians(scene: Scene, middle: NDArray) -> NDArray:
 def _middles(body: Body) -> NDArray:
     """(S, 3) [m] middle of each segment's surface, in the root frame at rest."""
     mesh = body_mesh(body)
-    count = np.maximum(np.bincount(mesh.segment, minlength=len(body.tree.segments)), 1)
-    return np.stack(
-        [np.bincount(mesh.segment, mesh.vertices[:, k], len(body.tree.segments)) / count for k in range(3)], axis=1
-    )
+    return segment_middles(mesh.vertices, mesh.segment, len(body.tree.segments))
