@@ -41,6 +41,7 @@ def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError
     `error`
         No TOML, with line and column; or tables so deep, keys or numbers so long that nobody wrote them.
     """
+    text = text.removeprefix("\ufeff")  # that some editors of Windows begin a file with
     if len(text) > _LARGEST:
         raise error(f"a TOML file of {len(text) / 1e6:.0f} MB", file=file, remedy="Is it another file?")
     if (dotted := _DOTTED.search(text)) is not None:  # tomllib's time grows with the square of their number

@@ -290,3 +290,12 @@ def test_a_camera_of_five_thousand_digits_is_none_of_a_table(tmp_path):
     with pytest.raises(ObservationError, match="no camera in this table") as error:
         read_keypoints(path, format="caliscope", camera="cam" + "9" * 5000, rate=10.0)
     assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST
+
+
+def test_a_table_that_a_spreadsheet_wrote_is_read(tmp_path):
+    path = caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", "1,0,0.1,3,5,6")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert set(read_caliscope_csv(path)) == {"cam_0"}
+    seed = seed_of("body skin", tmp_path)
+    (tmp_path / "skin.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "skin.csv").read_bytes())
+    assert seed.read().skin is not None

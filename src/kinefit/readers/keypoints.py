@@ -185,7 +185,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     path, names = Path(path), KEYPOINT_SETS["MEDIAPIPE_33"]
     columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
                 needed = f"Needed: {', '.join(columns)}."
