@@ -26,6 +26,7 @@ from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError,
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
+from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess.names import camera_number, natural
 from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.asf import read_asf
@@ -299,3 +300,17 @@ def test_a_table_that_a_spreadsheet_wrote_is_read(tmp_path):
     seed = seed_of("body skin", tmp_path)
     (tmp_path / "skin.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "skin.csv").read_bytes())
     assert seed.read().skin is not None
+
+
+@pytest.mark.parametrize("name", ["caliscope", "surface points", "bar"])
+def test_columns_that_semicolons_separate_are_told(tmp_path, name):
+    seed = seed_of(name, tmp_path)
+    seed.files[0].write_text(seed.files[0].read_text().replace(",", ";"))
+    with pytest.raises(KinefitError, match="separated by ';', not by commas"):
+        seed.read()
+
+
+def test_a_folder_of_photographs_is_no_depth(tmp_path):
+    (tmp_path / "0001.jpg").write_bytes(bytes(100))
+    with pytest.raises(FileError, match=r"\.jpg files hold colours"):
+        read_depth(tmp_path, rate=30.0)
