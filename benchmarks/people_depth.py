@@ -2,7 +2,7 @@
 
 Pixels below were read from the images, to about 5 px: middle of the hand (between wrist and knuckles), middle of the
 head, and the lower end of a raised forearm. A hand lies 1.5 cm behind the surface that is seen there, an elbow 4 cm, a
-head 8 cm. Nothing was fitted to them. Two people are in the first and the last image of the Kinect; the nearer one is followed.
+head 8 cm. Nothing was fitted to them. Two people are in the first and the last image of the Kinect: the nearer counts.
 """
 
 from __future__ import annotations
