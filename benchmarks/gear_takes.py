@@ -27,7 +27,7 @@ from kinefit.simulation import movement, simulate_keypoints, studio_rig
 from kinefit.simulation.retarget import known_motion
 
 SIZE, FOCAL = (640, 480), 600.0
-SECONDS = 1.6
+SECONDS = 1.0
 _NOISE, _DRIFT = 1.5, 1.0  # [px] of the keypoints of the first frame
 _CASE = np.array([[-0.40, -0.30, -0.42], [0.42, 0.70, -0.015]])  # [m] in the bike's frame: around the left leg
 
