@@ -62,7 +62,7 @@ def _scale(found: BarCalibration, rig: Rig, seed: int) -> float:
 def _baseline(found: BarCalibration, rig: Rig) -> float:
     """Largest relative error of a distance between two cameras."""
     true = {(a.name, b.name): np.linalg.norm(a.centre_world - b.centre_world) for a in rig for b in rig}
-    return max(abs(metres / float(true[pair]) - 1.0) for pair, metres in found.distances.items())
+    return max(abs(metres / float(true[pair]) - 1.0) for pair, metres in found.rig.distances.items())
 
 
 def _deviations(found: BarCalibration, rig: Rig) -> np.ndarray:

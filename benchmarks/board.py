@@ -95,7 +95,7 @@ def _webcams(name: str, inner: str) -> tuple[BoardCalibration, Rig] | None:
 def _distances(found: BoardCalibration, reference: Rig) -> float:
     """Largest difference [%] of the distances between cameras."""
     out = 0.0
-    for (a, b), metres in found.distances.items():
+    for (a, b), metres in found.rig.distances.items():
         true = float(np.linalg.norm(reference[a].centre_world - reference[b].centre_world))
         out = max(out, abs(100 * (metres / true - 1)))
     return out

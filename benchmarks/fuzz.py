@@ -15,7 +15,7 @@ import threading
 from collections import Counter
 
 from benchmarks.figures import amount, figure
-from benchmarks.fuzz_seeds import READERS
+from benchmarks.fuzz_readers import READERS
 
 SLOW, MEMORY = 5.0, 500
 """[s] of the processor and [MB] that a file may take."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import json
 import re
 import struct
 import zipfile
@@ -45,7 +46,72 @@ def _inside(data: bytes, rng: np.random.Generator) -> bytes:
             return _once(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return _chunk(data, rng)
+    if data[:1] in (b"{", b"[") and rng.random() < 0.6:
+        try:
+            return _leaf(data, rng)
+        except Exception:  # no JSON: a TOML file, or one that is damaged already
+            return _entry(data, rng)
+    if _TABLE.search(data) and rng.random() < 0.6:
+        return _entry(data, rng)
     return _once(data, rng)
+
+
+_TABLE = re.compile(rb"(?m)^\[\[?[\w.]+\]\]?[ \t]*$")
+_LINE = re.compile(rb"(?m)^[ \t]*[\w.\"]+[ \t]*=[ \t]*(.*)$")
+_VALUES = (
+    "0", "-1", "1", "2", "0.5", "-0.0", "1e-320", "1e-9", "1e9", "1e308", "-1e308", "9223372036854775807", "nan",
+    "inf", "-inf", "true", '""', '"text"', '"1"', '"."', '"/"', '"../.."', '"*"', '"a**"', '"[\\u0000"',
+    '"\u00e4\u4eba"', '"m"', '"x"', '"%s"' % ("a" * 5000), '"%s"' % ("a/" * 3000), "[]", "[[]]", "[0]", "[0, 0]",
+    "[1, 0]", "[0, 0, 0]", "[0, 0, 0, 0]", "[1e308, 1e308, 1e308]", "[1, 1, 1e-300]", '["a", "a"]', "{}",
+    f"[{', '.join(['1'] * 3000)}]", "[[1, 2], [3]]",
+)  # fmt: skip
+"""Values that TOML has, and JSON but for a few: what follows them is read."""
+
+
+def _entry(data: bytes, rng: np.random.Generator) -> bytes:
+    """A TOML file that still is one: a value replaced, by another line's too, or a line left out or twice."""
+    lines = list(_LINE.finditer(data[:200_000]))
+    if not lines:
+        return _once(data, rng)
+    line, way = lines[int(rng.integers(len(lines)))], rng.random()
+    if way < 0.1:
+        return data[: line.start()] + data[line.end() :]
+    if way < 0.2:  # a table of its own, such as a sensor, twice
+        starts = [found.start() for found in _TABLE.finditer(data)] + [len(data)]
+        k = int(rng.integers(len(starts) - 1)) if len(starts) > 1 else 0
+        return data + b"\n" + data[starts[k] : starts[min(k + 1, len(starts) - 1)]]
+    numbers = list(_NUMBER.finditer(line[1]))
+    if way < 0.5 and numbers:
+        place = numbers[int(rng.integers(len(numbers)))]
+        new = line[1][: place.start()] + _VALUES[int(rng.integers(15))].encode() + line[1][place.end() :]
+    elif way < 0.7:
+        new = lines[int(rng.integers(len(lines)))][1]
+    else:
+        new = _VALUES[int(rng.integers(len(_VALUES)))].encode()
+    return data[: line.start(1)] + new + data[line.end(1) :]
+
+
+def _leaf(data: bytes, rng: np.random.Generator) -> bytes:
+    """A JSON file that still is one: something in it replaced, by another part too, or left out."""
+    tree = json.loads(data)
+    places: list[tuple] = []
+    rooms = [tree]
+    while rooms:
+        room = rooms.pop()
+        for key in room if isinstance(room, dict) else range(len(room)):
+            places.append((room, key))
+            if isinstance(room[key], dict | list):
+                rooms.append(room[key])
+    (room, key), way = places[int(rng.integers(len(places)))], rng.random()
+    if way < 0.15:
+        del room[key]
+    elif way < 0.35:
+        other, name = places[int(rng.integers(len(places)))]
+        room[key] = json.loads(json.dumps(other[name]))
+    else:
+        text = ("null", "1e400", "[null, null]", *_VALUES)[int(rng.integers(len(_VALUES) + 3))]
+        room[key] = {"nan": float("nan"), "inf": float("inf"), "-inf": -float("inf")}.get(text) or json.loads(text)
+    return json.dumps(tree).encode()
 
 
 def _member(data: bytes, rng: np.random.Generator) -> bytes:

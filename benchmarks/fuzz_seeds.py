@@ -1,11 +1,11 @@
-"""A small valid file for every reader, made at run time, and what reads it."""
+"""A small valid file for a reader, made at run time, and what reads it: see `fuzz_readers` for all."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from importlib import resources
 from pathlib import Path
 
@@ -72,9 +72,22 @@ class Seed:
     read: Callable[[], object]
 
 
-def seed_of(name: str, folder: Path) -> Seed:
-    """The seed of a reader of `READERS`, its files made below a folder."""
-    return READERS[name](folder)
+def finite(thing: object, name: str = "") -> object:
+    """A body or a rig, handed through; ValueError where a number of it is none."""
+    if isinstance(thing, np.ndarray | float):
+        bad = np.asarray(thing).dtype.kind == "f" and np.isnan(thing).any()
+        if bad or (name not in _ENDLESS and np.asarray(thing).dtype.kind == "f" and np.isinf(thing).any()):
+            raise ValueError(f"a result with {name} of {np.asarray(thing).ravel()[:9]}")
+    elif isinstance(thing, dict | tuple | list):
+        for key, one in thing.items() if isinstance(thing, dict) else zip([name] * len(thing), thing):
+            finite(one, str(key))
+    elif is_dataclass(thing):
+        for field in fields(thing):
+            finite(getattr(thing, field.name), field.name)
+    return thing
+
+
+_ENDLESS = ("lower", "upper", "spread", "radii")  # of a bulge, too
 
 
 def _motion():
@@ -93,7 +106,7 @@ def _take(folder: Path) -> Seed:
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
 
-    _calibration(folder)
+    calibration_of(folder)
     text = '[take]\nname = "walk"\nrate = 30.0\nup = "z"\nheight = 1.75\nframes = [0, 4]\n[calibration]\n'
     text += 'file = "calibration.toml"\nunit = "m"\n'
     for camera in _rig().names:
@@ -104,7 +117,8 @@ def _take(folder: Path) -> Seed:
     return Seed((folder / "take.toml",), lambda: load_observations(read_take(folder / "take.toml")))
 
 
-def _calibration(folder: Path) -> Seed:
+def calibration_of(folder: Path) -> Seed:
+    """The calibration of two cameras, cam01 and cam02."""
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     write_calibration(_rig(), folder / "calibration.toml")
@@ -112,7 +126,7 @@ def _calibration(folder: Path) -> Seed:
 
 
 def _calibrated(path: Path, read: Callable) -> Seed:
-    return Seed((path,), lambda: read(path))
+    return Seed((path,), lambda: finite(read(path)))
 
 
 def _opencv(ending: str) -> Callable[[Path], Seed]:
@@ -149,7 +163,7 @@ def _colmap(folder: Path) -> Seed:
     (folder / "cameras.txt").write_text("1 OPENCV 64 48 50 50 32 24 0.1 0 0 0\n2 PINHOLE 64 48 50 50 32 24\n")
     (folder / "images.txt").write_text("1 1 0 0 0 0 0 3 1 a.png\n\n2 0.7 0 0.7 0 0 0 3 2 b.png\n\n")
     files = folder / "cameras.txt", folder / "images.txt"
-    return Seed(files, lambda: read_calibration(folder))
+    return Seed(files, lambda: finite(read_calibration(folder)))
 
 
 def _openpose(folder: Path) -> Seed:
@@ -257,7 +271,8 @@ def _lines(ending: str) -> Callable[[Path], Seed]:
     return make
 
 
-def _depth_counts() -> np.ndarray:
+def depth_counts() -> np.ndarray:
+    """Three depth images (3, 48, 64) [mm]."""
     v, u = np.mgrid[0:48, 0:64]
     return np.stack([(1500 + 3 * u + 2 * v + i).astype(np.uint16) for i in range(3)])
 
@@ -275,7 +290,7 @@ def _read_all(path: Path, **options: object) -> Callable[[], object]:
 def _depth(ending: str) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
         (folder / "depth").mkdir()
-        for i, counts in enumerate(_depth_counts()):
+        for i, counts in enumerate(depth_counts()):
             file = folder / "depth" / f"d{i}{ending}"
             if ending == ".raw":
                 counts.tofile(file)
@@ -288,7 +303,7 @@ def _depth(ending: str) -> Callable[[Path], Seed]:
 
 
 def _depth_archive(folder: Path) -> Seed:
-    counts = _depth_counts()
+    counts = depth_counts()
     np.savez_compressed(folder / "a.npz", depth=counts, times=np.arange(3) / 30, unit=0.001, rate=30.0)
     return Seed((folder / "a.npz",), _read_all(folder / "a.npz"))
 
@@ -297,7 +312,7 @@ def _depth_track(folder: Path) -> Seed:
     with av.open(str(folder / "a.mkv"), "w") as container:
         stream = container.add_stream("ffv1", rate=30)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "gray16le"
-        for counts in _depth_counts():
+        for counts in depth_counts():
             container.mux(stream.encode(av.VideoFrame.from_ndarray(counts, format="gray16le")))
         container.mux(stream.encode())
     return Seed((folder / "a.mkv",), _read_all(folder / "a.mkv"))
@@ -394,13 +409,14 @@ def _masks(folder: Path) -> Seed:
     return Seed(tuple(sorted((folder / "masks").iterdir())), read)
 
 
-def _body(name: str) -> Callable[[Path], Seed]:
+def body_of(name: str) -> Callable[[Path], Seed]:
+    """A body of the catalogue as a file."""
     def make(folder: Path) -> Seed:
         from kinefit.bodies import load_body
 
         text = (resources.files("kinefit.bodies") / "catalogue" / f"{name}.toml").read_text("utf-8")
         (folder / "body.toml").write_text(text)
-        return Seed((folder / "body.toml",), lambda: load_body(folder / "body.toml"))
+        return Seed((folder / "body.toml",), lambda: finite(load_body(folder / "body.toml")))
 
     return make
 
@@ -410,7 +426,7 @@ def _saved_body(folder: Path) -> Seed:
     from kinefit.bodies.serial import save_body
 
     save_body(load_body("humanoid_morphing"), folder / "body.npz")
-    return Seed((folder / "body.npz",), lambda: load_body(folder / "body.npz"))
+    return Seed((folder / "body.npz",), lambda: finite(load_body(folder / "body.npz")))
 
 
 def _mesh_body(folder: Path) -> Seed:
@@ -421,7 +437,7 @@ def _mesh_body(folder: Path) -> Seed:
     body = '[body]\nname = "thing"\n[[segment]]\nname = "thing"\nsurface = { mesh = "a.obj" }\n'
     body += 'joint = { name = "ground", type = "free" }\n'
     (folder / "body.toml").write_text(body)
-    return Seed((folder / "a.obj", folder / "body.toml"), lambda: load_body(folder / "body.toml"))
+    return Seed((folder / "a.obj", folder / "body.toml"), lambda: finite(load_body(folder / "body.toml")))
 
 
 def _marker_set(folder: Path) -> Seed:
@@ -449,13 +465,13 @@ def _folder(folder: Path) -> Seed:
     shutil.rmtree(folder)
     folder.mkdir()
     files = []
-    for make in (_calibration, _mediapipe, _caliscope, _openpose, _markers(".trc")):
+    for make in (calibration_of, _mediapipe, _caliscope, _openpose, _markers(".trc")):
         files += make(folder).files
     return Seed(tuple(files), lambda: guess_take(folder))
 
 
-READERS: dict[str, Callable[[Path], Seed]] = {
-    "take": _take, "calibration toml": _calibration, "calibration yaml": _opencv(".yml"),
+FIRST: dict[str, Callable[[Path], Seed]] = {
+    "take": _take, "calibration toml": calibration_of, "calibration yaml": _opencv(".yml"),
     "calibration xml": _opencv(".xml"), "calibration json": _opencv(".json"), "qualisys": _qualisys, "colmap": _colmap,
     "openpose": _openpose, "mediapipe": _mediapipe, "caliscope": _caliscope, "detections": _detections,
     "c3d": _markers(".c3d"), "trc": _markers(".trc"), "motion": _motion_file, "bvh": _bvh, "amc": _amc,
@@ -465,7 +481,8 @@ READERS: dict[str, Callable[[Path], Seed]] = {
     "pcd": _clouds("pcd"),
     "binary pcd": _clouds("binary pcd"), "packed pcd": _clouds("packed pcd"), "video mp4": _video("mpeg4", ".mp4"),
     "video avi": _video("mpeg4", ".avi"), "video webm": _video("libvpx", ".webm"), "images png": _images(".png"),
-    "images jpg": _images(".jpg"), "masks": _masks, "body toml": _body("humanoid_morphing"), "arm toml": _body("arm"),
+    "images jpg": _images(".jpg"), "masks": _masks, "body toml": body_of("humanoid_morphing"),
+    "arm toml": body_of("arm"),
     "body npz": _saved_body, "body mesh": _mesh_body, "marker set": _marker_set, "subject": _subject, "init": _folder,
 }  # fmt: skip
 """{reader: maker of its seed}."""

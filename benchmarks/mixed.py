@@ -1,6 +1,6 @@
 """Sensors together, through take files.
 
-`python -m benchmarks.mixed [--quick] [--draws N] [--mixes A,B] [--only GROUP]`.
+`python -m benchmarks.mixed [--quick] [--draws N] [--each K] [--mixes A,B] [--only GROUP]`.
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
 interval), "smoothing" (it helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
@@ -35,6 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mixed", description="Figures of sensors together.")
     parser.add_argument("--quick", action="store_true", help="two draws, short takes, fewer runs; within two minutes")
     parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
+    parser.add_argument("--each", type=int, help="so many takes of each draw, in turn, in place of all: of intervals")
     parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")
     parser.add_argument("--only", choices=GROUPS, help="one group of figures")
     told = parser.parse_args()
@@ -52,9 +53,11 @@ def main() -> None:
         if unknown := set(mixes) - set(MIXES):
             parser.error(f"no mix {', '.join(sorted(unknown))}; there are: {', '.join(MIXES)}")
         runs = [run for run in mixed_figures.runs_of(simulated, told.quick) if run[0] in mixes]
+        if told.each is not None and (simulated != ["intervals"] or told.each < 1):
+            parser.error("--each K, at least one, goes with --only intervals: other figures compare takes of a draw")
         begin = time.perf_counter()
-        outcomes = track_draws(draws, round(RATE * (QUICK_SECONDS if told.quick else SECONDS)), runs)
-        print(f"# {draws} draws, {len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
+        outcomes = track_draws(draws, round(RATE * (QUICK_SECONDS if told.quick else SECONDS)), runs, told.each)
+        print(f"# {draws} draws, {told.each or len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
         mixed_figures.table(outcomes)
         for group in simulated:
             print(f"\n# {group}", flush=True)

@@ -9,7 +9,8 @@ the one-sided 95 % interval of this ratio, from 2000 bootstrap samples of the dr
 than 2 % is refuted.
 
 Error bars: shares of |estimate - truth| <= 1.96 sigma over what has a finite sigma; per cell (mix, condition, group of
-joints, joints or angles) and pooled over all cells of a group. Cells with fewer than 200 values are left out.
+joints, joints or angles) and pooled over all cells of a group. Cells with fewer than 200 values are left out. With
+`--each K` every draw has K of the runs alone, in turn: as many draws in a fraction of the time; intervals are by draw.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def table(told: Told) -> None:
     for run, draws in told.items():
         kept = [one for one in draws if isinstance(one, Outcome)]
         reasons = sorted({one for one in draws if isinstance(one, str)})
-        text = f"# {' '.join(run)}: {len(kept)} of {len(draws)} draws"
+        text = f"# {' '.join(run)}: {len(kept)} of {sum(one is not None for one in draws)} draws"
         if kept:
             known = lambda array: array[np.isfinite(array)]
             sigma = 1e3 * _mean([_mean(known(o.sigma)) for o in kept])
@@ -76,7 +77,7 @@ def intervals(told: Told) -> None:
     missing = [run for run in told if _of(told, run)[1]]
     for run in told:
         outcomes, reason = _of(told, run)
-        for key, counts in _counts(outcomes).items():
+        for key, counts in _counts(told[run] if outcomes else []).items():
             cells.setdefault(key, {})[run] = counts
         _stated("_".join(run), outcomes, reason)
     share = lambda rows: rows[:, 0].sum() / max(rows[:, 1].sum(), 1.0)
@@ -143,8 +144,8 @@ def _stated(name: str, outcomes: Sequence[Outcome], reason: str) -> None:
         figure(f"sigma_{what}_{name}", _mean(sigmas) / rms if errors else None, "x rms error", "<= 1.5", reason)
 
 
-def _counts(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], NDArray]:
-    """(group, "joints" or "angles"): (draws, 2) how many are inside, and how many there are."""
+def _counts(outcomes: Sequence[Outcome | str | None]) -> dict[tuple[str, str], NDArray]:
+    """(group, "joints" or "angles"): (draws, 2) how many are inside, and how many there are; 0 where it was not run."""
     body, out = load_body("humanoid"), {}
     for g, group in enumerate(body.scale_groups):
         segments = body.segment_scale == g
@@ -154,6 +155,9 @@ def _counts(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], NDArray]:
         ):
             rows = []
             for o in outcomes:
+                if not isinstance(o, Outcome):
+                    rows.append([0, 0])
+                    continue
                 error, sigma = np.abs(error_of(o)[:, chosen]), sigma_of(o)[:, chosen]
                 finite = np.isfinite(sigma)
                 rows.append([(error[finite] <= SIGMAS * sigma[finite]).sum(), finite.sum()])
@@ -163,9 +167,8 @@ def _counts(outcomes: Sequence[Outcome]) -> dict[tuple[str, str], NDArray]:
 
 
 def _added(runs: Iterable[NDArray]) -> NDArray:
-    """(draws, 2) of several runs of the same draws together; runs in which a draw failed count as they are."""
-    runs = list(runs)
-    return np.sum(runs, axis=0) if len({len(r) for r in runs}) == 1 else np.concatenate(runs)
+    """(draws, 2) of several runs of the same draws together."""
+    return np.sum(list(runs), axis=0)
 
 
 def _of(told: Told, run: Run) -> tuple[list[Outcome], str]:
@@ -173,7 +176,7 @@ def _of(told: Told, run: Run) -> tuple[list[Outcome], str]:
     if run not in told:
         return [], "not among the takes that the command line asks for"
     failed = [one for one in told[run] if isinstance(one, str)]
-    reason = f"{len(failed)} of {len(told[run])} draws: {failed[0]}" if failed else ""
+    reason = f"{len(failed)} of {sum(one is not None for one in told[run])} draws: {failed[0]}" if failed else ""
     return [] if failed else [one for one in told[run] if isinstance(one, Outcome)], reason
 
 

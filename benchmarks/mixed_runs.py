@@ -82,7 +82,7 @@ class Outcome:
         return np.linalg.norm(self.shift, axis=-1)
 
 
-Told = dict[Run, list[Outcome | str]]  # of every draw, in order
+Told = dict[Run, list[Outcome | str | None]]  # of every draw, in order; None where a draw has not this run
 
 
 def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], seconds: float) -> Outcome:
@@ -169,13 +169,21 @@ def draw_runs(draw: int, frames: int, runs: Sequence[Run]) -> dict[Run, Outcome 
     return out
 
 
-def track_draws(draws: int, frames: int, runs: Sequence[Run], workers: int = 2) -> Told:
-    """All runs of all draws, in as many processes of one thread each."""
+def some_of(runs: Sequence[Run], draw: int, each: int | None) -> list[Run]:
+    """As many runs of one draw, the next ones in the next draw: all have their turn equally often, in a mixed order."""
+    if each is None or each >= len(runs):
+        return list(runs)
+    mixed = np.random.default_rng(0).permutation(len(runs))
+    return [runs[mixed[(draw * each + k) % len(runs)]] for k in range(each)]
+
+
+def track_draws(draws: int, frames: int, runs: Sequence[Run], each: int | None = None, workers: int = 2) -> Told:
+    """All runs of all draws, or so many of each, in as many processes of one thread each."""
     os.environ |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     told: list[dict[Run, Outcome | str]] = [{} for _ in range(draws)]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(draw_runs, draw, frames, runs): draw for draw in range(draws)}
+        jobs = {pool.submit(draw_runs, draw, frames, some_of(runs, draw, each)): draw for draw in range(draws)}
         for done, job in enumerate(as_completed(jobs), 1):
             told[jobs[job]] = job.result()
             print(f"  {done} of {draws} draws", end="\r", file=sys.stderr, flush=True)
-    return {run: [one[run] for one in told] for run in runs}
+    return {run: [one.get(run) for one in told] for run in runs}

@@ -62,7 +62,9 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     calibration = two / "Calib.qca.txt"
     together = prepared(read_take(_take(two, calibration, folder / "two")))
     by_himself = prepared(read_take(_take(one / "videos", calibration, folder / "one", 'image = "letterboxed"\n')))
-    people = people_in_view(together)
+    view = people_in_view(together)
+    assert view is not None
+    people = view.people
     _figure("people_two_tracks", float(len(people)))
     frames = [float(np.mean(p.views > 0)) for p in people]
     _figure("people_two_frames", 100 * min(frames))

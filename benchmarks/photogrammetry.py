@@ -7,11 +7,14 @@ from benchmarks.figures import run_parts
 PARTS = {
     "bar": "cameras from a bar with two targets, drawn",
     "dic": "speckle images with known displacement and strain, beside pyvale",
+    "dic_plates": "a rigid plate and a plate with a hole of pyvale's, one camera and two, beside pyvale",
     "lsm": "sub-pixel shifts and affinities of drawn texture, beside OpenCV",
     "stereo_cylinder": "a speckled cylinder before two cameras, in three positions",
     "surface_body": "a drawn textured arm through `kinefit surface` and `kinefit track`",
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",
+    "clicked": "poses from joints clicked in three images",
+    "retarget": "recorded motions on other characters, in the Khronos validator",
 }
 
 if __name__ == "__main__":

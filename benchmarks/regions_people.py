@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from benchmarks import mixed_real
 from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
-from benchmarks.silhouettes_track import CAMERAS, overlaps, tracked
+from benchmarks.silhouettes_track import CAMERAS, overlaps, tracked, trial_text
 from benchmarks.silhouettes_track import take_text as masks_text
 from kinefit.bodies import BodyState
 from kinefit.bodies.surfaces import body_mesh
@@ -44,15 +44,8 @@ GOALS = {
 
 def take_text(folder: Path, cameras: Sequence[str] = CAMERAS, *, regions: bool = True, first: bool = True) -> str:
     """The trial with the colours of some cameras, and with keypoints of its first frame, or of all."""
-    text = f'[take]\nup = "z"\nheight = 1.75\nframes = [0, {FRAMES}]\n'
-    text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
-    for camera in cameras:
-        boxed = 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
-        text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}'
-        text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/openpose_json/{camera}"\n'
-        text += 'set = "BODY_25B"\nframe = "calibration"\n' + ("frames = [0, 1]\n" if first else "")
-        text += f'[[region]]\ncamera = "{camera}"\n' if regions else ""
-    return text
+    beside = {camera: f'[[region]]\ncamera = "{camera}"\n' if regions else "" for camera in cameras}
+    return trial_text(folder, beside, "frames = [0, 1]\n" if first else "")
 
 
 def seen_of(text: str) -> Observations:

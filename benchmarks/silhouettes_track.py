@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -26,19 +26,25 @@ FRAMES = amount(100, 12)
 SCALE = 0.25  # at which the body and masks are compared
 
 
-def take_text(folder: Path, kind: str, cameras: Sequence[str] = CAMERAS, keypoints: str = "frames = [0, 1]") -> str:
-    """The trial with silhouettes of some cameras, and keypoints of its first frame."""
+def trial_text(folder: Path, beside: Mapping[str, str], keypoints: str) -> str:
+    """The trial with keypoints and, camera by camera, other sensors beside; `keypoints` stands in their tables."""
     text = f'[take]\nup = "z"\nheight = 1.75\nframes = [0, {FRAMES}]\n'
     text += f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n'
-    for camera in cameras:
+    for camera, sensors in beside.items():
         boxed = 'image = "letterboxed"\n' if camera in ("cam01", "cam02") else ""
         text += f'[[camera]]\nname = "{camera}"\nvideo = "{folder}/videos/{camera}.mp4"\n{boxed}'
         text += f'[[keypoints]]\ncamera = "{camera}"\nfile = "{folder}/openpose_json/{camera}"\n'
-        text += f'set = "BODY_25B"\nframe = "calibration"\n{keypoints}\n[[silhouette]]\ncamera = "{camera}"\n'
-        masks = f'file = "{folder}/person_masks/{camera}"\nframe = "video"\n'
-        plate = f'format = "background"\nfile = "{folder}/background_plate_{camera}.png"\n'
-        text += masks if kind == "masks" else plate
+        text += f'set = "BODY_25B"\nframe = "calibration"\n{keypoints}{sensors}'
     return text
+
+
+def take_text(folder: Path, kind: str, cameras: Sequence[str] = CAMERAS, keypoints: str = "frames = [0, 1]\n") -> str:
+    """The trial with silhouettes of some cameras, and keypoints of its first frame."""
+    masks = 'file = "{folder}/person_masks/{camera}"\nframe = "video"\n'
+    plate = 'format = "background"\nfile = "{folder}/background_plate_{camera}.png"\n'
+    own = masks if kind == "masks" else plate
+    beside = {c: f'[[silhouette]]\ncamera = "{c}"\n{own.format(folder=folder, camera=c)}' for c in cameras}
+    return trial_text(folder, beside, keypoints)
 
 
 def tracked(text: str) -> Motion:

@@ -38,7 +38,8 @@ def run() -> None:
             for name, rms in errors(Path(place), seed, frames=amount(40, 6), size=amount(640, 320)).items():
                 worst.setdefault(name, []).append(rms)
     for name, values in worst.items():
-        figure(f"surface_body_{name}", max(values), "deg RMS", "<= 2")
+        unit = "stated standard deviations, RMS" if name.endswith("deviations") else "deg RMS"
+        figure(f"surface_body_{name}", max(values), unit, "<= 2")
 
 
 def moving_arm(seed: int, frames: int) -> Motion:
@@ -94,7 +95,9 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
 
 
 def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, float]:
-    """RMS errors [deg] of the elbow's and wrist's angles, also without their means, and of the upper arm's turn."""
+    """RMS errors [deg] of the elbow's and wrist's angles, also without their means and in stated standard deviations,
+    and of the upper arm's turn.
+    """
     from kinefit.cli import main
 
     motion, rig = moving_arm(seed, frames), cameras(size)
@@ -114,6 +117,11 @@ def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, floa
     told_names = [name for name in names if "arm" not in name]
     out = {name: float(np.sqrt(np.mean(off[:, names.index(name)] ** 2))) for name in told_names}
     out |= {f"{name}_change": float(off[:, names.index(name)].std()) for name in told_names}
+    std = np.degrees(found.dof_std[:, 6:])
+    for name in told_names:
+        d = names.index(name)
+        print(f"  {name}: off {off[0, d]:.2f} to {off[-1, d]:.2f} deg, stated {std[0, d]:.2f} to {std[-1, d]:.2f} deg")
+        out[f"{name}_deviations"] = float(np.sqrt(np.mean((off[:, d] / std[:, d]) ** 2)))
     turned = [_turn(a.state(k), b.state(k), motion) for a, b, k in ((found, motion, k) for k in range(len(found)))]
     return {"upperarm": float(np.sqrt(np.mean(np.square(turned)))), **out}
 

@@ -51,6 +51,7 @@ PEERS: dict[str, Peer] = {
     "opensim": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_ik"),
     "opensim_takes": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_takes"),
     "pyvale": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_dic"),
+    "pyvale_plates": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_plates"),
     "momentum": Peer(*_MOMENTUM, ("markers",), **_MOMENTUM_FILES),
     "momentum_planes": Peer(*_MOMENTUM, ("planes",), **_MOMENTUM_FILES),
 }

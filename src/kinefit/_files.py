@@ -69,6 +69,9 @@ def _remedy(text: str, problem: str) -> str:
         if header := re.match(r"\s*\[\[?([^\[\]]{1,60})\]", line):
             return f"Tables that are there several times have two brackets, the first one too: [[{header[1].strip()}]]."
         return "It is there twice: keep one."
+    if "twice" in problem and (header := re.match(r"\s*\[\s*([^\[\]]{1,60}?)\s*\]", line)):
+        name = header[1]
+        return f"Of a table that may be there several times write [[{name}]], the first one too; of any other keep one."
     if re.fullmatch(r"[^\W\d][^\"'\[\]{}]{0,119}", value):
         return f"Put a text in quotes: {line.partition('=')[0].strip()[:60]} = \"{value}\"."
     return "Put texts in quotes and numbers not, and give numbers a point, not a comma: 1.5."

@@ -37,14 +37,17 @@ class KinefitError(Exception):
         remedy: str | None = None,
     ) -> None:
         self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
-        self.remedy = shortened(remedy, _ALL - len(self.problem) - len(self.place or "")) if remedy else remedy
-        where = ", ".join(str(part) for part in (file, self.place) if part)
+        told = shortened(str(file), _PATH) if file else ""
+        room = _ALL - len(self.problem) - len(self.place or "") - max(len(told) - _USUAL, 0)
+        self.remedy = shortened(remedy, max(room, _LEAST)) if remedy else remedy
+        where = ", ".join(part for part in (told, self.place) if part)
         text = f"{where}: {self.problem}" if where else self.problem
         super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
 
 
 _LISTED = 240  # characters of a list of names
 _LONGEST, _ALL = 300, 570  # characters of a problem, and of all parts: what a file gives them may be of any length
+_PATH, _USUAL, _LEAST = 260, 150, 60  # of a path, also one that a file names; of a usual one; of a remedy
 
 
 def shortened(text: str, longest: int = _LONGEST) -> str:

@@ -27,6 +27,7 @@ UP_AXES = {
 }
 
 
+BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
 _AT_ONCE = 2000  # frames of which all segments' poses are made at once
 _ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
 
@@ -112,7 +113,7 @@ class Motion:
     quality : (F,) in 0..1
         Share of the body that its measurements support; 0 in a frame without tracking.
     segment_quality : (F, S) in 0..1
-        0 for a segment that no measurement supports (lost, or hidden).
+        Share of what was measured of a segment that speaks for it; 0 for one of which nothing was. See `lost`.
     residuals : sensor name -> Residuals
     up : str
         Vertical axis of the world: "x", "y", "z", "-x", "-y" or "-z".
@@ -230,6 +231,11 @@ class Motion:
         return np.concatenate([
             self.body.trajectories(self.Ts_world_root[part], self.angles[part], points) for part in parts
         ])  # fmt: skip
+
+    @property
+    def lost(self) -> NDArray:
+        """(F, S) bool: segments that no measurement supports, or that more speaks against than for."""
+        return np.asarray(self.segment_quality < BELIEVED)
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""

@@ -139,6 +139,9 @@ def test_wrong_closures_are_told(old, new, told):
         ({"value": '"guess"'}, "a number, or \"estimate\""),
         ({"value": '"estimate"', "std": ""}, "with std = None"),
         ({"moves": '["rod end"]'}, "shifts closure"),
+        ({"value": "nan"}, "not finite"),
+        ({"value": "-inf"}, "not finite"),
+        ({"along": "along = [1e308, 0, 0]", "value": "9.0"}, "no dimensions"),
     ],
 )
 def test_wrong_dimensions_are_told(changes, told):
@@ -148,3 +151,9 @@ def test_wrong_dimensions_are_told(changes, told):
     text = '[[dimension]]\nname = "length"\nvalue = {value}\ndrawn = 0.4\nmoves = {moves}\n{along}\n{about}\n{std}\n'
     with pytest.raises(BodyError, match=told):
         parse_body(LAMP + text.format(**given))
+
+
+def test_a_dimension_that_is_no_number_is_told():
+    body = load_body("cyclist")
+    with pytest.raises(BodyError, match="of nan"):
+        with_dimensions(body, {body.dimensions[0].name: float("nan")})

@@ -213,6 +213,7 @@ def change(old, new):
         (change("turn = [5, 0, 0]", "radii = [1, 1, 1]"), "a joint morph has no radii"),
         (change("centre = [0.1, 0.1, 0.08]\n", ""), "a local morph without centre"),
         (change("radii = [0.1, inf, 0.1]", "radii = [0.1, 0.0, 0.1]"), "radii .* of a bulge"),
+        (change("radii = [0.1, inf, 0.1]", "radii = [0.1, nan, 0.1]"), "radii .* of a bulge"),
         (change("shift = [0.01, 0.0, 0.005]", "shift = [nan, 0.0, 0.005]"), "`shift` is not finite"),
         (change("end = -100", "end = -10"), "steered by arm_add_r from"),
         (change("weight = [[0.0, 1.0], [0.5, 0.2], [1.0, 0.0]]", 'weight = "cubic"'), "no weighting 'cubic'"),

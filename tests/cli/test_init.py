@@ -1,14 +1,21 @@
 """`kinefit init`: from a folder to a take that tracks."""
 
+import json
+import threading
+import urllib.request
+
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import kinefit.cli
+from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
+from kinefit.tracking.take_recording import recording_of
 
 
 @pytest.fixture(autouse=True)
@@ -98,3 +105,77 @@ def test_what_it_writes_can_be_tracked(folder, tmp_path):
     knees = [motion.body.tree.segment(f"shank_{side}") for side in "rl"]
     off = motion.segment_poses()[:, knees, :3, 3] - truth.segment_poses()[:, knees, :3, 3]
     assert np.median(np.linalg.norm(off, axis=-1)) < 0.03
+
+
+def clicked(folder, motion, frame=3, names=None):
+    """Clicks on the joints of a drawn take, as JSON has them."""
+    from kinefit.initialization.from_clicks import clickable
+
+    body, seen = motion.body, load_observations(read_take(folder / "take.toml"))
+    points = body.landmarks.select(names or clickable(body))
+    x = motion.positions(points)[frame]
+    uv = {c.name: c.project(x) for c in tuple(seen.rig)[:3]}
+    return {"step": frame, "points": {c: dict(zip(points.names, p.tolist())) for c, p in uv.items()}}
+
+
+def test_clicked_joints_give_body_and_start(folder, tmp_path):
+    motion = squat_and_wave()
+    assert run("init", folder).exit_code == 0
+    told = clicked(folder, motion)
+    (tmp_path / "clicks.json").write_text(json.dumps(told))
+    answer = run("init", folder, "--points", tmp_path / "clicks.json", "--force")
+    assert answer.exit_code == 0, answer.output
+    assert "points known in space" in answer.stdout
+    take = read_take(folder / "take.toml")
+    assert take.pose.step == 3 and take.body == str(folder / "clicked-body.npz")
+    body = load_body(take.body)
+    recording, _ = recording_of(take, load_observations(take), body)
+    step, state = recording.start
+    assert step == 3 - load_observations(take).frames[0]
+    joints = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, :, :3, 3]
+    assert np.linalg.norm(joints - motion.joint_centres[3], axis=1).max() < 0.05
+    told["points"]["cam02"]["r_knee"][0] += 60.0
+    told["points"]["cam02"]["r_knee"][1] += 90.0
+    (tmp_path / "clicks.json").write_text(json.dumps(told))
+    answer = run("init", folder, "--points", tmp_path / "clicks.json", "--force")
+    assert answer.exit_code == 2 and "r_knee: camera cam02 is off by" in answer.stderr
+    (tmp_path / "clicks.json").write_text('{"points": {"cam02": {"r_knee": [1]}}}')
+    answer = run("init", folder, "--points", tmp_path / "clicks.json", "--force")
+    assert answer.exit_code == 2 and "[1] is no pixel" in answer.stderr
+
+
+def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
+    assert run("init", folder).exit_code == 0
+    right, seen = clicked(folder, squat_and_wave(), frame=0), {}
+    wrong = json.loads(json.dumps(right))
+    for place in wrong["points"]["cam03"].values():
+        place[0] += 40.0
+        place[1] += 80.0
+
+    def browser(url):
+        def ask(path, told=None):
+            with urllib.request.urlopen(url + path, data=told and json.dumps(told).encode(), timeout=20) as answer:
+                return answer.read()
+
+        seen["page"], seen["asked"] = ask("").decode(), json.loads(ask("asked.json"))
+        seen["picture"] = cv2.imdecode(np.frombuffer(ask("picture/cam02"), np.uint8), 1).shape
+        seen["answers"] = [json.loads(ask("clicks", told)) for told in (wrong, right)]
+
+    monkeypatch.setattr("webbrowser.open", lambda url: threading.Thread(target=browser, args=(url,)).start())
+    answer = run("init", folder, "--click", "--force")
+    assert answer.exit_code == 0, answer.output
+    assert seen["asked"]["cameras"] == ["cam01", "cam02", "cam03", "cam04"] and "r_knee" in seen["asked"]["joints"]
+    assert "asked.json" in seen["page"] and seen["picture"] == (960, 544, 3)
+    assert [a["taken"] for a in seen["answers"]] == [False, True]
+    assert "Camera cam03 is off in" in seen["answers"][0]["told"]
+    assert read_take(folder / "take.toml").pose is not None
+    assert json.loads((folder / "clicks.json").read_text())["points"]["cam01"]
+
+
+def test_options_of_clicks_that_do_not_fit(folder, tmp_path):
+    for words, problem in ((["--step", 3], "--step is of --click"), (["--body", "arm"], "--body is of --click"),
+                           (["--click", "--points", "x"], "name one")):  # fmt: skip
+        answer = run("init", folder, *words)
+        assert answer.exit_code == 2 and problem in answer.stderr
+    answer = run("init", folder, "--points", tmp_path / "x.json")
+    assert answer.exit_code == 2 and "cannot be read" in answer.stderr

@@ -40,6 +40,18 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
         assert f"2 people are in view, person {k} is followed" in told.stdout
 
 
+def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
+    from kinefit.multiview import followed
+    from kinefit.tracking import take as module
+
+    calls = []
+    for of, name in ((module, "load_observations"), (followed, "people_of")):
+        original = getattr(of, name)
+        monkeypatch.setattr(of, name, lambda *a, f=original, n=name, **more: (calls.append(n), f(*a, **more))[1])
+    assert run("track", take, *QUIET, "--out", tmp_path).exit_code == 0
+    assert sorted(calls) == ["load_observations", "people_of"]
+
+
 @pytest.mark.parametrize(("who", "index"), [("moving", 1), ("nearest 1.2 0.9 0", 1), ("nearest 0 0.9 0", 0)])
 def test_one_is_followed_by_option_or_by_key(who, index, take, tmp_path):
     told = run("track", take, *QUIET, "--person", who, "--out", tmp_path / "option")
@@ -56,7 +68,7 @@ def test_one_is_followed_by_option_or_by_key(who, index, take, tmp_path):
 @pytest.mark.parametrize("wrong", ["0", "tallest", "nearest 1 2", "nearest 1 2 x", "-1", "nearest nan 0 0", ""])
 def test_a_person_that_cannot_be_is_told(wrong, take, tmp_path):
     told = run("track", take, "--person", wrong, "--out", tmp_path / "out")
-    assert told.exit_code == 2 and "[take] person" in told.stderr and '"moving"' in told.stderr
+    assert told.exit_code == 2 and "--person" in told.stderr and '"moving"' in told.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -11,6 +11,8 @@ from kinefit.exporters import write_motion
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import cut, squat_and_wave
 
+TWICE = '\n[[keypoints]]\ncamera = "cam01"\nfile = "mediapipe_cam01.npy"\nformat = "mediapipe"\nsigma = 3.0\n'
+
 
 def run(*args):
     return CliRunner().invoke(main, [str(arg) for arg in args])
@@ -172,3 +174,86 @@ def test_a_folder_of_results_stands_for_the_motion_in_it(tmp_path):
     write_motion(cut(squat_and_wave(), 0, 4), tmp_path / "motion.npz")
     assert run("export", tmp_path, "--to", "bvh").exit_code == 0
     assert (tmp_path / "motion.bvh").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(("calibrate", "baar"), "Did you mean 'bar'?"), (("markers", "ident"), "Did you mean 'identify'?"),
+     (("body", "xyz"), "There are: check, copy, picture."), (("calibrate", "bar", "x"), "'--length'. Give --length M."),
+     (("calibrate", "bar", "--length", "1"), "'VIDEO_FOLDER_OR_CSV...'.")],
+)  # fmt: skip
+def test_commands_of_a_group_are_told(words, told):
+    answer = run(*words)
+    assert answer.exit_code == 2 and answer.stderr.rstrip().endswith(told)
+
+
+def test_a_bar_is_checked_before_any_work(take, tmp_path):
+    for words, told in (
+        ([take.parent, "--length", "900"], "a bar of 900 m\n    at length\n   try Give it in metres, such as 0.9"),
+        ([take.parent, "--length", "90"], "such as 0.9"),
+        ([take.with_name("cam01.mp4"), "--length", "0.9"], "1 camera: a bar calibrates two or more together"),
+    ):
+        answer = run("calibrate", "bar", *words, "--out", tmp_path / "c.toml")
+        assert answer.exit_code == 2 and told in answer.stderr and "finding targets" not in answer.stderr, answer.stderr
+
+
+def test_who_is_followed_is_told_of_the_option(take):
+    told = run("track", take, "--person", "moveing").stderr
+    assert "at --person" in told and '"moving"' in told and "[take]" not in told
+
+
+def test_formats_may_stand_apart():
+    from kinefit.cli.track import chosen_formats
+
+    assert chosen_formats(None, None, "csv bvh, GLB csv") == ("csv", "bvh", "glb")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [("up = ", 'unit = "mm"\nup = ', "'unit' belongs to [calibration], [[markers]], [[depth]]"),
+     ("rate = 30.0", "rate = 25.0", "Leave rate out of [take]: the videos state theirs"),
+     ("[[camera]]", "[camera]", "write [[camera]], the first one too"),
+     ('format = "mediapipe"', 'format = "openpose"', '.npy files are of format = "mediapipe"'),
+     ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is of camera cam02, too"),
+     ("cam02.mp4", "cam01.mp4", "cam01.mp4 is of camera cam02, too"), ("", TWICE, "the same file twice")],
+)  # fmt: skip
+def test_slips_of_a_take_are_told(take, old, new, told):
+    text = take.read_text()
+    take.write_text(text.replace(old, new) if old else text + new)
+    answer = run("track", take)
+    assert answer.exit_code == 2 and told in answer.stderr
+
+
+def test_check_of_one_camera_says_that_one_is_too_few(take):
+    text = take.read_text()
+    start, *tables = re.split(r"(?m)^(?=\[\[)", text)
+    take.write_text(start + "".join(table for table in tables if "cam01" in table))
+    told = run("check", take)
+    assert "One camera does not tell how far a person is; two cameras do" in told.stdout
+
+
+def test_a_take_of_any_table_is_found_in_its_folder(take):
+    text = take.read_text() + '[session]\nsubject = "P07"\n'
+    take.unlink()
+    take.with_name("monday.toml").write_text(text)
+    assert read_take(take.parent).path.name == "monday.toml"
+
+
+def test_another_file_than_a_motion_is_answered_with_its_command(take, monkeypatch):
+    monkeypatch.chdir(take.parent)
+    for name, told in (("take.toml", "kinefit track take.toml"), ("cam01.mp4", "that `kinefit track` wrote")):
+        answer = run("export", name, "--to", "bvh")
+        assert answer.exit_code == 2 and told in answer.stderr and "Zip" not in answer.stderr
+
+
+def test_units_and_axes_of_an_export_are_spelled_as_people_do(tmp_path):
+    write_motion(cut(squat_and_wave(), 0, 4), tmp_path / "motion.npz")
+    told = run("export", tmp_path, "--to", "trc", "--unit", "Millimetres", "--up", "Z", "--out", tmp_path / "a.trc")
+    assert told.exit_code == 0 and "unit mm, up z" in told.stdout
+    told = run("export", tmp_path, "--to", "trc", "--unit", "inch")
+    assert told.exit_code == 2 and "m, cm, mm; not inch" in told.stderr
+
+
+def test_static_points_are_looked_for_before_any_work(take):
+    told = run("check", take, "--refine", "--points", "nothing.toml")
+    assert told.exit_code == 2 and "no such file: nothing.toml" in told.stderr and not told.stdout

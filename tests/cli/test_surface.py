@@ -119,7 +119,7 @@ def test_a_real_board_from_seeds_by_hand_is_flat(data_dir, tmp_path):
         (["a={0}/a", "b={0}/b", "--window", "even"], ObservationError, "window of 'even'"),
         (["a={0}/a", "b={0}/b", "--window", "14"], ObservationError, "odd number"),
         (["a={0}/a", "b={0}/b", "--still", "7"], ObservationError, "state 7 of 3"),
-        (["a={0}/a", "b={0}/b", "--seeds", "{0}/calib.toml"], FileError, "cannot be read"),
+        (["a={0}/a", "b={0}/b", "--seeds", "{0}/calib.toml"], FileError, "line 2: 'name = \"a\"' is no number"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(folder, tmp_path, words, error, text):

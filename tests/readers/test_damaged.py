@@ -1,6 +1,8 @@
 """Every reader on damaged files: a typed error or a result, soon and in little memory; and what was found so."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -12,15 +14,24 @@ import numpy as np
 import pytest
 from benchmarks.fuzz import SLOW, fuzz
 from benchmarks.fuzz_mutations import mutated
-from benchmarks.fuzz_seeds import ASF, READERS, seed_of
+from benchmarks.fuzz_readers import READERS, seed_of
+from benchmarks.fuzz_seeds import ASF
 from benchmarks.fuzz_worker import LONGEST
 
-from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError
+from kinefit._files import parse_toml
+from kinefit.bodies import load_body
+from kinefit.bodies.surfaces import Metaballs
+from kinefit.cli._surface import read_seeds
+from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
-from kinefit.readers.keypoints import read_caliscope_csv
+from kinefit.readers.depth.images import listed
+from kinefit.readers.guess.names import camera_number, natural
+from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.asf import read_asf
 from kinefit.readers.static_points import read_static_points
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.surface_points import read_surface_points
 from kinefit.readers.video import Video
 
 COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
@@ -60,7 +71,8 @@ def test_damage_is_the_same_in_every_run():
 @linux
 def test_a_reader_that_fails_is_counted(tmp_path):
     code = (
-        "import benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w, os, sys, numpy as np\n"
+        "import os, numpy as np\n"
+        "import benchmarks.fuzz_readers as r, benchmarks.fuzz_seeds as s, benchmarks.fuzz_worker as w\n"
         "def make(folder):\n"
         "    (folder / 'a').write_bytes(b'1')\n"
         "    whole = [True]\n"
@@ -70,7 +82,7 @@ def test_a_reader_that_fails_is_counted(tmp_path):
         "        if KIND == 'memory': return np.ones(10**9)\n"
         "        os.abort()\n"
         "    return s.Seed((folder / 'a',), read)\n"
-        "s.READERS['x'] = make; w.main('x', 0, 1, 500)\n"
+        "r.READERS['x'] = make; w.main('x', 0, 1, 500)\n"
     )
     for kind in ("untyped", "memory", "abort"):
         words = [sys.executable, "-c", code.replace("KIND", repr(kind))]
@@ -159,3 +171,122 @@ def test_points_at_the_end_of_the_world_are_told(tmp_path):
     cloud = Cloud(points, (20, 20), np.eye(4))
     with pytest.raises(CalibrationError, match="no camera sees"):
         camera_of(cloud, "a", tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("base", ["humanoid" + "(" * 5000, "../../x", "a\\u0000.toml", "b" * 5000 + ".toml"])
+def test_a_base_that_cannot_be_a_file_is_told(tmp_path, base):
+    (tmp_path / "body.toml").write_text(f'[body]\nname = "thing"\nbase = "{base}"\n')
+    with pytest.raises(BodyError) as error:
+        load_body(tmp_path / "body.toml")
+    assert error.value.place == "body.base" and len(str(error.value)) < LONGEST + 60
+
+
+@pytest.mark.parametrize("mesh", ["a\\u0000.obj", "[" * 5000, "a/" * 3000 + "a.obj"])
+def test_a_mesh_that_cannot_be_a_file_is_told(tmp_path, mesh):
+    seed = seed_of("body mesh", tmp_path)
+    body = tmp_path / "body.toml"
+    body.write_text(body.read_text().replace("a.obj", mesh))
+    with pytest.raises(BodyError, match="cannot read the mesh") as error:
+        seed.read()
+    assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST
+
+
+@pytest.mark.parametrize("ball", ["radii = [1e-320, 0.06, 0.05]", "at = [0, 0, 1e308]", "radii = [0.1, 1e300, 1]"])
+def test_metaballs_of_no_size_are_told(tmp_path, ball):
+    key = ball.split()[0]
+    seed = seed_of("metaballs toml", tmp_path)
+    text = (tmp_path / "body.toml").read_text()
+    (tmp_path / "body.toml").write_text(re.sub(rf"{key} = \[[^\]]*\](?=[^\n]*\}},\n)", ball, text, count=1))
+    with pytest.raises(BodyError, match="ball 1 at"):
+        seed.read()
+
+
+def test_a_thin_ball_beside_thick_ones_is_drawn():
+    balls = Metaballs.of(0, [[0, 0, 0], [0, 0.002, 0], [0, 0.6, 0]], [[2e-4] * 3, [0.002] * 3, [1.0] * 3])
+    assert np.isfinite(balls.vertices).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("1,2,3,4\n1,2,3\n", "line 2: 3 columns for 2 views"), ("u,v,u,v\n\n1,2,x,4\n", "line 3: 'x' is no number"),
+     ("1,2,3,4\0\n", "no number"), ("u,v,u,v\n", "no points"), ('1,2,3,"' + "4" * 140_000, "field larger")],
+)  # fmt: skip
+def test_a_table_of_seeds_that_is_none_is_told(tmp_path, text, told):
+    (tmp_path / "seeds.csv").write_text(text)
+    with pytest.raises(FileError, match=told):
+        read_seeds(tmp_path / "seeds.csv", 2)
+
+
+def test_a_file_that_still_can_be_read_is_damaged_within():
+    toml = b'[take]\nrate = 30.0\nname = "a"\n[[camera]]\nname = "b"\nsize = [64, 48]\n'
+    tree = b'{"version": 1.3, "people": [{"points": [1, 2, 3]}]}'
+    for data, parse in ((toml, lambda text: parse_toml(text.decode(), "a")), (tree, json.loads)):
+        read = 0
+        for i in range(100):
+            damaged = mutated(data, [2, i])
+            try:
+                read += parse(damaged) != parse(data)
+            except (KinefitError, ValueError):
+                continue
+        assert read > 20
+
+
+def test_times_of_a_surface_that_cannot_be_are_told(tmp_path):
+    head = "time_s,point,x,y,z,std_x,std_y,std_z\n"
+    odd = (((0, 1e-320), "apart"), ((0, 1e20), "apart"), ((1e308, 2e307), "apart"), ((1e12, 1e12 + 1), "from 1e"))
+    for times, told in odd:
+        rows = "".join(f"{time!r},1,0,0,1,0.1,0.1,0.1\n" for time in times)
+        (tmp_path / "a.csv").write_text(head + rows)
+        with pytest.raises(ObservationError, match=told):
+            read_surface_points(tmp_path / "a.csv")
+
+
+def test_a_camera_of_five_thousand_digits_has_a_number():
+    assert camera_number("cam" + "0" * 5000 + "12") == 12
+    assert natural("1\u00b22.png") > natural("1a.png")
+
+
+def test_a_video_that_claims_more_than_there_is_memory_for_is_told(tmp_path):
+    seed = seed_of("video mp4", tmp_path)
+    data = bytearray(seed.files[0].read_bytes())
+    at = data.index(b"stsz") + 12
+    data[at : at + 4] = bytes([0xFF, 0xFF, 0xFF, 0x0F])
+    seed.files[0].write_bytes(data)
+    with pytest.raises(FileError):
+        seed.read()
+
+
+@pytest.mark.parametrize(("name", "told"), [("a**.png", "no such file"), ("a/" * 3000, "too long"), ("[*", "no such")])
+def test_a_pattern_that_cannot_be_is_told(tmp_path, name, told):
+    entry = f'[[depth]]\nname = "d"\nfile = "{name}"\nintrinsics = [60.0, 60.0, 32.0, 24.0]\n'
+    (tmp_path / "take.toml").write_text(f"[take]\nrate = 30.0\n{entry}")
+    with pytest.raises(KinefitError, match=told):
+        read_take(tmp_path / "take.toml")
+
+
+def test_two_stars_are_one(tmp_path):
+    (tmp_path / "a1.png").touch()
+    assert listed(tmp_path / "a**.png") == [tmp_path / "a1.png"]
+
+
+@pytest.mark.parametrize("stature", ["nan", "inf", "-1.0"])
+def test_a_stature_that_is_none_is_told(tmp_path, stature):
+    (tmp_path / "a.toml").write_text(f'[body]\nname = "a"\nbase = "arm"\nstature = {stature}\n')
+    with pytest.raises(BodyError, match="a stature of"):
+        load_body(tmp_path / "a.toml")
+
+
+def test_a_morph_of_a_segment_without_a_name_is_told(tmp_path):
+    seed = seed_of("body toml", tmp_path)
+    body = tmp_path / "body.toml"
+    kind = re.search(r'kind = "joint"\n(?:[^\n\[]*\n)*?segment = "(\w+)"', body.read_text())
+    body.write_text(body.read_text().replace(kind[0], kind[0].replace(kind[1], "")))
+    with pytest.raises(BodyError, match="no segment ''"):
+        seed.read()
+
+
+def test_a_camera_of_five_thousand_digits_is_none_of_a_table(tmp_path):
+    path = caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", "1,0,0.1,3,5,6")
+    with pytest.raises(ObservationError, match="no camera in this table") as error:
+        read_keypoints(path, format="caliscope", camera="cam" + "9" * 5000, rate=10.0)
+    assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST

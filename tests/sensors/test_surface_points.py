@@ -129,3 +129,30 @@ def test_a_point_of_another_limb_is_let_go_and_given_anew():
     before = set(sensor.anchors)
     sensor.learn(sensor.prepare(frame(other), wrong), wrong, True)
     assert len(before & set(sensor.anchors)) > 0.5 * len(before)
+
+
+def test_how_a_limb_was_turned_at_first_lasts():
+    arm = load_body("arm")
+    points, _, segment = sample(arm, 200)
+    sensor, tree = SurfacePointSensor("skin"), arm.tree
+    tracker = Tracker(arm, Rig(()), rate=30.0, sensors=[sensor])
+    angles = np.array(arm.usual_state().angles)
+    angles[tree.coordinate("elbow_flex_r")] = 1.2
+    tracker.start_at(BodyState(np.eye(4), angles))
+    forearm, turned = tree.segment("forearm_r"), tree.coordinate("pro_sup_r")
+    stated, rng = [], np.random.default_rng(0)
+    for k in range(18):
+        angles[turned] += 0.01
+        f = Scene(arm, BodyState(np.eye(4), angles), Rig(())).frames[segment]
+        x = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), points) + f[:, 9:]
+        x += 1e-3 * rng.normal(size=x.shape)
+        seen = SurfacePointFrame("skin", k / 30.0, np.arange(len(x)), x, np.tile(1e-6 * np.eye(3), (len(x), 1, 1)))
+        result = tracker.update([seen])
+        if forearm in {s for s, _ in sensor.anchors.values()}:
+            stated.append(result.dof_std[6 + turned])
+    at_first = np.linalg.norm(sensor.turns[forearm])
+    assert len(stated) > 5 and at_first > 0.1  # [rad] a round limb's cloud tells no more
+    assert min(stated) > at_first
+    sensor.turns = {}
+    exact = tracker.update([SurfacePointFrame("skin", 0.6, seen.ids, x, seen.covariance)])
+    assert exact.dof_std[6 + turned] < 0.85 * min(stated)  # by what it says from frame to frame

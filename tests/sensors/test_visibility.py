@@ -100,6 +100,30 @@ def test_no_measurement_tells_nothing(scene):
     assert verdict.hidden.all() and not verdict.lost.any() and not verdict.quality.any()
 
 
+def test_a_limb_in_blank_pixels_is_flagged_and_the_others_are_not(scene):
+    body, state, camera, layers = scene
+    depth = seen(body, state, camera)
+    depth[depth == WALL] = 0.0  # out of the sensor's range
+    other = turned(body, state, "arm_add_r", -1.2)
+    verdict = judged(body, other, layers, depth, camera)
+    arm = np.array([s in ("upperarm_r", "forearm_r", "hand_r") for s in body.tree.segments])
+    assert verdict.evidence.lost[arm & (verdict.counts[:, kernels.OWN] > 40)].all() and arm.any()
+    assert not verdict.evidence.lost[~arm].any()
+    assert not judged(body, state, layers, depth, camera).evidence.lost.any()
+
+
+def test_holes_and_a_sensor_that_sees_little_of_the_body_tell_nothing(scene):
+    body, state, camera, layers = scene
+    depth = seen(body, state, camera)
+    holes = depth.copy()
+    holes[::6] = holes[:, ::6] = 0.0  # 5 cm apart, a pixel wide
+    assert not judged(body, state, layers, holes, camera).evidence.lost.any()
+    legs = depth.copy()
+    legs[130:] = 0.0  # dark trousers
+    verdict = judged(body, state, layers, legs, camera)
+    assert not verdict.evidence.lost.any() and verdict.evidence.hidden.any()
+
+
 def test_verdicts_of_sensors_add_up(scene):
     body, state, camera, layers = scene
     clear = judged(body, state, layers, seen(body, state, camera), camera)

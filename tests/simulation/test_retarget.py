@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.joint_names import recorded_joints
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
@@ -13,7 +14,7 @@ from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.amc import read_amc
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import cut, resampled, retarget, squat_and_wave
-from kinefit.simulation.skeletons import bone_directions, family_of
+from kinefit.simulation.skeletons import bone_directions
 
 BONES = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
 RECORDINGS = [  # file, family, frames, largest median and 95th percentile of the error [deg]
@@ -46,7 +47,7 @@ def test_bones_point_where_the_recorded_ones_do(data_dir, name, family, frames, 
     skeleton = read(data_dir, name)
     rate = min(60.0, skeleton.rate)
     motion = retarget(skeleton, rate=rate)
-    assert (family_of(skeleton).name, len(motion), motion.rate, motion.up) == (family, frames, rate, "y")
+    assert (recorded_joints(skeleton.names).family, len(motion), motion.rate, motion.up) == (family, frames, rate, "y")
     source = bone_directions(skeleton)
     source = source if rate == skeleton.rate else source.resampled(rate)
     errors = np.concatenate([

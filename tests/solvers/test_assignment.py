@@ -8,7 +8,7 @@ from kinefit.errors import ObservationError
 from kinefit.solvers.assignment import assign
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (4, 4), (3, 7), (8, 2), (12, 12)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 6), (5, 1), (4, 4), (3, 7), (8, 2), (12, 12)])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_total_is_the_least(shape, seed):
     cost = np.random.default_rng(seed).normal(size=shape)
@@ -31,6 +31,7 @@ def test_who_costs_too_much_stays_alone(seed):
 
 def test_what_is_impossible_is_no_pair():
     assert assign([[np.inf, 1.0], [np.inf, 2.0]]) == [(0, 1)]
+    assert assign([[0.5], [0.4], [np.inf]], 0.45) == [(1, 0)] and assign([[0.5, 0.6]], 0.45) == []
     assert assign(np.full((2, 2), np.inf)) == [] and assign(np.zeros((0, 3))) == []
     assert sorted(assign([[np.inf, 1.0], [2.0, 100.0]])) == [(0, 1), (1, 0)]
 

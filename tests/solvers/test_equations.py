@@ -145,6 +145,20 @@ def test_rows_of_every_kind_together(body):
     assert found.cost == pytest.approx(cost, rel=1e-12)
 
 
+def test_shares_count_beyond_the_loss(body):
+    state = state_of(body, "random")
+    parts = [
+        random_rows(body, state), random_pairs(body, state), random_parameters(body), random_dense(body),
+    ]  # fmt: skip
+    shares = (0.3, 0.5, 2.0, 0.7)
+    found = normal_equations(body, state, parts, loss=huber(), shares=shares)
+    each = [dense([part], body, state, huber()) for part in parts]
+    H, g, cost = (sum(share * one[k] for share, one in zip(shares, each)) for k in range(3))
+    np.testing.assert_allclose(found.matrix, H, atol=1e-11 * np.abs(H).max())
+    np.testing.assert_allclose(found.gradient, g, atol=1e-11 * np.abs(g).max())
+    assert found.cost == pytest.approx(cost, rel=1e-12)
+
+
 def test_pairs_alone_and_parameters_alone(body):
     state = state_of(body, "random")
     for part in (random_pairs(body, state), random_parameters(body)):

@@ -290,3 +290,13 @@ def test_angles_that_nothing_observes_have_the_posture_priors_covariance():
         V[np.ix_(own, own)] / deviation / deviation[:, None],
         expected[np.ix_(own, own)] / deviation / deviation[:, None], atol=0.03,
     )  # fmt: skip
+
+
+def test_shares_leave_what_nothing_observes_its_variance():
+    p, wanted = prior(dt=1 / 60), np.geomspace(1e-3, 1e9, 13)
+    found = p._shares(wanted)
+    theta = np.geomspace(1e-7, np.pi, 40000)
+    z = np.exp(1j * theta)
+    density = np.abs((1 - z) * (1 - p.keep[0] * z) * (1 - p.keep[1] * z)) ** 2
+    for w, variance in zip(found, wanted):
+        assert np.trapezoid(1.0 / (w + density), theta) / np.pi == pytest.approx(variance, rel=1e-3)

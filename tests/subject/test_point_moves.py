@@ -23,10 +23,21 @@ class Slow:
         self.problem, self.body, self.parts = problem, problem.body, problem.parts
 
 
+class Untold:
+    """The same parameters, which do not tell how points move with them."""
+
+    of_points = True
+
+    def __init__(self, one):
+        self.names, self.mean, self.information, self.step = one.names, one.mean, one.information, one.step
+        self.touches, self.apply = one.touches, one.apply
+
+
+@pytest.mark.parametrize("kind", [lambda one: one, Untold])
 @pytest.mark.parametrize("seed", range(3))
-def test_they_are_those_of_rows_in_other_worlds(seed):
+def test_they_are_those_of_rows_in_other_worlds(seed, kind):
     rig, states = rig_around((0.0, 0.0, 0.0), cameras=3), [posture(BODY, 3 + seed, 0.3)]
-    parameters = [SegmentScales(BODY), PointOffsets(BODY, "COCO_17", 0.01)]
+    parameters = [kind(SegmentScales(BODY)), kind(PointOffsets(BODY, "COCO_17", 0.01))]
     points = BODY.keypoints("COCO_17")
     x = BODY.positions(states[0], points)
     frames = [
@@ -40,3 +51,14 @@ def test_they_are_those_of_rows_in_other_worlds(seed):
     assert not np.isnan(problem.columns(theta, step, states)[0]).any()
     assert np.abs(slow[:, 0]).max() > 1.0
     np.testing.assert_allclose(quick, slow, atol=1e-4)
+
+
+def test_lengths_carry_places_along():
+    told = [PointOffsets(BODY, "COCO_17", 0.01), SegmentScales(BODY)]  # shifted first, then stretched
+    theta = np.random.default_rng(0).normal(scale=0.05, size=sum(len(one.names) for one in told))
+    step, moved = np.full(len(theta), 1e-4), []
+    places = [("COCO_17", name) for name in BODY.keypoints("COCO_17").names]
+    for parameters in (told, [Untold(one) for one in told]):
+        worlds = Worlds(World(BODY, rig_around((0.0, 0.0, 0.0))), parameters)
+        moved.append(worlds.moves(theta, step, np.arange(len(theta)))._of(places))
+    np.testing.assert_allclose(moved[0], moved[1], atol=1e-7)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 ESTIMATE = "estimate"
 _NAMED = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_LARGEST = 1e4  # [m] or [deg] of a dimension
 _CLOSE = {"line": "axis", "plane": "axis"}
 
 
@@ -179,9 +180,10 @@ def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, 
             raise wrong(f"an angle that moves '{name}'", "Angles turn rigid closures, and nothing else.")
         if kinds[0] and r.along is not None and closures[name].to:
             raise wrong(f"it shifts closure '{name}' between two landmarks", "Name one of the landmarks.")
-    numbers = [r.drawn, *(r.along or r.about or ()), *([] if r.mean is None else [r.mean])]
-    if not np.isfinite(numbers).all():
-        raise wrong("numbers that are not finite", "Give metres and degrees.")
+    told = [r.mean, None if isinstance(r.value, str) else r.value]
+    numbers = [r.drawn, *(r.along or r.about or ()), *(number for number in told if number is not None)]
+    if not (np.abs(numbers) < _LARGEST).all():
+        raise wrong("numbers that are not finite, or no dimensions of anything", "Give metres and degrees.")
     axis = (0.0, 0.0, 0.0)
     if r.about is not None:
         unit_axis = _unit(r.about)

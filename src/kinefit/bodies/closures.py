@@ -123,12 +123,14 @@ def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
     Raises
     ------
     BodyError
-        A dimension that the body does not have.
+        A dimension that the body does not have, or a value that is not finite.
     """
     known = {d.name: d for d in body.dimensions}
     for name in values:
         if name not in known:
             raise BodyError(choices(f"dimension of body '{body.name}' named", name, known), remedy="Use one of these.")
+        if not np.isfinite(values[name]):
+            raise BodyError(f"dimension '{name}' of {values[name]}", remedy="Give metres, or radians.")
     offsets, points = np.array(body.tree.offsets), np.array(body.landmarks.points)
     closures = {c.name: c for c in body.closures}
     moved = False

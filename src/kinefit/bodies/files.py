@@ -16,7 +16,7 @@ from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closure_files import closed, with_closure_images
 from kinefit.bodies.couplings import coupled, with_posture
 from kinefit.bodies.morph_files import morphs_of, with_images
-from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged
+from kinefit.bodies.records import FileRecord, JointRecord, MarkerSetRecord, SegmentRecord, Vector, merged, stature_of
 from kinefit.bodies.serial import saved_body
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skin_files import skin_of
@@ -55,16 +55,17 @@ def _text(name_or_file: str | Path) -> tuple[str, str]:
     if path.suffix == ".toml":
         try:
             return path.read_text(encoding="utf-8"), str(path)
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, ValueError) as error:
             remedy = "Give the path of a text file (UTF-8) in TOML."
-            raise BodyError(f"cannot read the body file ({error})", file=path, remedy=remedy) from error
+            problem = f"cannot read the body file ({getattr(error, 'strerror', None) or error})"
+            raise BodyError(problem, file=path, remedy=remedy) from error
     else:
-        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
-        if not entry.is_file():
+        if str(name_or_file) not in catalogue():
             raise BodyError(
                 choices("body in the catalogue named", str(name_or_file), catalogue()),
                 remedy="A body file of your own is given by its path, ending in .toml.",
             )
+        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
         return entry.read_text(encoding="utf-8"), f"catalogue body {name_or_file}"
 
 
@@ -115,7 +116,7 @@ def parse_body(text: str, source: str = "body") -> Body:
             for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
         ),
         aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
-        stature=record.body.stature or 0.0,
+        stature=stature_of(record.body.stature or 0.0, source),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(with_images(record.morph, _left) if mirror else record.morph, tree, source),
     )

@@ -102,7 +102,7 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
     _check_keys(record)
     if record.angle not in tree.coordinates:
         raise BodyError(choices("angle", record.angle, tree.coordinates), remedy="Use one of these.")
-    for name in [*([record.segment] if record.segment else []), *(record.on or [])]:
+    for name in [*([] if record.segment is None else [record.segment]), *(record.on or [])]:
         if name not in tree.segments:
             raise BodyError(choices("segment", name, tree.segments), remedy="Use one of these, or add it.")
     for what, value in (("shift", record.shift), ("turn", record.turn), ("centre", record.centre)):
@@ -116,7 +116,7 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         return _joint_motion(record, record.segment, tree, steering)
     if record.kind == "local":
         assert record.centre and record.radii and record.shift
-        if not min(record.radii) > 0.0:
+        if not all(radius > 0.0 for radius in record.radii):
             raise BodyError(f"radii {list(record.radii)} of a bulge", remedy="Give positive ones; inf leaves one out.")
         placed = np.array(record.centre), np.array(record.radii), np.array(record.shift)
         return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from os import PathLike
+
 import msgspec
 
 from kinefit.bodies.closure_files import ClosureRecord, DimensionRecord
 from kinefit.bodies.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
 from kinefit.bodies.surfaces.skin_files import SkinRecord
+from kinefit.errors import BodyError
 
 Vector = tuple[float, float, float]
 
@@ -62,6 +65,22 @@ class HeadRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True)
     base: str | None = None
     stature: float | None = None
     mirror: bool | None = None
+
+
+def stature_of(value: float, source: str | PathLike[str] | None = None) -> float:
+    """[m] as a file states it; 0 where it does not.
+
+    Raises
+    ------
+    BodyError
+        A number that is no stature.
+    """
+    if not 0 <= value <= _TALLEST:
+        raise BodyError(f"a stature of {value:g} m", file=source, place="body.stature", remedy="Give metres.")
+    return value
+
+
+_TALLEST = 100.0  # [m]: of machines, too
 
 
 class MarkerSetRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
+from kinefit.bodies.records import stature_of
 from kinefit.bodies.serial_morphs import (
     morphs_from_arrays,
     morphs_to_arrays,
@@ -122,7 +123,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
             for key in arrays
             if key.startswith("aliases/")
         },
-        stature=float(_array(arrays, "stature", ())),
+        stature=stature_of(float(_array(arrays, "stature", ()))),
         morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
         skin=skin_from_arrays(arrays, n_segments),
         closures=_decoded(arrays, "closures", Closure),

@@ -7,7 +7,7 @@ The degrees of freedom of a body are the root's twist (v, ω) in the world about
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -93,6 +93,13 @@ class KinematicTree:
     def posture_precision(self) -> NDArray:
         """(D, D) inverse covariance of the posture prior, a Gaussian about `usual`; zero where there is no prior."""
         return _frozen(np.diag(np.square(1.0 / self.spread)) + self.couplings.T @ self.couplings)
+
+    @cached_property
+    def held_by_posture(self) -> tuple[NDArray, NDArray]:
+        """(H,) coordinates with a posture prior, and their (H, H) inverse covariance; (H,) where none are coupled."""
+        held = np.flatnonzero(np.isfinite(self.spread))
+        precision = self.posture_precision[np.ix_(held, held)]
+        return _frozen(held, np.int64), _frozen(precision if self.coupled else np.diag(precision))
 
     def posture_cost(self, angles: NDArray, share: float = 1.0) -> float:
         """A share of the posture prior's cost of angles (D,)."""
@@ -185,7 +192,10 @@ class KinematicTree:
 
     def with_offsets(self, offsets: NDArray) -> KinematicTree:
         """The same tree with other joint centres, (S, 3) [m]."""
-        return replace(self, offsets=offsets)
+        out = object.__new__(KinematicTree)  # what does not depend on them is not made again
+        out.__dict__.update(self.__dict__, offsets=_frozen(offsets))
+        out.__dict__.pop("rest", None)
+        return out
 
     def forward(self, T_world_root: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
         """Frames (S, 12) and screws (D, 6) of one pose; see `_kernels.forward`."""

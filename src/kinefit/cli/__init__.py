@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from difflib import get_close_matches
 from importlib import import_module
 from typing import Any
 
@@ -15,6 +14,7 @@ import click
 
 from kinefit import __version__
 from kinefit.cli import _screen
+from kinefit.cli._group import Group
 from kinefit.errors import KinefitError
 
 COMMANDS = (
@@ -44,7 +44,7 @@ _WORDS = "kinefit.words"
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
-class _Commands(click.Group):
+class _Commands(Group):
     """Commands that are imported when they are called; errors become messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -60,11 +60,7 @@ class _Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that is meant; the nearest one where there is none of the name."""
-        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
-            near = get_close_matches(args[0].lower(), COMMANDS, n=1, cutoff=0.5)
-            told = f" Did you mean '{near[0]}'?" if near else f" There are: {', '.join(COMMANDS)}."
-            raise click.UsageError(f"No such command '{args[0]}'.{told}", ctx)
+        """The command that is meant, and its words."""
         ctx.meta[_WORDS] = args[1:]
         return super().resolve_command(ctx, args)
 
@@ -117,8 +113,8 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
             found.append(f"{option} {value or next((word for word in words[k + 1 :] if word != '='), '')}".strip())
     if found:
         return f" Did you mean {' '.join(found)}?"
-    if isinstance(error, click.MissingParameter) and error.param is not None and error.param.metavar:
-        return f"Give {error.param.opts[0]} {error.param.metavar}."
+    if isinstance(error, click.MissingParameter) and isinstance(error.param, click.Option) and error.param.metavar:
+        return f" Give {error.param.opts[0]} {error.param.metavar}."
     return ""
 
 

@@ -51,25 +51,23 @@ def bar(
     Give a synchronised video for each camera, named as the camera, or folders of images; frames of one number are of
     one time. Or a CSV file of centroids: camera,frame,u,v, two rows an image.
     """
-    from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar
-    from kinefit.cli._results import check_file
-    from kinefit.errors import ExportError
+    from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
+    from kinefit.cli._results import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
+    sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
+    check_bar(length, sigma)
     on_floor, known = _frames(floor), _distance(distance)
     beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
     for file in beside:
-        if file.exists() and not overwrite:
-            remedy = "Add --overwrite, or name another."
-            raise ExportError("there is a file of this name already", file=file, remedy=remedy)
-        check_file(file)
+        check_new(file, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     with _screen.bars() as step:
         seen = _seen(sources, size, kept, max_frames, on_floor, step)
         step("calibrating", 0, 1)
         result = calibrate_bar(
             seen, length, interiors=kept, floor=on_floor, known_distance=known,
-            length_sigma=LENGTH_SIGMA if length_sigma is None else length_sigma,
+            length_sigma=sigma,
         )  # fmt: skip
         step("calibrating", 1, 1)
     write_calibration(result.rig, out)
@@ -83,6 +81,7 @@ def _seen(
     sources: tuple[Path, ...], size: str | None, kept: object, max_frames: int, include: tuple[int, ...],
     step: _screen.Step,
 ) -> dict[str, BarViews]:
+    from kinefit.calibration.bar.calibrate import check_cameras
     from kinefit.calibration.bar.table import read_centroids
     from kinefit.calibration.bar.targets import find_bars
     from kinefit.calibration.board.sources import camera_sources
@@ -91,7 +90,9 @@ def _seen(
     if not any(path.suffix.lower() == ".csv" for path in sources):
         if size is not None:
             raise click.BadParameter("images have a size of their own; it is for a CSV file", param_hint="--size")
-        return find_bars(camera_sources(sources), max_frames=max_frames, include=include, progress=step)
+        views = camera_sources(sources)
+        check_cameras(views)
+        return find_bars(views, max_frames=max_frames, include=include, progress=step)
     if len(sources) > 1:
         raise click.BadParameter("give one CSV file that holds all cameras", param_hint="VIDEO_FOLDER_OR_CSV")
     if size is not None:
@@ -201,7 +202,7 @@ def _tell(result: BarCalibration, checked: bool) -> None:
         f"over {len(result.frames)} places. Left out: {result.left_out} that do not fit, {result.ambiguous} in which "
         "nothing tells the two targets apart."
     )
-    for (a, b), distance in result.distances.items():
+    for (a, b), distance in result.rig.distances.items():
         _screen.say(f"{a} to {b}: {distance:.4f} m")
     _screen.say(result.world)
     for line in result.advice:

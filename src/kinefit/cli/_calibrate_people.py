@@ -35,8 +35,7 @@ def people(
 
     from kinefit.bodies import load_body
     from kinefit.calibration.people.calibrate import calibrate_people
-    from kinefit.cli._results import check_file
-    from kinefit.errors import ExportError
+    from kinefit.cli._results import check_new
     from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import read_take
@@ -45,9 +44,7 @@ def people(
 
     take = find_take(take)
     out = out or take.with_name(f"{take.stem}-people.toml")
-    if out.exists():
-        raise ExportError("there is a file of this name already", file=out, remedy="Name another one with --out.")
-    check_file(out)
+    check_new(out, remedy="Name another one with --out.")
     entry = read_take(take)
     with _screen.bars() as step:
         entry = with_detections(entry, step, _screen.note)

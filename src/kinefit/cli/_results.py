@@ -72,6 +72,13 @@ def check_file(path: Path, option: str = "--out") -> None:
     check_folder(path.absolute().parent, option)
 
 
+def check_new(path: Path, overwrite: bool = False, remedy: str = "Add --overwrite, or name another.") -> None:
+    """Refuse a file that cannot be written, or that is there already and must not be written over."""
+    if path.exists() and not overwrite:
+        raise ExportError("there is a file of this name already", file=path, remedy=remedy)
+    check_file(path)
+
+
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
     """Write a motion in one of the formats of `NAMES`; options are those of its exporter."""
     from kinefit import exporters

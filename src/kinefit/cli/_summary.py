@@ -73,9 +73,8 @@ def frame_ranges(frames: NDArray) -> str:
 
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
-    """Segments that no measurement supports, and in which frames."""
-    seen = motion.quality > 0
-    gone = (motion.segment_quality <= 0) & seen[:, None]
+    """Segments that are lost, and in which frames somebody was tracked all the same."""
+    gone = motion.lost & (motion.quality > 0)[:, None]
     lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
     return {name: frames for name, frames in lost.items() if len(frames)}
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, TrackingError
+from kinefit.errors import FileError, ObservationError, TrackingError, shortened
 from kinefit.exporters.surface_files import (
     point_columns,
     write_field_picture,
@@ -121,17 +121,23 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
 
 def read_seeds(path: Path, views: int) -> list[Seeds]:
     """Seeds from the first camera to each other one, of a CSV file: a row has u and v in every view."""
+    remedy = "Give u and v [px] of each point in every view: u1,v1,u2,v2."
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if row]
-        if rows and not _is_number(rows[0][0]):
-            rows = rows[1:]
-        table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for row in rows])
-    except (OSError, ValueError, UnicodeDecodeError) as error:
+            reader = csv.reader(file)
+            rows = [(reader.line_num, row) for row in reader if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"cannot be read: {error}", file=path, remedy="Write numbers, separated by commas.") from None
-    if table.ndim != 2 or table.shape[1] != 2 * views:
-        problem = f"{table.shape[-1] if table.size else 0} columns for {views} views"
-        raise FileError(problem, file=path, remedy="Give u and v [px] of each point in every view: u1,v1,u2,v2.")
+    if rows and not _is_number(rows[0][1][0]):
+        rows = rows[1:]
+    for line, row in rows:
+        bad = next((cell for cell in row if cell.strip() and not _is_number(cell)), None)
+        if bad is not None or len(row) != 2 * views:
+            problem = f"{len(row)} columns for {views} views" if bad is None else f"'{shortened(bad, 60)}' is no number"
+            raise FileError(problem, file=path, place=f"line {line}", remedy=remedy)
+    table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for _, row in rows])
+    if not len(table):
+        raise FileError("no points in it", file=path, remedy=remedy)
     return [Seeds.of(table[:, :2], table[:, 2 * k : 2 * k + 2]) for k in range(1, views)]
 
 

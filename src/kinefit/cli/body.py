@@ -8,11 +8,12 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
+from kinefit.cli._group import Group
 
 _FILE = click.Path(path_type=Path)
 
 
-@click.group(short_help="List, copy and draw bodies; check closed chains.", invoke_without_command=True,
+@click.group(cls=Group, short_help="List, copy and draw bodies; check closed chains.", invoke_without_command=True,
              epilog="""\b
 Examples:
   kinefit body                                   what comes along: people, and people with gear

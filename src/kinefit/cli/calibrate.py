@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
+from kinefit.cli._group import Group
 
 if TYPE_CHECKING:
     from kinefit.calibration.board.calibrate import BoardCalibration
@@ -27,7 +28,7 @@ Examples:
 """
 
 
-class _Ways(click.Group):
+class _Ways(Group):
     """Subcommands that are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -72,15 +73,12 @@ def board(
     from kinefit.calibration.board.calibrate import calibrate_board
     from kinefit.calibration.board.detection import Board
     from kinefit.calibration.board.sources import camera_sources, find_boards
-    from kinefit.cli._results import check_file
-    from kinefit.errors import ExportError
+    from kinefit.cli._results import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     described = Board.parse(spec)
     found = camera_sources(sources)
-    if out.exists() and not overwrite:
-        raise ExportError("there is a file of this name already", file=out, remedy="Add --overwrite, or name another.")
-    check_file(out)
+    check_new(out, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     frame = _frame(floor, found)
     with _screen.bars() as step:
@@ -130,7 +128,7 @@ def _tell(result: BoardCalibration) -> None:
         )  # fmt: skip
         table.add_row(camera.name, *told)
     _screen.console().print(table)
-    for (a, b), distance in result.distances.items() if result.shared else ():
+    for (a, b), distance in result.rig.distances.items() if result.shared else ():
         told_frames = f"{result.shared.get((a, b), 0)} frames agree"
         _screen.say(f"{a} to {b}: {distance:.3f} m, {told_frames}")
     if result.jitter[0] > 5e-4:

@@ -48,6 +48,8 @@ def check(
     """
     if (focal or distortion or time_offsets or points) and not refine:
         raise click.UsageError("--focal, --distortion, --time-offsets and --points only go with --refine.")
+    if points is not None and not points.is_file():
+        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit.calibration.check.check import check_take
     from kinefit.cli._check_page import check_page
     from kinefit.cli._check_refine import refined_of, write_refined

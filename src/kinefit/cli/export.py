@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import click
 
 from kinefit.cli import _results, _screen
 from kinefit.errors import spelled
+from kinefit.readers.units import LENGTHS, worth
 
 
 class Freedom(NamedTuple):
@@ -52,6 +54,7 @@ Examples:
   kinefit export motion.npz --to usd --up z --out walk.usda
   kinefit export motion.npz --to trc --out walk.trc --unit mm
   kinefit export motion.npz --to parquet --out tables
+  kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
 
 \b
 Choices, the default first (csv, parquet and c3d keep the take's vertical axis; --names mixamo rests as t):
@@ -64,8 +67,10 @@ Choices, the default first (csv, parquet and c3d keep the take's vertical axis; 
 )
 
 
-def _format(ctx: click.Context, parameter: click.Parameter, value: str) -> str:
+def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
     """A format; where there is none of the name, what would do instead."""
+    if value is None:
+        return None
     format = spelled(value, FREEDOM)
     if format not in FREEDOM:
         raise click.BadParameter(_results.no_format(value, FREEDOM))
@@ -75,8 +80,16 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str) -> str:
 @click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
 @click.argument("motion", type=click.Path(path_type=Path))
 @click.option(
-    "--to", "format", required=True, callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
-    help="Format; csv and parquet are a folder of tables.",
+    "--to", "format", callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
+    help="Format; csv and parquet are a folder of tables. Needed, unless --retarget.",
+)
+@click.option(
+    "--retarget", "character", type=click.Path(path_type=Path), metavar="CHARACTER",
+    help="Put the motion onto the skeleton and mesh of a GLB, VRM, glTF or BVH file.",
+)
+@click.option(
+    "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
+    help="With --retarget: lines such as thigh_l = \"JointName\", where the character's names tell it not.",
 )
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: beside MOTION]")
 @click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
@@ -84,10 +97,20 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str) -> str:
 @click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
 @_screen.verbose_option
-def export(motion: Path, format: str, out: Path | None, verbose: bool, **choices: str | None) -> None:
-    """Write a motion file, as `kinefit track` leaves it, in another format."""
+def export(
+    motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None, verbose: bool,
+    **choices: str | None,
+) -> None:
+    """Write a motion file, as `kinefit track` leaves it, in another format, or on another character."""
+    if character is not None:
+        others = [key for key, value in {"to": format, **choices}.items() if value is not None]
+        return _retarget(motion, character, table, out, others)
+    if table is not None:
+        raise click.UsageError("--names-table names the joints of a --retarget CHARACTER.")
+    if format is None:
+        raise click.UsageError("Missing option '--to' (or --retarget CHARACTER).")
     options = {
-        key: _choice(format, key, value if key == "up" else spelled(value, getattr(FREEDOM[format], key)))
+        key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
     }  # fmt: skip
     from kinefit.readers.motion import find_motion, read_motion
@@ -99,6 +122,31 @@ def export(motion: Path, format: str, out: Path | None, verbose: bool, **choices
     _results.write_format(recorded, format, out, **options)
     told = ", ".join(f"{key} {value}" for key, value in options.items())
     _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+
+
+def _meant(key: str, value: str, valid: Sequence[str]) -> str:
+    """A value as it is called here: "MM" and "millimetres" are mm, "OpenSim" is opensim, "Z" is z."""
+    if key == "up":
+        return value.strip().lower()
+    metres = worth(value, LENGTHS) if key == "unit" else None
+    return next((unit for unit in valid if metres == LENGTHS.get(unit)), value) if metres else spelled(value, valid)
+
+
+def _retarget(motion: Path, character: Path, table: Path | None, out: Path | None, others: list[str]) -> None:
+    """Write a motion on a character, in its format."""
+    if others:
+        raise click.UsageError(f"--{others[0]} has no place beside --retarget: all is as in the character's file.")
+    from kinefit.exporters import write_character
+    from kinefit.readers.motion import find_motion, read_motion
+    from kinefit.readers.skeletons.characters import KINDS, read_names
+
+    motion = find_motion(motion)
+    ending = KINDS.get(character.suffix.lower(), character.suffix)
+    out = out or motion.with_name(f"{motion.stem}-{character.stem}.{ending}")
+    _results.check_file(out)
+    recorded = read_motion(motion)
+    found = write_character(recorded, character, out, names=read_names(table) if table else None)
+    _screen.say(f"{out}: {len(recorded)} frames on {len(found.segments)} joints of {character.name}")
 
 
 def _choice(format: str, key: str, value: str) -> str:

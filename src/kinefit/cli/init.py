@@ -12,6 +12,8 @@ _EXAMPLES = """\b
 Examples:
   kinefit init my_recording
   kinefit init my_recording --out takes/monday.toml
+  kinefit init my_recording --click                   the first pose from joints that you click
+  kinefit init my_recording --points clicks.json      the same from a file
 """
 _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold red"}
 
@@ -20,13 +22,27 @@ _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold 
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Take file.  [default: FOLDER/take.toml]")
 @click.option("--force", is_flag=True, help="Replace a take file that is there.")
+@click.option("--click", "clicked", is_flag=True, help="Ask for joints in one image of each camera, in the browser.")
+@click.option("--points", type=click.Path(path_type=Path), metavar="JSON", help="Joints that were clicked before.")
+@click.option("--step", type=click.IntRange(min=0), help="With --click: frame of the images.  [default: the first]")
+@click.option("--body", metavar="BODY", help="Body that is clicked: of the catalogue, or a file.  [default: humanoid]")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page of --click.")
 @_screen.verbose_option
-def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
+def init(
+    folder: Path, out: Path | None, force: bool, clicked: bool, points: Path | None, step: int | None,
+    body: str | None, browser: bool, verbose: bool,
+) -> None:
     """Write a first take file from what lies in FOLDER: calibration, videos, keypoints, markers.
 
     Everything is guessed from names and contents, and reported with how sure it is, here and as comments in the file.
     Nothing else is changed. Look at what is a guess or open, then run kinefit check.
     """
+    if clicked and points is not None:
+        raise click.UsageError("--click asks for joints, --points has them: name one.")
+    if step is not None and not clicked:
+        raise click.UsageError("--step is of --click; a file of --points has its own.")
+    if body is not None and not (clicked or points):
+        raise click.UsageError("--body is of --click and --points; else write it into the take file.")
     from kinefit.cli._results import check_file
     from kinefit.errors import TakeError, command
     from kinefit.exporters.atomic import write_text
@@ -41,6 +57,10 @@ def init(folder: Path, out: Path | None, force: bool, verbose: bool) -> None:
     guess = guess_take(folder, beside=out.absolute().parent)
     write_text(out, guess.text)
     _show(guess.notes)
+    if clicked or points is not None:
+        from kinefit.cli._clicks import start_from_clicks
+
+        start_from_clicks(out, points, step, body or "humanoid", browser)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
     alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)
     lacking = ["its rate, in frames a second,"] * asked + ["a second camera, [[depth]] or [[markers]]"] * alone

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _results, _screen
+from kinefit.cli._group import Group
 
 if TYPE_CHECKING:
     from kinefit.identification.take.takes import TakeIdentification
@@ -28,7 +29,7 @@ _FILE = click.Path(path_type=Path)
 _unit = click.option("--unit", metavar="UNIT", help="Of files that state none, or a wrong one: mm, cm, m ...")
 
 
-@click.group(short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES)
+@click.group(cls=Group, short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES)
 def markers() -> None:
     """Name the markers of a take (C3D, TRC), fit a body to them, check labels."""
 

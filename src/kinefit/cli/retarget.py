@@ -12,7 +12,7 @@ _EXAMPLES = """\b
 Examples:
   kinefit retarget walk.bvh
   kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
-  kinefit export walk.npz --to glb
+  kinefit export walk.npz --retarget character.glb
 """
 
 
@@ -21,13 +21,20 @@ Examples:
 @click.option("--asf", type=click.Path(path_type=Path), help="Skeleton of an .amc file; needed there.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Motion file.  [default: RECORDING with .npz]")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: as recorded]")
+@click.option(
+    "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
+    help="Lines such as thigh_l = \"JointName\", where the joints are named in no known way.",
+)
 @_screen.verbose_option
-def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | None, verbose: bool) -> None:
+def retarget(
+    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, verbose: bool
+) -> None:
     """Put a recorded motion onto the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file
     from kinefit.exporters import write_motion
     from kinefit.readers.skeletons.amc import read_amc
     from kinefit.readers.skeletons.bvh import read_bvh
+    from kinefit.readers.skeletons.characters import read_names
     from kinefit.simulation import retarget as retarget_motion
 
     suffix = recording.suffix.lower()
@@ -40,7 +47,7 @@ def retarget(recording: Path, asf: Path | None, out: Path | None, rate: float | 
     skeleton = read_amc(asf, recording) if asf else read_bvh(recording)
     with _screen.bars() as step:
         step("retargeting", 0, 0)
-        motion = retarget_motion(skeleton, rate=rate)
+        motion = retarget_motion(skeleton, rate=rate, names=read_names(table) if table else None)
         step("retargeting", len(motion), len(motion))
         write_motion(motion, out)
     _screen.say(f"{out}: {len(motion)} frames at {motion.rate:g} Hz of the body {motion.body.name}")

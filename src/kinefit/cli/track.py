@@ -13,11 +13,12 @@ from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
+    from kinefit.tracking.take import InView
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     """Formats of a list such as "bvh,csv"."""
-    formats = tuple(dict.fromkeys(part.strip().lower() for part in value.split(",") if part.strip()))
+    formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
     for name in formats:
         if name not in _results.NAMES:
             raise click.BadParameter(_results.no_format(name, _results.NAMES))
@@ -111,7 +112,10 @@ def run(
     take = read_take(path)
     if person is not None:
         take = replace(take, person=person)
-        check_take(take)
+        try:
+            check_take(take)
+        except KinefitError as error:  # of this option: the take alone is right
+            raise type(error)(error.problem, place="--person", remedy=error.remedy) from None
     check_enough(take)
     if wanted and not (take.depth or any(camera.video for camera in take.cameras)):
         raise TakeError("overlays, but no video or depth to draw on", file=path, remedy="Leave --overlays out.")
@@ -122,16 +126,17 @@ def run(
     }  # fmt: skip
     with _screen.bars() as step:
         take = prepared(take, step, _screen.note)
-    people = people_in_view(take) if take.person is None else ()
-    if not people:
-        return _track_one(take, out, **options)
+    view = people_in_view(take) if take.person is None else None
+    people = len(view.people) if view else 0
+    if people < 2:
+        return _track_one(take, out, view, **options)
     code = 0
-    for k in range(1, len(people) + 1):
+    for k in range(1, people + 1):
         folder = out / f"person-{k}"
-        _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
+        _screen.say(f"person {k} of {people}: {folder}", style="bold")
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            own = _track_one(replace(take, person=k, name=f"{take.name}-person-{k}"), folder, **options)
+            own = _track_one(replace(take, person=k, name=f"{take.name}-person-{k}"), folder, view, **options)
         except KinefitError as error:  # of one person: the others are tracked all the same
             _screen.tell_error(error)
             own = error.exit_code
@@ -142,8 +147,8 @@ def run(
 
 
 def _track_one(
-    take: Take, out: Path, *, overlays: bool, formats: tuple[str, ...], report: bool, smooth: bool, pictures: str,
-    contacts: bool, lag: float | None, verbose: bool, restart: bool,
+    take: Take, out: Path, view: InView | None, *, overlays: bool, formats: tuple[str, ...], report: bool,
+    smooth: bool, pictures: str, contacts: bool, lag: float | None, verbose: bool, restart: bool,
 ) -> int:  # fmt: skip
     """Track one person of a take, and write what comes of it; returns the exit code."""
     from kinefit.cli._agreement import print_agreement
@@ -171,7 +176,7 @@ def _track_one(
             step("reading", 0, 0)
             try:
                 motion, seen = track_take(
-                    take, smooth=smooth, contacts=contacts, lag=lag, checkpoint=unfinished,
+                    take, smooth=smooth, contacts=contacts, lag=lag, checkpoint=unfinished, view=view,
                     progress=lambda *told: (step("reading", 1, 1), step(*told))[1],
                 )
                 notes.extend([*seen.notes, *sentences(motion.provenance["contradictions"])])

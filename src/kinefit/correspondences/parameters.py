@@ -38,11 +38,14 @@ def prior_rows(
         Spread of the posture, inf for a coordinate without prior; default: the body's posture prior, couplings and all.
     """
     tree, count = body.tree, len(body.tree.coordinates)
+    if mean is None and sigma is None:
+        held, precision = tree.held_by_posture
+        return ParameterRows(6 + held, (tree.usual - state.angles)[held], precision)
     w = targets.weights(tree.spread if sigma is None else sigma, np.ones(count, bool), "priors")
     held = np.flatnonzero(w > 0.0)
     gap = np.broadcast_to(np.asarray(tree.usual if mean is None else mean, float), count) - state.angles
     joint = sigma is None and tree.coupled
-    return ParameterRows(6 + held, gap[held], tree.posture_precision[np.ix_(held, held)] if joint else w[held])
+    return ParameterRows(6 + held, gap[held], tree.held_by_posture[1] if joint else w[held])
 
 
 def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma: NDArray) -> ParameterRows:

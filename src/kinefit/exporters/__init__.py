@@ -8,12 +8,13 @@ from kinefit.exporters.pictures.depth import depth_picture, write_depth_overlay
 from kinefit.exporters.pictures.overlay import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.report.report import write_report
 from kinefit.exporters.skeletons.bvh import write_bvh
+from kinefit.exporters.skeletons.characters import write_character
 from kinefit.exporters.skeletons.glb import write_glb
 from kinefit.exporters.skeletons.usd import write_usd
 from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [
-    "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_csv", "write_depth_overlay",
-    "write_glb", "write_markers", "write_montage", "write_mot", "write_motion", "write_osim", "write_overlay",
-    "write_parquet", "write_report", "write_trc", "write_usd",
+    "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_character", "write_csv",
+    "write_depth_overlay", "write_glb", "write_markers", "write_montage", "write_mot", "write_motion", "write_osim",
+    "write_overlay", "write_parquet", "write_report", "write_trc", "write_usd",
 ]  # fmt: skip

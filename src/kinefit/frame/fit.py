@@ -45,6 +45,7 @@ class Fitted:
 
     Parameters
     ----------
+    stated : (n, n) covariance behind the result's deviations, the prior and what surfaces err by included
     seen : (D,) bool, coordinates that this frame's measurements observe
     known : (D,) bool, those, and what was known before and is not lost now
     released : (n,) bool, optional: degrees of freedom that were found where they were not expected
@@ -52,6 +53,7 @@ class Fitted:
 
     result: FrameResult
     filtered: NDArray
+    stated: NDArray
     seen: NDArray
     known: NDArray
     released: NDArray | None = None
@@ -253,11 +255,9 @@ class FrameFit:
         result = judged(scene, stated, found.matched, found.iterations, observed=known, told=told)
         if lost is not None:
             result = replace(result, joint_std=np.where(elsewhere[:, None], np.inf, result.joint_std))
-        return Fitted(result, inverse(alone), seen[6:], known)
+        return Fitted(result, inverse(alone), stated, seen[6:], known)
 
-    def _of_surfaces(
-        self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without
-    ) -> NDArray:
+    def _of_surfaces(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n, n) what the surfaces' own error, which lasts, adds to a pose, with the information of one time."""
         s, n = self.settings, self.body.tree.n_dofs
         if s.skin_shift <= 0.0 or n == 6 or all(m.of_points for m in matched):
@@ -265,7 +265,7 @@ class FrameFit:
         _, surface, points = _kinds(scene, matched, None, 0, without)
         if not surface:
             return np.zeros((n, n))
-        skin = skin_of(scene, surface, s.skin_shift, s.skin_turn)
+        skin = skin_of(scene, surface, s.skin_shift, s.skin_turn, matched)
         moved = (skin.pushes if points >= n else skin.exact_pushes) @ inverse(now)
         return moved.T @ moved
 

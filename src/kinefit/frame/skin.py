@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.surfaces import body_mesh, segment_middles
 from kinefit.rows import DofRows, Rows
+from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels
 
@@ -38,6 +39,7 @@ class Skin:
     jacobian : (S, 6, n) of those twists by the degrees of freedom
     sigma : (6,) [m, rad] standard deviations of the surface's error
     exact : (S, 6, 6) H of surfaces that are taken for exact, nothing eliminated
+    turned : (S, 6) twist by which what tracked points were anchored to is off besides, one standard deviation
     """
 
     H: NDArray
@@ -45,6 +47,7 @@ class Skin:
     jacobian: NDArray
     sigma: NDArray
     exact: NDArray
+    turned: NDArray
 
     def rows(self) -> DofRows:
         """The same as six rows a segment, of directions that are observed."""
@@ -63,16 +66,18 @@ class Skin:
 
     @property
     def pushes(self) -> NDArray:
-        """(6 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
+        """(7 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
         return self._pushes(self.H)
 
     @property
     def exact_pushes(self) -> NDArray:
-        """(6 S, n) the same where surfaces are taken for exact."""
+        """(7 S, n) the same where surfaces are taken for exact."""
         return self._pushes(self.exact)
 
     def _pushes(self, H: NDArray) -> NDArray:
-        return (self.sigma[:, None] * (H @ self.jacobian)).reshape(-1, self.n)
+        by_twist = H @ self.jacobian
+        anchored = np.einsum("si,sin->sn", self.turned, by_twist)
+        return np.concatenate([(self.sigma[:, None] * by_twist).reshape(-1, self.n), anchored])
 
     @property
     def n(self) -> int:
@@ -80,13 +85,16 @@ class Skin:
         return int(self.jacobian.shape[2])
 
 
-def skin_of(scene: Scene, parts: Sequence[Rows], shift: float, turn: float) -> Skin:
+def skin_of(
+    scene: Scene, parts: Sequence[Rows], shift: float, turn: float, matched: Sequence[Matched] = ()
+) -> Skin:
     """Surface rows of all sensors at a scene's state, with the surface's error eliminated.
 
     Parameters
     ----------
     parts : with their losses
     shift, turn : [m], [rad] standard deviations of a segment's surface about its bone
+    matched : matches, whose `turns` last besides
     """
     body, tree = scene.body, scene.body.tree
     S = len(tree.segments)
@@ -111,7 +119,11 @@ def skin_of(scene: Scene, parts: Sequence[Rows], shift: float, turn: float) -> S
     kept = np.linalg.solve(H + inverse, np.concatenate([H, g[..., None]], axis=2))
     left = H - H @ kept[..., :6]
     g = inverse @ kept[..., 6:]
-    return Skin(0.5 * (left + left.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H)
+    turned = np.zeros((S, 6))
+    for segment, turn_by in (pair for m in matched for pair in m.turns.items()):
+        if turn_by @ turn_by > turned[segment] @ turned[segment]:
+            turned[segment, 3:] = R[segment] @ turn_by
+    return Skin(0.5 * (left + left.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
 
 
 def _factor(rows: Rows) -> NDArray:
@@ -137,7 +149,4 @@ def _jacobians(scene: Scene, middle: NDArray) -> NDArray:
 def _middles(body: Body) -> NDArray:
     """(S, 3) [m] middle of each segment's surface, in the root frame at rest."""
     mesh = body_mesh(body)
-    count = np.maximum(np.bincount(mesh.segment, minlength=len(body.tree.segments)), 1)
-    return np.stack(
-        [np.bincount(mesh.segment, mesh.vertices[:, k], len(body.tree.segments)) / count for k in range(3)], axis=1
-    )
+    return segment_middles(mesh.vertices, mesh.segment, len(body.tree.segments))

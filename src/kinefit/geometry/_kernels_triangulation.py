@@ -90,7 +90,7 @@ def _triangulate(cameras, centres, directions, uv, weights, steps):
             damping = damping * 0.1
         else:
             damping = 1e-6 if damping == 0.0 else 10.0 * damping
-        if dx * dx + dy * dy + dz * dz <= 1e-20 * (1.0 + x * x + y * y + z * z):
+        if dx * dx + dy * dy + dz * dz <= 1e-14 * (1.0 + x * x + y * y + z * z):
             break
     return True, x, y, z
 

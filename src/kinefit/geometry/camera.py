@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import combinations
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -117,7 +118,7 @@ class Camera:
         out[kernels.ROT : kernels.ROT + 9] = T[:3, :3].ravel()
         out[kernels.TRANS : kernels.TRANS + 3] = T[:3, 3]
         out[[kernels.WIDTH, kernels.HEIGHT]] = self.size
-        out[kernels.LIMIT] = _monotonic_limit(out[kernels.DIST : kernels.DIST + 8], self.model)
+        out[kernels.LIMIT] = _monotonic_limit(tuple(out[kernels.DIST : kernels.DIST + 8].tolist()), self.model)
         return _read_only(out)
 
     @property
@@ -170,7 +171,8 @@ class Camera:
         return replace(self, size=size, matrix=ImageFrame.scaled(self.size, size).T_image_calibration @ self.matrix)
 
 
-def _monotonic_limit(k: NDArray, model: str) -> float:
+@lru_cache(maxsize=256)  # of a camera that moves it is asked for at every place
+def _monotonic_limit(k: tuple[float, ...], model: str) -> float:
     """Largest r² (radtan) or θ [rad] (fisheye) up to which the radial distortion grows, a trifle inside."""
     if model == "fisheye":
         derivative = Polynomial([1, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]])
@@ -309,6 +311,14 @@ class Rig:
         if len(self.cameras):
             kernels.project_each(self.packed, camera, np.array(x_world, float, order="C"), uv)
         return uv
+
+    @property
+    def distances(self) -> dict[tuple[str, str], float]:
+        """{(camera, camera): distance of their centres [m]}, of every two."""
+        return {
+            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
+            for a, b in combinations(self.cameras, 2)
+        }
 
     def index(self, name: str) -> int:
         """Place of a camera in the rig."""

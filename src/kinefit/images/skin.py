@@ -89,8 +89,9 @@ class SkinTracker:
         self._check(image)
         left, top, width, height = (float(v) for v in face)
         h, w = image.shape[:2]
-        if not (min(width, height) >= 8 and left < w and top < h and left + width > 0 and top + height > 0):
-            remedy = "Give (left, top, width, height) in pixels, of 8 px at least."
+        seen = left < w and top < h and left + width > 0 and top + height > 0
+        if not (min(width, height) >= 8 and width <= 2 * w and height <= 2 * h and seen):
+            remedy = "Give (left, top, width, height) in pixels: 8 px or more, no larger than the picture."
             raise ObservationError(f"no face at {tuple(face)} in a picture of {w}x{h} px", remedy=remedy)
         if not rate > 0:
             raise ObservationError(f"a rate of {rate} Hz", remedy="Give pictures per second.")

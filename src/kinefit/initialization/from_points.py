@@ -13,6 +13,8 @@ from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.solvers.least_squares import levenberg_marquardt
 
+_NUMBERS = {3: "three", 6: "six"}
+
 
 def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
     """Pairs of points whose distance no angle changes: (point, point, scale group, distance at rest [m]).
@@ -85,21 +87,23 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
 
 
 def pose_from_points(
-    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None,
+    fewest: int = 6, robust: bool = True,
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 
-    With no pose given two starts are tried, the prior mean laid on the points and turned about its long axis; the
+    `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and turned about its long axis; the
     cheaper end wins. `near` is a start that is known to be close, and the only one then.
 
     Raises
     ------
     TrackingError
-        Fewer than six points are known.
+        Fewer than six (`fewest`) points are known.
     """
     known = np.isfinite(x_world).all(axis=1)
-    if known.sum() < 6:
-        raise TrackingError("fewer than six points are known in space", remedy="Start where more cameras see the body.")
+    if known.sum() < fewest:
+        problem = f"fewer than {_NUMBERS.get(fewest, fewest)} points are known in space"
+        raise TrackingError(problem, remedy="Start where more cameras see the body.")
 
     def rows(state: BodyState) -> list[AnyRows]:
         return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
@@ -110,7 +114,8 @@ def pose_from_points(
     fits = []
     for start in starts:
         rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state
-        fits.append(levenberg_marquardt(body, rough, rows, loss=geman_mcclure(), max_iterations=40, tolerance=1e-4))
+        loss = {"loss": geman_mcclure()} if robust else {}
+        fits.append(levenberg_marquardt(body, rough, rows, **loss, max_iterations=40, tolerance=1e-4))
     best = min(fits, key=lambda fit: fit.equations.cost)
     left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
     return best.state, float(np.median(left))

@@ -13,6 +13,7 @@ from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.multiview.boxes import same_people
+from kinefit.multiview.medians import medians
 from kinefit.observations import Keypoints
 
 _ENOUGH = 4  # points of a person that must be seen
@@ -130,9 +131,9 @@ def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArr
     with warnings.catch_warnings():  # frames without a common point are NaN, and meant to be
         warnings.simplefilter("ignore", RuntimeWarning)
         size = np.mean(np.nanmax(uv[..., 1], axis=1) - np.nanmin(uv[..., 1], axis=1), axis=1)
-        agree = np.nanmedian(error.reshape(len(frames), -1), axis=1) < _AGREE * size
-        agree &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _ENOUGH
-        return np.where(agree[:, None], np.nanmedian(x, axis=1), np.nan)
+        agree = medians(error.reshape(len(frames), -1)) < _AGREE * size
+    agree &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _ENOUGH
+    return np.where(agree[:, None], medians(np.moveaxis(x, 1, -1)), np.nan)
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,9 @@ class Followed:
         }}  # fmt: skip
 
 
-def follow(rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None) -> Followed:
+def follow(
+    rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None, people: Sequence[Person] | None = None
+) -> Followed:
     """The keypoints of one of the people in view.
 
     Parameters
@@ -56,6 +58,7 @@ def follow(rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = 
     rig : Rig
     keypoints : records of the same number of frames and the same rate, each of one or several people.
     person : "first" (default), "moving", "largest", "nearest X Y Z" [m], or a number from 1
+    people : everybody in view, where `follow` has found them in these keypoints before
 
     Raises
     ------
@@ -65,7 +68,9 @@ def follow(rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = 
         A number that is more than there are people.
     """
     wanted = PersonChoice.of(person)
-    people = tuple(people_of(rig, keypoints)) if may_be_several(keypoints) else ()
+    if people is None:
+        people = people_of(rig, keypoints) if may_be_several(keypoints) else ()
+    people = tuple(people)
     if wanted.way == "number" and wanted.number > max(len(people), 1):
         there = f"{len(people)} people are" if len(people) > 1 else "one person is"
         raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")

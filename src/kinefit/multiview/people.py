@@ -17,6 +17,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
 from kinefit.multiview.boxes import same_people
+from kinefit.multiview.medians import distances, medians
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
 
@@ -134,7 +135,7 @@ class _Track:
             self.path[frame] = self.x
             return
         moved = x - self.x
-        middle = np.nanmedian(moved, axis=0) if np.isfinite(moved).all(axis=1).any() else np.zeros(3)
+        middle = medians(moved.T) if np.isfinite(moved).all(axis=1).any() else np.zeros(3)
         x = np.where(np.isfinite(x), x, self.x + middle)
         step = (x - self.x) / max(abs(frame - self.last), 1)
         step *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
@@ -221,7 +222,7 @@ class _Search:
             mine = [p for r, p in free if r == q]
             if not mine or not tracks:
                 continue
-            cost = np.array([[self._off(x, frame, (q, p)) for p in mine] for x in expected])
+            cost = distances(self.cameras[q], np.array(expected), self.uv[q][frame, mine])
             waited = np.array([abs(frame - t.last) for t in tracks])
             near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)
             cost[cost > near[:, None]] = np.inf
@@ -234,19 +235,13 @@ class _Search:
 
     def _off(self, x: NDArray, frame: int, node: Node) -> float:
         """How far a detection is from points (k, 3), as a share of its height."""
-        uv = self.uv[node[0]][frame, node[1]]
-        both = np.isfinite(uv).all(axis=1) & np.isfinite(x).all(axis=1)
-        if both.sum() < 3:
-            return np.inf
-        away = np.linalg.norm(self.cameras[node[0]].project(x[both]) - uv[both], axis=1)
-        median = float(np.median(np.where(np.isfinite(away), away, 1e6)))
-        return median / max(float(np.ptp(uv[both, 1])), 1.0)
+        return float(distances(self.cameras[node[0]], x[None], self.uv[node[0]][frame, node[1]][None])[0, 0])
 
     def _agreeing(self, frame: int, nodes: list[Node], expected: NDArray | None) -> tuple[list[Node], NDArray | None]:
         """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
         while len(nodes) > 1:
             uv = np.stack([self.uv[q][frame, p] for q, p in nodes], axis=1)
-            height = float(np.nanmedian(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
+            height = float(medians(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
             x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
             off = np.array([self._off(x, frame, node) for node in nodes])
@@ -264,17 +259,13 @@ class _Search:
     def person(self, track: _Track, chosen: list[NDArray], views: NDArray, main: Sequence[int]) -> Person:
         """What is told of a person."""
         step = max(round(_STEP * self.rate), 1)
-        speeds = [
-            np.nanmedian(np.linalg.norm(track.path[f + step] - x, axis=1)) * self.rate / step
-            for f, x in track.path.items()
-            if f + step in track.path
-        ]
+        moved = [track.path[f + step] - x for f, x in track.path.items() if f + step in track.path]
         sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
             self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes
         )]  # fmt: skip
         sure = sum(float(self.surety[q][f, p]) for f, nodes in track.nodes.items() for q, p in nodes)
-        place = np.nanmedian([np.nanmedian(x, axis=0) for x in track.path.values()], axis=0)
-        speed = float(np.mean(speeds)) if speeds else 0.0
+        place = medians(medians(np.moveaxis(np.array(list(track.path.values())), 1, 2)).T)
+        speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
         return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place)
 
 

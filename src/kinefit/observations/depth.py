@@ -13,10 +13,11 @@ from kinefit.geometry.camera import Camera
 from kinefit.observations.frames import DepthFrame, PointCloud
 
 _GAP = 1.5  # usual steps of time: half a frame late is jitter, more is a frame that is missing
+_LATEST = 1e11  # [s] of a time: clocks count from 1970 or from when they began
 
 
 def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
-    """Read-only (F,) [s]; a typed error names the first frame that is not later than the one before it."""
+    """Read-only (F,) [s]; a typed error where one is no time, or not later than the one before it."""
     times = np.array(times, dtype=float).ravel()
     back = np.flatnonzero(~(np.diff(times) > 0.0)) + 1
     bad = np.flatnonzero(~np.isfinite(times))
@@ -28,6 +29,9 @@ def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
             file=source or None, place=f"frame {frame}" if len(times) else None,
             remedy="Sort the frames by time and leave out doubled ones; a clock that was set back needs two takes.",
         )  # fmt: skip
+    if max(-times[0], times[-1]) > _LATEST:
+        problem = f"times of the frames of {sensor} from {times[0]:.6g} to {times[-1]:.6g} s"
+        raise ObservationError(problem, file=source or None, remedy="Give seconds; time_unit = \"us\" says otherwise.")
     times.flags.writeable = False
     return times
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -145,7 +146,7 @@ def _from_beside(job: Job, key: str, people: int | None, masks: bool | None) -> 
 
     if _fits(detections_key(job.file), key, people, masks, job.seconds):
         return
-    for other in sorted(job.file.parent.parent.glob(f"*-detect/{job.file.name}")):
+    for other in sorted(job.file.parent.parent.glob(f"*-detect/{escape(job.file.name)}")):
         if _fits(detections_key(other), key, people, masks, job.seconds):
             with writing(job.file) as temporary:
                 shutil.copyfile(other, temporary)

@@ -17,6 +17,7 @@ the video's picture, the centre of the first pixel is (0, 0):
 
 from __future__ import annotations
 
+from glob import escape
 from os import PathLike
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def _anew(file: Path, *options: str) -> str:
     """The command that makes a file of detections."""
     folder = file.parent if file.parent.name else file.absolute().parent
     take = folder.with_name(f"{folder.name.removesuffix('-detect')}.toml")
-    video = next((p for p in folder.glob(f"{file.stem.removesuffix('-detect')}.*") if p.suffix != ".npz"), None)
+    video = next((p for p in folder.glob(f"{escape(file.stem.removesuffix('-detect'))}.*") if p.suffix != ".npz"), None)
     return command("detect", take if take.is_file() else video or "VIDEO", *options)
 
 

@@ -251,7 +251,7 @@ def _caliscope_camera(
     path: Path, *, camera: str, rate: float, time_offset: float = 0.0, image_frame: ImageFrame | None = None
 ) -> Keypoints:
     ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
-    port = ports.get(f"cam_{int(numbers[-1])}" if numbers else "")
+    port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
     if port is None:
         raise ObservationError(choices("camera in this table named", camera, ports), file=path)
     points = port.points if image_frame is None else image_frame.to_calibration(port.points)
@@ -261,7 +261,8 @@ def _caliscope_camera(
 def _numbered_files(folder: Path) -> list[Path]:
     """Json files of a folder by frame number, without gaps."""
     if not folder.is_dir():
-        raise FileError("no such folder of json files", file=folder, remedy="Name the folder, not one of its files.")
+        remedy = 'Name the folder, not one of its files; .npy files are of format = "mediapipe", .csv of "caliscope".'
+        raise FileError("no such folder of json files", file=folder, remedy=remedy)
     numbered: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() != ".json":

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, ObservationError, choices
+from kinefit.errors import FileError, ObservationError, choices, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 from kinefit.readers.units import LENGTHS, worth
@@ -52,7 +52,8 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     except FileNotFoundError as error:
         raise FileError("no such file", file=path) from error
     except OSError as error:
-        raise FileError(f"cannot be read ({error})", file=path) from error
+        remedy = "Give a .c3d or .trc file."
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy=remedy) from error
     if head[1:2] == b"\x50" or path.suffix.lower() == ".c3d":
         return _of_one_unit(_markers_of_c3d(read_c3d(path), path, unit), path)
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(b"pathfiletype") or path.suffix.lower() == ".trc":
@@ -196,7 +197,7 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
 def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[NDArray, NDArray, NDArray]:
     """Frame numbers (F,), times (F,) [s] and positions (F, M, 3) in the file's unit; NaN where a cell is empty."""
     width = 2 + 3 * count
-    rows: list[list[str]] = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines[4:], start=5):
         if not line.strip() or line.split()[0].upper() == "X1":
             continue
@@ -213,11 +214,13 @@ def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[ND
         elif short:
             problem = f"{len(cells)} cells where {count} markers need {width}"
             raise FileError(problem, file=path, place=f"line {number}", remedy=_TRC_REMEDY)
-        rows.append(["nan" if not cell else cell for cell in cells])
-    try:
-        table = np.array(rows, dtype=float).reshape(len(rows), width)
-    except ValueError as error:
-        raise FileError(f"a cell is not a number ({error})", file=path, remedy=_TRC_REMEDY) from error
+        try:
+            rows.append([float(cell or "nan") for cell in cells])
+        except ValueError as error:
+            remedy = "Leave the cells of a marker empty where it is not seen."
+            problem = f"a cell is not a number ({shortened(str(error), 120)})"
+            raise FileError(problem, file=path, place=f"line {number}", remedy=remedy) from error
+    table = np.array(rows, dtype=float).reshape(len(rows), width)
     if not np.isfinite(table[:, :2]).all():
         raise FileError("a row without frame number or time", file=path, remedy=_TRC_REMEDY)
     return table[:, 0], table[:, 1], table[:, 2:].reshape(len(rows), count, 3)

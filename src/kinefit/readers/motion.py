@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.bodies.serial import body_from_arrays
-from kinefit.errors import FileError, KinefitError
+from kinefit.errors import FileError, KinefitError, command
 from kinefit.motion import UP_AXES, Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
@@ -86,6 +86,14 @@ def read_motion(path: str | PathLike[str]) -> Motion:
 def _load(file: Path) -> dict[str, NDArray]:
     if not file.is_file():
         raise FileError("no such motion file", file=file, remedy="Check the path.")
+    with file.open("rb") as stream:
+        packed = stream.read(2) == b"PK"
+    if not packed:
+        ways = {".toml": ("track",), ".bvh": ("retarget",), ".amc": ("retarget",), ".c3d": ("markers", "fit"),
+                ".trc": ("markers", "fit")}  # fmt: skip
+        way = ways.get(file.suffix.lower())
+        remedy = f"It becomes one: {command(*way, file)}" if way else "Give a file that `kinefit track` wrote."
+        raise FileError("this is no motion file of kinefit", file=file, remedy=remedy)
     try:
         return read_npz(file, remedy=_REMEDY)
     except FileError as error:

@@ -154,10 +154,12 @@ def check_rates(rates: Mapping[str, float], *, file: str | PathLike[str] | None 
     """Refuse streams whose rates [Hz] differ by more than 0.1 %."""
     if max(rates.values()) > 1.001 * min(rates.values()):
         listed = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in rates.items())
-        raise ObservationError(
-            f"streams of different rate: {listed}", file=file,
-            remedy="Correct rate = ... of [[keypoints]], or resample the videos: ffmpeg -i IN -r RATE OUT.",
-        )
+        videos = [rate for name, rate in rates.items() if name.startswith("video ")]
+        remedy = "Correct rate = ... of [[keypoints]], or resample the videos: ffmpeg -i IN -r RATE OUT."
+        alike = bool(videos) and max(videos) <= 1.001 * min(videos)
+        if alike and abs(rates.get("take", videos[0]) / videos[0] - 1.0) > 0.001:
+            remedy = "Leave rate out of [take]: the videos state theirs."
+        raise ObservationError(f"streams of different rate: {listed}", file=file, remedy=remedy)
 
 
 def common_frames(

@@ -110,6 +110,8 @@ def _open(path: Path) -> Any:
 
 def _reason(error: Exception) -> str:
     """What FFmpeg says, without its error number and the path."""
+    if isinstance(error, MemoryError):  # also of counts in a file that cannot be
+        return "it claims more than there is memory for"
     return str(getattr(error, "strerror", None) or error)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from kinefit._jit import jit
 
-OWN, ALONE, SHARED, EMPTY, COVERED, UNKNOWN = range(6)
-COUNTS = 6
+OWN, ALONE, SHARED, EMPTY, COVERED, UNKNOWN, BLANK = range(7)
+COUNTS = 7
 
 
 @jit
@@ -31,12 +31,21 @@ def add_layer(layer, label, front, behind, owner, counts):
 
 
 @jit
-def judge(front, behind, owner, depth, across, down, focal, slack, constant, quadratic, counts):
+def measured(depth, across, down, out):
+    """Where something was measured at the pixels that `judge` looks at: out (h, w) uint8."""
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            out[v, u] = depth[int((v + 0.5) * down), int((u + 0.5) * across)] != 0.0
+
+
+@jit
+def judge(front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, counts):
     """Count every segment's foremost pixels by what was measured there.
 
     depth (H, W) [m], 0 for none, negative where it is known to be something else's, `across` and `down` times as wide
     and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the
-    pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image.
+    pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image. A pixel without a
+    measurement is blank where the next one with one is farther than `gap` [m] of the body, by away (h, w) [cells].
     """
     height, width = depth.shape
     for v in range(front.shape[0]):
@@ -60,7 +69,9 @@ def judge(front, behind, owner, depth, across, down, focal, slack, constant, qua
             z = behind[v, u]
             if agrees:
                 kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE
-            elif m == 0.0 or abs(-m - front[v, u]) <= bound:
+            elif m == 0.0:
+                kind = BLANK if away[v, u] * across * front[v, u] > gap * focal else UNKNOWN
+            elif abs(-m - front[v, u]) <= bound:
                 kind = UNKNOWN
             else:
                 kind = EMPTY if abs(m) > front[v, u] else COVERED

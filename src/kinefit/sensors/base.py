@@ -16,6 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -99,6 +100,8 @@ class Matched(ABC):
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
+    turns : {segment: (3,) [rad] in its frame}, one standard deviation by which all that it says of a segment's surface
+        is turned against the bone, for as long as the take lasts
     places : (M,) set and name of the body's points that its `Rows` number by group, "" for landmarks, where every row
         says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
     cameras : (M,) number in the rig of the camera that sees each of these points; empty where none does.
@@ -109,6 +112,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
+    turns: Mapping[int, NDArray] = MappingProxyType({})
     places: Sequence[tuple[str, str]] | None = None
     cameras: NDArray | None = None
 

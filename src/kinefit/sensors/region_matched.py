@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.correspondences import _kernels, _kernels_outlines
 from kinefit.correspondences.morphed import morphed_outline_rows
+from kinefit.correspondences.outlines import outline_rows
 from kinefit.correspondences.rims import Rim
 from kinefit.losses import Loss
-from kinefit.rows import AnyRows, Rows
+from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, by_segments
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_seams import Seams
@@ -56,18 +56,14 @@ class RegionMatched(Matched):
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
         seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
-        n, camera = len(self.rim), scene.placed(self.measurement.of.camera)
-        numbers = np.arange(n)
+        camera, pairs = scene.placed(self.measurement.of.camera), (np.arange(len(self.rim)),) * 2
         if not scene.surface.morphing.is_rigid:
-            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, (numbers, numbers), sigma=1.0)
+            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, pairs, sigma=1.0)
             return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss), *seams]
-        data, segment, group = _kernels.buffers(n)
-        used = _kernels_outlines.tangent_rows(
-            camera.packed, np.ascontiguousarray(scene.pose.vertices), self.rim.vertices, self.rim.share,
-            self.rim.segment, self.place, numbers, numbers, 1.0, data, segment, group,
-        )  # fmt: skip
-        data[7, :used] *= self.weight[group[:used]]
-        return [Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used], self.loss), *seams]
+        state, x = scene.state, scene.pose.vertices
+        rows = outline_rows(scene.body, state, self.rim, x, camera, self.place, pairs, sigma=1.0)
+        rows.data[7] *= self.weight[rows.group]
+        return [replace(rows, loss=self.loss), *seams]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Points of each segment's contour at which colours change as they should, and those at which they do not."""

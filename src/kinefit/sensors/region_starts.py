@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.bodies.surfaces import segment_middles
 from kinefit.geometry.camera import Camera
-from kinefit.sensors.evidence import BELIEVED, Evidence
+from kinefit.motion import BELIEVED
+from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.region_flips import Flips
 from kinefit.sensors.region_image import Coloured
 from kinefit.sensors.region_limbs import Limbs
@@ -39,10 +41,8 @@ class Starts:
 
     @cached_property
     def _flips(self) -> Flips:
-        mesh = self._mesh
-        count = np.maximum(np.bincount(mesh.segment, minlength=len(self._body.tree.segments)), 1)
-        sums = [np.bincount(mesh.segment, mesh.vertices[:, k], len(count)) for k in range(3)]
-        return Flips(self._body, np.array(sums).T / count[:, None] - self._body.tree.rest)
+        tree, mesh = self._body.tree, self._mesh
+        return Flips(self._body, segment_middles(mesh.vertices, mesh.segment, len(tree.segments)) - tree.rest)
 
     @cached_property
     def _limbs(self) -> Limbs:

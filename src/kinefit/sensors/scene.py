@@ -42,13 +42,17 @@ class Scene:
     measurements : what all sensors measured at this time, for those that ask each other
     surface : Surface of the body, made when it is first needed
     others : scenes of other bodies at the same time
+    covariance : (6 + D, 6 + D) [m, rad], optional
+        Of the state, where a fit gave it.
     """
 
     def __init__(
         self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
         values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
         surface: Surface | None = None, others: Sequence[Scene] = (), samples: int = SAMPLES,
+        covariance: NDArray | None = None,
     ) -> None:  # fmt: skip
+        self.covariance = covariance
         self.body, self.state, self.rig, self.time, self.velocity = body, state, rig, time, velocity
         self.values, self.measurements, self.others = values or {}, tuple(measurements), tuple(others)
         self._samples = samples

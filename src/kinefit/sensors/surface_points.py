@@ -3,13 +3,14 @@
 A point that was not seen before is drawn to the nearest surface, as one of a cloud. Once the limb rests in the cloud,
 so that places of points on it no longer wander from step to step, they are anchored where they lie on its segment; from
 then on each says in all three directions where that place is, so that turns about a limb's own axis are seen. Anchors
-are what the sensor learnt, not parameters: skin slides on the bone by `slide`.
+are what the sensor learnt, not parameters: skin slides on the bone by `slide`. How a limb was turned about its bone
+when its first points were anchored they never tell: that deviation lasts, for all of its points together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,6 +45,7 @@ class SurfacePointSensor(Sensor):
             raise ObservationError(f"a slide of {slide} m, {most} points", remedy="Give positive numbers.")
         self.name, self.slide, self.most = name, float(slide), int(most)
         self.anchors: Mapping[int, Anchor] = {}
+        self.turns: Mapping[int, NDArray] = {}  # of segments, until they got their first anchor; see `Matched`
         self._last: Mapping[int, Anchor] = {}  # places of points on limbs that have not settled
         self._waited: Mapping[int, int] = {}  # steps of each such limb
 
@@ -59,8 +61,9 @@ class SurfacePointSensor(Sensor):
         mean = np.trace(frame.covariance[order], axis1=1, axis2=2) / 3.0
         ids = frame.ids[order]
         anchors = {int(i): self.anchors[int(i)] for i in ids if int(i) in self.anchors}
+        turns = {s: self.turns[s] for s in {s for s, _ in anchors.values()} & set(self.turns)}
         return SurfacePointMeasurement(
-            frame.sensor, frame.time, ids, frame.x_world[order], mean + self.slide**2, self.slide, anchors
+            frame.sensor, frame.time, ids, frame.x_world[order], mean + self.slide**2, self.slide, anchors, turns
         )
 
     def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
@@ -85,8 +88,15 @@ class SurfacePointSensor(Sensor):
         settled = known | {s for s in {s for s, _ in found.values()} - known if self._rests(s, found)}
         self._last = {i: anchor for i, anchor in found.items() if anchor[0] not in settled}
         added = {i: anchor for i, anchor in found.items() if anchor[0] in settled}
+        seen = {s for s, _ in found.values()} - known
+        self.turns = {**self.turns, **{s: self._surest(s, scene) for s in seen}}
         if added:
             self.anchors = {**self.anchors, **added}
+
+    def _surest(self, segment: int, scene: Scene) -> NDArray:
+        """How surely a limb that waits for anchors was turned about its bone when that was known best."""
+        now, before = _turn(scene, segment), self.turns.get(segment) if self._waited.get(segment, 0) > 1 else None
+        return now if before is None or not before.any() or now @ now < before @ before else before
 
     def _rests(self, segment: int, found: Mapping[int, Anchor]) -> bool:
         """Whether places of points on a segment have stopped to wander, or have been waited for long enough."""
@@ -95,6 +105,20 @@ class SurfacePointSensor(Sensor):
         both = [i for i, (s, _) in found.items() if s == segment and self._last.get(i, (-1, None))[0] == segment]
         moved = [float(np.linalg.norm(found[i][1] - self._last[i][1])) for i in both]
         return waited > _PATIENCE or (len(moved) > 2 and float(np.median(moved)) < _SETTLED * self.slide)
+
+
+def _turn(scene: Scene, segment: int) -> NDArray:
+    """(3,) [rad] in its frame: standard deviation of how a segment is turned about its bone, by the scene's state."""
+    tree, bone = scene.body.tree, scene.body.segment_ends().get(segment)
+    if bone is None or scene.covariance is None or not np.any(bone):
+        return np.zeros(3)
+    if scene.morphing is not None:
+        J = scene.morphing.pose(scene.state).segment_jacobian(segment)
+    else:
+        J = tree.segment_jacobian(tree.forward(scene.state.T_world_root, scene.state.angles)[1], segment)
+    bone = bone / np.linalg.norm(bone)
+    by = scene.frames[segment, :9].reshape(3, 3) @ bone @ J[3:]
+    return np.asarray(bone * np.sqrt(max(by @ scene.covariance @ by, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +131,7 @@ class SurfacePointMeasurement(Measurement):
     variance : (N,) [m²] with the slide
     slide : float [m]
     anchors : {id: (segment, place in its frame (3,) [m])} of its points, as known then
+    turns : {segment: (3,) [rad]} of those, see `Matched`
     """
 
     sensor: str
@@ -116,6 +141,7 @@ class SurfacePointMeasurement(Measurement):
     variance: NDArray
     slide: float
     anchors: Mapping[int, Anchor]
+    turns: Mapping[int, NDArray]
     settled = False
 
     @property
@@ -164,7 +190,7 @@ class SurfacePointMeasurement(Measurement):
             x = np.ascontiguousarray(self.x_world[new])
             pairs.append(SurfacePairs.nearest(self.near(scene, new, scale), x, scene, scale))
         lasts = float(self.slide**2 / self.variance.mean()) if len(self.ids) else 0.0
-        return SurfacePointMatched(tuple(pairs), lasts, self.sensor)
+        return SurfacePointMatched(tuple(pairs), lasts, self.sensor, self.turns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +202,13 @@ class SurfacePointMatched(Matched):
     pairs : of anchored points along three axes, and of new ones along the surface's normal
     lasts : share of the variance that lasts: the slide
     sensor : of the measurement
+    turns : of the measurement
     """
 
     pairs: tuple[SurfacePairs, ...]
     lasts: float = 0.0
     sensor: str = ""
+    turns: Mapping[int, NDArray] = field(default_factory=dict)
     of_points = False
     shows_surface = True
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,8 @@ from kinefit.sensors.evidence import Evidence
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
 FEWEST = 16  # pixels of a whole outline: fewer say too little of a segment
 DEVIATIONS = 3.0  # of a measurement that agrees
+GAP = 0.03  # [m] to the next measurement: holes, hair, gaps between fingers and shadows beside edges are narrower
+SEES = 0.2  # share of the body that may be blank where blank means that nothing is there: five to one against the body
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,8 @@ class SegmentVerdict:
     ----------
     counts : (S, 6) int, pixels of each segment
         its whole outline; foremost and supported by a measurement that nothing else of the body explains; supported,
-        but explained without it; empty: something was measured behind; covered: something was measured in front;
+        but explained without it; empty: something was measured behind, or it is blank (nothing was measured within
+        `GAP`, by a sensor that measures nearly all of the body); covered: something was measured in front;
         unknown: no measurement.
     """
 
@@ -79,6 +83,7 @@ class Layers:
         self.front, self.behind = np.empty((2, height, width), np.float32)
         self.owner = np.empty((height, width), np.int32)
         self.counts = np.empty((len(body.tree.segments), kernels.COUNTS), np.int64)
+        self.measured = np.empty((height, width), np.uint8)
         self._parts = [_part(mesh, s) for s in np.unique(mesh.segment)]
 
     def draw(self, vertices_world: NDArray) -> None:
@@ -125,8 +130,15 @@ def judge_segments(
         raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
     layers.draw(vertices_world)
     width, height = layers.camera.size
+    cells = camera.size[0] / width, camera.size[1] / height
+    kernels.measured(depth, *cells, layers.measured)
+    away = cv2.distanceTransform(1 - layers.measured, cv2.DIST_L2, 3)
     kernels.judge(
-        layers.front, layers.behind, layers.owner, depth, camera.size[0] / width, camera.size[1] / height,
-        camera.matrix[0, 0], slack, DEVIATIONS * noise[0], DEVIATIONS * noise[1], layers.counts,
+        layers.front, layers.behind, layers.owner, depth, away, *cells, camera.matrix[0, 0], slack, GAP,
+        DEVIATIONS * noise[0], DEVIATIONS * noise[1], layers.counts,
     )  # fmt: skip
-    return SegmentVerdict(layers.counts.copy())
+    counts = layers.counts[:, : kernels.BLANK].copy()
+    blank = layers.counts[:, kernels.BLANK]
+    few = blank.sum() <= SEES * layers.counts[:, 1:].sum()
+    counts[:, kernels.EMPTY if few else kernels.UNKNOWN] += blank
+    return SegmentVerdict(counts)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -35,7 +35,10 @@ _EXTREMITIES = tuple(f"toes_{side}" for side in "lr") + _POINTS[3:]
 
 
 @checked
-def retarget(skeleton: SkeletonMotion, body: Body | None = None, *, rate: float | None = None) -> Motion:
+def retarget(
+    skeleton: SkeletonMotion, body: Body | None = None, *, rate: float | None = None,
+    names: Mapping[str, str] | None = None,
+) -> Motion:
     """Motion of a body whose bones point where those of a recorded skeleton do; it keeps its own lengths.
 
     Target points are found by walking from joint to joint with the body's lengths along the recorded directions, and
@@ -44,11 +47,13 @@ def retarget(skeleton: SkeletonMotion, body: Body | None = None, *, rate: float 
     Parameters
     ----------
     skeleton : SkeletonMotion
-        Of a family of `skeletons.FAMILIES`.
+        Of a family of `bodies.joint_names.FAMILIES`, or of names that `names` tells.
     body : Body, optional
         The catalogue's "humanoid" (default), or one of the same segments and landmarks.
     rate : float [Hz], optional
         Of the result; default: the recorded one.
+    names : segment -> name of its joint, optional
+        As of `bodies.joint_names.recorded_joints`.
 
     Returns
     -------
@@ -63,7 +68,7 @@ def retarget(skeleton: SkeletonMotion, body: Body | None = None, *, rate: float 
         The body is not made like the humanoid.
     """
     body = load_body("humanoid") if body is None else body
-    bones = bone_directions(skeleton)
+    bones = bone_directions(skeleton, names)
     if rate is not None and rate != skeleton.rate:
         bones = bones.resampled(rate)
     points, targets, Ts_world_root = _targets(body, bones)

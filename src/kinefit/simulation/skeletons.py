@@ -8,83 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.joint_names import SIDES, Recorded, recorded_joints
 from kinefit.errors import ObservationError
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
-_SIDES = {"l": {"s": "l", "S": "L", "Side": "Left"}, "r": {"s": "r", "S": "R", "Side": "Right"}}
-_LIMBS = ("hip", "knee", "ankle", "toe", "shoulder", "elbow", "wrist", "knuckle")
 _LEAST_BONE = 0.005  # [m] a shorter bone has no direction
-
-
-@dataclass(frozen=True)
-class Family:
-    """Joint names of one family of skeletons.
-
-    Parameters
-    ----------
-    name : str
-    spine : names of the joints at the sacrum, a third of the way up the spine, at the root of the neck, in the head.
-    limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist, knuckles; {s}, {S}, {Side}
-        are l, L, Left.
-    toe_end : name of the tip of the toes.
-    hand : names of the joint whose frame turns with the hand (at rest the thumbs are in front), or of two joints, the
-        second one on the thumb's side.
-    head_top : name of the top of the head; None where the eyes tell how the head is turned.
-    eyes : name of the eyes, or None.
-    upright : (forward, up) of the bones "pelvis", "abdomen", "thorax", "head" (see `BoneDirections`) of a person who
-        stands upright; None where the rest pose of the file is that.
-    """
-
-    name: str
-    spine: tuple[str, str, str, str]
-    limbs: tuple[str, ...]
-    toe_end: str
-    hand: tuple[str, ...]
-    head_top: str | None = None
-    eyes: str | None = None
-    upright: tuple[tuple[float, float], ...] | None = None
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """All joints that the family is recognised by."""
-        both = [name.format(**side) for side in _SIDES.values() for name in (*self.limbs, self.toe_end, *self.hand)]
-        eyes = [self.eyes.format(**side) for side in _SIDES.values()] if self.eyes else []
-        return tuple(dict.fromkeys([*self.spine, *([self.head_top] if self.head_top else []), *both, *eyes]))
-
-
-FAMILIES = (
-    Family(
-        "Acclaim (CMU)", ("root", "upperback", "lowerneck", "head"),
-        ("{s}femur", "{s}tibia", "{s}foot", "{s}toes", "{s}humerus", "{s}radius", "{s}wrist", "{s}fingers"),
-        "{s}toes_end", ("{s}hand",), "head_end",
-    ),
-    Family(
-        "MotionBuilder (CMU)", ("Hips", "Spine", "Neck", "Head"),
-        ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand",
-         "{Side}HandIndex1"),
-        "{Side}ToeBase_end", ("{Side}FingerBase",), "Head_end",
-    ),
-    Family(
-        "hip and knee (CMU)", ("Hips", "Chest", "lowerneck", "Head"),
-        ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist",
-         "{S}Fingers"),
-        "{Side}Toe_end", ("{s}hand",), "Head_end",
-    ),
-    Family(
-        "AnimatedDrawings", ("Hips", "Spine1", "Neck", "Head"),
-        ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand",
-         "{Side}HandEnd"),
-        "{Side}ToeBase_end", ("{Side}Hand",), "Head_end",
-    ),
-    Family(
-        "iClone", ("CC_Base_Waist", "CC_Base_Spine01", "CC_Base_NeckTwist01", "CC_Base_Head"),
-        ("CC_Base_{S}_Thigh", "CC_Base_{S}_Calf", "CC_Base_{S}_Foot", "CC_Base_{S}_ToeBase", "CC_Base_{S}_Upperarm",
-         "CC_Base_{S}_Forearm", "CC_Base_{S}_Hand", "CC_Base_{S}_Mid1"),
-        "CC_Base_{S}_MidToe1", ("CC_Base_{S}_Pinky1", "CC_Base_{S}_Index1"), eyes="CC_Base_{S}_Eye",
-        upright=((0.17, 0.985), (0.588, 0.809), (-0.19, 0.982), (0.543, 0.84)),
-    ),
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,95 +75,89 @@ def steps(frames: int, rate: float, new_rate: float) -> NDArray:
     return np.arange(int((frames - 1) / rate * new_rate + 1e-6) + 1) * (rate / new_rate)
 
 
-def family_of(skeleton: SkeletonMotion) -> Family:
-    """The family of a skeleton by the names of its joints.
+def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = None) -> BoneDirections:
+    """Directions of the bones of a recorded skeleton.
 
-    Raises
-    ------
-    ObservationError
-        None fits; the message tells what lacks for the nearest one.
-    """
-    lacking = {family: [name for name in family.joints if name not in skeleton.names] for family in FAMILIES}
-    family = min(FAMILIES, key=lambda family: len(lacking[family]) / len(family.joints))
-    if lacking[family]:
-        names = ", ".join(family.name for family in FAMILIES)
-        raise ObservationError(
-            f"the skeleton is of no known family ({names}); for '{family.name}' it lacks: {', '.join(lacking[family])}",
-            file=skeleton.source or None, remedy="Rename its joints to those of a known family.",
-        )
-    return family
-
-
-def bone_directions(skeleton: SkeletonMotion) -> BoneDirections:
-    """Directions of the bones of a recorded skeleton of a known family.
+    Parameters
+    ----------
+    skeleton : SkeletonMotion
+    names : segment -> name of a joint, optional
+        As of `bodies.joint_names.recorded_joints`; else the names tell the family.
 
     Raises
     ------
     ObservationError
         Of no known family, or a bone of the trunk, the arms or the legs has no length.
     """
-    family = family_of(skeleton)
-    R_up = rotation_between_up(skeleton.up, "y")
+    found = recorded_joints(skeleton.names, names, source=skeleton.source)
+    joints, R_up = found.joints, rotation_between_up(skeleton.up, "y")
     positions = skeleton.positions @ R_up.T
-    rest, right, forward = _rest(skeleton, family, R_up)
+    rest, right, forward = _rest(skeleton, found, R_up)
 
-    def index(name: str, side: str) -> int:
-        return skeleton.names.index(name.format(**_SIDES[side]))
+    def turned(role: str, direction: NDArray) -> NDArray:  # with the joint, from the rest pose
+        return (R_up @ skeleton.Ts_world_joint[:, joints[role], :3, :3] @ R_up.T) @ direction
 
-    def at(name: str, side: str = "l") -> NDArray:
-        return positions[:, index(name, side)]
+    def end(role: str, of: str) -> NDArray:  # where no name tells it, the first child
+        return positions[:, joints.get(role, _child(skeleton, joints[of]))]
 
-    def turned(name: str, direction: NDArray, side: str = "l") -> NDArray:  # with the joint, from the rest pose
-        return (R_up @ skeleton.Ts_world_joint[:, index(name, side), :3, :3] @ R_up.T) @ direction
-
-    joint = {f"{limb}_{side}": at(name, side) for side in _SIDES for limb, name in zip(_LIMBS, family.limbs)}
-    sacrum, spine, neck = (at(name) for name in family.spine[:3])
-    hip_centre = 0.5 * (joint["hip_l"] + joint["hip_r"])
-    bones = {"pelvis": sacrum - hip_centre, "abdomen": spine - sacrum, "thorax": neck - spine}
-    across = {"pelvis": joint["hip_r"] - joint["hip_l"], "thorax": joint["shoulder_r"] - joint["shoulder_l"]}
-    if family.eyes:
-        left_eye, right_eye = at(family.eyes, "l"), at(family.eyes, "r")
-        bones["head"], across["head"] = 0.5 * (left_eye + right_eye) - neck, right_eye - left_eye
+    joint = {role: positions[:, index] for role, index in joints.items()}
+    neck = joint["neck"]
+    hip_centre = 0.5 * (joint["thigh_l"] + joint["thigh_r"])
+    bones = {"pelvis": joint["sacrum"] - hip_centre, "abdomen": joint["spine"] - joint["sacrum"]}
+    bones["thorax"] = neck - joint["spine"]
+    across = {
+        "pelvis": joint["thigh_r"] - joint["thigh_l"], "thorax": joint["upperarm_r"] - joint["upperarm_l"],
+    }  # fmt: skip
+    if "eye_l" in joints:
+        bones["head"] = 0.5 * (joint["eye_l"] + joint["eye_r"]) - neck
+        across["head"] = joint["eye_r"] - joint["eye_l"]
     else:
-        bones["head"], across["head"] = at(family.head_top or "") - neck, turned(family.spine[3], right)
-    for side in _SIDES:
-        chain = [joint[f"{limb}_{side}"] for limb in _LIMBS]
-        for name, (start, end) in {
-            "thigh": chain[0:2], "shank": chain[1:3], "foot": chain[2:4],
-            "toes": (chain[3], at(family.toe_end, side)), "clavicle": (neck, chain[4]),
-            "upperarm": chain[4:6], "forearm": chain[5:7], "hand": chain[6:8],
-        }.items():
-            bones[f"{name}_{side}"] = end - start
-        hand = [at(name, side) for name in family.hand]
-        across[f"hand_{side}"] = hand[1] - hand[0] if len(hand) == 2 else turned(family.hand[0], forward, side)
-    legs = [np.linalg.norm(bones[f"{bone}_{side}"], axis=1).mean() for bone in ("thigh", "shank") for side in _SIDES]
+        bones["head"], across["head"] = end("head_top", "head") - neck, turned("head", right)
+    for s in SIDES:
+        chain = {
+            "thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand",
+        }  # fmt: skip
+        bones |= {f"{bone}_{s}": joint[f"{far}_{s}"] - joint[f"{bone}_{s}"] for bone, far in chain.items()}
+        bones[f"toes_{s}"] = end(f"toe_end_{s}", f"toes_{s}") - joint[f"toes_{s}"]
+        bones[f"clavicle_{s}"] = joint[f"upperarm_{s}"] - neck
+        bones[f"hand_{s}"] = end(f"knuckle_{s}", f"hand_{s}") - joint[f"hand_{s}"]
+        palm = f"palm_{s}" if f"palm_{s}" in joints else f"hand_{s}"
+        thumb = joint.get(f"thumb_{s}")
+        across[f"hand_{s}"] = turned(palm, forward) if thumb is None else thumb - joint[palm]
+    legs = [np.linalg.norm(bones[f"{bone}_{side}"], axis=1).mean() for bone in ("thigh", "shank") for side in SIDES]
     for name, vector in bones.items():
         if not name.startswith(("hand", "toes")) and np.any(np.linalg.norm(vector, axis=1) < _LEAST_BONE):
             raise ObservationError(f"the bone '{name}' has no length", file=skeleton.source or None)
     return BoneDirections(
         skeleton.rate, hip_centre, float(sum(legs) / 2),
         {name: _unit(v) for name, v in bones.items()}, {name: _unit(v) for name, v in across.items()},
-        _upright(skeleton, family, rest, forward),
+        _upright(skeleton, found, rest, forward),
     )
 
 
-def _rest(skeleton: SkeletonMotion, family: Family, R_up: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def _child(skeleton: SkeletonMotion, joint: int) -> int:
+    """The first child of a joint; the joint itself where it has none, so that the bone has no direction."""
+    children = np.flatnonzero(skeleton.parents == joint)
+    return int(children[0]) if len(children) else joint
+
+
+def _rest(skeleton: SkeletonMotion, found: Recorded, R_up: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Joints (J, 3) of the rest pose, y up, and the directions (3,) to the right and forward in it."""
     rest = np.array(skeleton.offsets)
     for joint, parent in enumerate(skeleton.parents):
         rest[joint] += rest[parent] if parent >= 0 else 0.0
     rest = rest @ R_up.T
-    left, right = (rest[skeleton.names.index(family.limbs[0].format(**side))] for side in _SIDES.values())
-    across = _unit(right - left)
+    across = _unit(rest[found.joints["thigh_r"]] - rest[found.joints["thigh_l"]])
     return rest, across, _unit(np.cross([0.0, 1.0, 0.0], across))
 
 
-def _upright(skeleton: SkeletonMotion, family: Family, rest: NDArray, forward: NDArray) -> dict[str, NDArray]:
-    vectors = np.array(family.upright)
-    if family.upright is None:
-        hips = [skeleton.names.index(family.limbs[0].format(**side)) for side in _SIDES.values()]
-        spine = [skeleton.names.index(name or "") for name in (*family.spine[:3], family.head_top)]
-        bones = np.diff([rest[hips].mean(axis=0), *rest[spine]], axis=0)
+def _upright(skeleton: SkeletonMotion, found: Recorded, rest: NDArray, forward: NDArray) -> dict[str, NDArray]:
+    vectors = np.array(found.upright)
+    if found.upright is None:
+        joints = found.joints
+        hips = rest[[joints["thigh_l"], joints["thigh_r"]]].mean(axis=0)
+        top = joints.get("head_top", _child(skeleton, joints["head"]))
+        bones = np.diff([hips, *rest[[joints["sacrum"], joints["spine"], joints["neck"], top]]], axis=0)
         vectors = np.stack([bones @ forward, bones[:, 1]], axis=1)
     return dict(zip(("pelvis", "abdomen", "thorax", "head"), _unit(vectors)))
 

@@ -123,7 +123,7 @@ def other_noise(
         if surface:
             settings = others.settings  # also where the fit takes surfaces for exact
             beside = max(settings.skin_shift, _EXACT), settings.skin_turn
-            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID))
+            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
             information[f] += skin.information[upper]
             if surfaces:
                 lasting[f] += (skin.pushes.T @ skin.pushes)[upper]

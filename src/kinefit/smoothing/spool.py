@@ -43,6 +43,13 @@ def stretches(frames: int) -> list[slice]:
     return [slice(start, min(start + STRETCH, frames)) for start in range(0, max(frames, 1), STRETCH)]
 
 
+def _goes_along(kind: type) -> bool:
+    """Whether things of a type are written; others stay as they are."""
+    if kind in _PLAIN or issubclass(kind, np.generic | np.dtype):
+        return True
+    return kind.__module__.startswith("kinefit.") and not issubclass(kind, _OF_ALL_FRAMES)
+
+
 class Spool(Sequence[T], Generic[T]):
     """Records of many frames, read back one by one; what is read is a copy.
 
@@ -132,6 +139,11 @@ class SpoolState:
     shared: tuple[Any, ...]
 
 
+def _kept(number: int) -> Any:
+    """Stands in a record for a thing that was not written; `_Unpickler` knows which."""
+    raise LookupError(f"thing {number} of a record")
+
+
 class _Pickler(pickle.Pickler):
     """Writes a record, with a number in place of each thing that is not written."""
 
@@ -139,8 +151,9 @@ class _Pickler(pickle.Pickler):
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
         self._number = number
 
-    def persistent_id(self, thing: Any) -> int | None:
-        return self._number(thing)
+    def reducer_override(self, thing: Any) -> Any:
+        number = None if thing is _kept else self._number(thing)
+        return NotImplemented if number is None else (_kept, (number,))
 
 
 class _Unpickler(pickle.Unpickler):
@@ -150,8 +163,8 @@ class _Unpickler(pickle.Unpickler):
         super().__init__(file)
         self._shared = shared
 
-    def persistent_load(self, number: int) -> Any:
-        return self._shared[number]
+    def find_class(self, module: str, name: str) -> Any:
+        return self._shared.__getitem__ if name == _kept.__name__ else super().find_class(module, name)
 
 
 class _Store:
@@ -166,6 +179,7 @@ class _Store:
         self._end = 0
         self.shared: list[Any] = []
         self._numbers: dict[int, int] = {}
+        self._written: dict[type, bool] = {}
         weakref.finalize(self, self._file.close)
 
     def flush(self) -> None:
@@ -205,9 +219,9 @@ class _Store:
     def _number(self, thing: Any) -> int | None:
         """Of what is kept as it is; None for what is written."""
         kind = type(thing)
-        if kind in _PLAIN or issubclass(kind, np.generic | np.dtype):
-            return None
-        if kind.__module__.startswith("kinefit.") and not issubclass(kind, _OF_ALL_FRAMES):
+        if kind not in self._written:
+            self._written[kind] = _goes_along(kind)
+        if self._written[kind]:
             return None
         number = self._numbers.get(id(thing))
         if number is None:

@@ -30,7 +30,8 @@ from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
 from kinefit.smoothing.spool import stretches
-from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
+from kinefit.solvers.border_frames import gram
+from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, normal_equations, product
 from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
@@ -216,13 +217,17 @@ def lasting(
     prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
-    alone[free, free] = inverse((product(by_pose.T, by_pose) + other_information + prior)[free, free])
+    seen = normal_equations(body, state, rows).matrix
+    alone[free, free] = inverse((seen + other_information + prior)[free, free])
     pushed = np.sqrt(weight[rows.group])[:, None] * by_pose
     last, source, axis = noise.drift[rows.group], channels.source[rows.group], np.arange(len(rows)) % 2
     sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shift))]
-    push = np.concatenate([last[:, None] * pushed, *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
-    meat = product(push.T, push) + other_lasting
-    pushed_by_shape = product(by_pose.T, by_shape)
+    push = np.concatenate([np.empty((0, n)), *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
+    data = np.array(rows.data)
+    data[7] *= np.square(last) * weight[rows.group]
+    drift = normal_equations(body, state, replace(rows, data=data)).matrix
+    meat = drift + product(push.T, push) + other_lasting
+    pushed_by_shape = gram(by_pose, by_shape)
     if known.closing is not None:
         moved_by = known.closing.at(state)
         pushed_by_shape[:, : moved_by.shape[1]] += closed.jacobian.T @ (w[:, None] * moved_by)

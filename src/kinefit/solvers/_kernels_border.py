@@ -67,3 +67,57 @@ def along(data, segment, centre, screws, dof_parent, last_dof, J):
             t = screws[d - 6]
             row[d] = t[0] * nx + t[1] * ny + t[2] * nz + t[3] * ax + t[4] * ay + t[5] * az
             d = dof_parent[d]
+
+
+@jit
+def joint_columns(parents, frames, offsets, out):
+    """out (S, 3, q): how joint centres move in the world, as their places in their parents do, offsets (S, 3, q)."""
+    for s in range(parents.size):
+        p = parents[s]
+        if p < 0:
+            out[s] = 0.0
+            continue
+        f, d, above, here = frames[p], offsets[s], out[p], out[s]
+        for i in range(3):
+            a, b, c = f[3 * i], f[3 * i + 1], f[3 * i + 2]
+            for k in range(d.shape[1]):
+                here[i, k] = above[i, k] + a * d[0, k] + b * d[1, k] + c * d[2, k]
+
+
+@jit
+def point_columns(data, segment, group, frames, joints, places, out):
+    """out (N, q): how far points of rows move, whitened: with joints (S, 3, q), and in their segments (M, 3, q)."""
+    for i in range(segment.size):
+        f, joint, place, row = frames[segment[i]], joints[segment[i]], places[group[i]], out[i]
+        w = math.sqrt(data[7, i])
+        x, y, z = w * data[3, i], w * data[4, i], w * data[5, i]
+        a, b, c = f[0] * x + f[3] * y + f[6] * z, f[1] * x + f[4] * y + f[7] * z, f[2] * x + f[5] * y + f[8] * z
+        for k in range(row.size):
+            row[k] = (
+                x * joint[0, k] + y * joint[1, k] + z * joint[2, k]
+                + a * place[0, k] + b * place[1, k] + c * place[2, k]
+            )  # fmt: skip
+
+
+@jit
+def camera_columns(data, camera, poses, first, out):
+    """Into out (N, p): how far points of rows move, whitened, by the twist of the camera (N,) that sees each.
+
+    poses (C, 4, 4) of the world in the cameras, first (C,) column of each, -1 for one that stays.
+    """
+    for i in range(camera.size):
+        k = first[camera[i]]
+        if k < 0:
+            continue
+        T, w = poses[camera[i]], math.sqrt(data[7, i])
+        x, y, z = data[0, i], data[1, i], data[2, i]
+        p = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        q = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        r = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+        x, y, z = w * data[3, i], w * data[4, i], w * data[5, i]
+        a = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
+        b = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
+        c = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+        row = out[i]
+        row[k], row[k + 1], row[k + 2] = a, b, c
+        row[k + 3], row[k + 4], row[k + 5] = q * c - r * b, r * a - p * c, p * b - q * a

@@ -30,6 +30,9 @@ def assign(cost: ArrayLike, most: float = np.inf) -> list[tuple[int, int]]:
     allowed = np.isfinite(cost) & (cost < most)
     if not allowed.any():
         return []
+    if 1 in cost.shape:  # one to choose for
+        best = int(np.argmin(np.where(allowed, cost, np.inf)))
+        return [divmod(best, cost.shape[1])]
     spread = float(np.ptp(cost[allowed])) + 1.0
     alone = most if np.isfinite(most) else float(cost[allowed].max()) + (min(cost.shape) + 1) * spread
     n = sum(cost.shape)  # everybody may stay alone, at the price of `most` a pair

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
-from kinefit.solvers.equations import lock
+from kinefit.solvers.equations import dense_pattern, lock, normal_equations
 from kinefit.solvers.whitened import Pose, columns, residuals, softening
 
 POSTURE = 0.01
@@ -75,22 +76,47 @@ class Frame:
 
     Parameters
     ----------
+    body, state : what they are about
     parts : its rows, by sensor
-    factor : (N,) square root of shares and robust factors
-    J : (N, n) derivatives by the pose, whitened and softened; left : (N,) residuals, likewise
+    weighing : how much they count
     H, g : (n, n), (n,) equations of the pose, with its posture prior
-    held : (n,) bool, at a limit that it presses on, or fixed: does not move
     cost : float
     """
 
+    body: Body
+    state: BodyState
     parts: Sequence[Part]
-    factor: NDArray
-    J: NDArray
-    left: NDArray
+    weighing: Weighing
     H: NDArray
     g: NDArray
-    held: NDArray
     cost: float
+
+    @cached_property
+    def factor(self) -> NDArray:
+        """(N,) square root of shares and robust factors."""
+        w = self.weighing
+        own = [np.sqrt(w.shares.get(sensor, 1.0)) * softening(rows, w.loss)[0] for sensor, rows in self.parts]
+        return np.concatenate([np.empty(0), *own])
+
+    @cached_property
+    def J(self) -> NDArray:
+        """(N, n) derivatives by the pose, whitened and softened."""
+        pose = Pose.of(self.body, self.state)
+        every = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
+        return np.asarray(self.factor[:, None] * np.concatenate(every))
+
+    @property
+    def left(self) -> NDArray:
+        """(N,) residuals, whitened and softened."""
+        return np.asarray(self.factor * _stacked(self.parts))
+
+    @cached_property
+    def held(self) -> NDArray:
+        """(n,) bool, at a limit that it presses on, or fixed: does not move."""
+        tree, angles, out = self.body.tree, self.state.angles, lock(self.body, None)
+        out[6:] |= (angles <= tree.lower) & (self.g[6:] < 0.0)
+        out[6:] |= (angles >= tree.upper) & (self.g[6:] > 0.0)
+        return out
 
     @property
     def felt(self) -> NDArray:
@@ -100,31 +126,30 @@ class Frame:
 
     def step(self, damping: float) -> tuple[NDArray, float]:
         """δ (n,) of the pose alone, and the predicted fall of the cost."""
-        move = solved(self.H, self.g[:, None], self.held, damping)[:, 0]
-        return move, float(self.g @ move) + damping * float(move @ move)
+        n, tree = len(self.g), self.body.tree
+        L, move = np.empty((n, n)), np.empty(n)
+        fall = _kernels_linear.damped_step(
+            self.H, self.g, damping + _floor(self.H), *dense_pattern(n), self.state.angles, tree.lower, tree.upper,
+            lock(self.body, None), L, move,
+        )  # fmt: skip
+        if fall < 0.0:
+            move = solved(self.H, self.g[:, None], self.held, damping)[:, 0]
+            fall = float(self.g @ move) + damping * float(move @ move)
+        return move, float(fall)
 
 
 def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, weighing: Weighing) -> Frame:
     """A frame's rows and equations at parameters (p,) and a state."""
     body = problem.body(theta)
-    tree, n = body.tree, body.tree.n_dofs
-    parts, pose = problem.parts(theta, frame, state), Pose.of(body, state)
-    posture, factors, cost = weighing.most * weighing.posture, [np.empty(0)], 0.0
-    pull = posture * tree.posture_precision
-    for sensor, rows in parts:
-        share = weighing.shares.get(sensor, 1.0)
-        soft, own = softening(rows, weighing.loss)
-        factors.append(np.sqrt(share) * soft)
-        cost += share * own
-    factor = np.concatenate(factors)
-    J = factor[:, None] * np.concatenate([*(columns(r, pose) for _, r in parts), np.empty((0, n))])
-    left = factor * _stacked(parts)
-    H, g, held = gram(J, J), left @ J, lock(body, None)
+    parts = problem.parts(theta, frame, state)
+    shares = [weighing.shares.get(sensor, 1.0) for sensor, _ in parts]
+    found = normal_equations(body, state, [rows for _, rows in parts], loss=weighing.loss, shares=shares)
+    H, g, posture = found.matrix, found.gradient, weighing.most * weighing.posture
+    pull = posture * body.tree.posture_precision
+    away = state.angles - body.tree.usual
     H[6:, 6:] += pull
-    g[6:] -= pull @ (state.angles - tree.usual)
-    held[6:] |= (state.angles <= tree.lower) & (g[6:] < 0.0)
-    held[6:] |= (state.angles >= tree.upper) & (g[6:] > 0.0)
-    return Frame(parts, factor, J, left, H, g, held, cost + tree.posture_cost(state.angles, posture))
+    g[6:] -= pull @ away
+    return Frame(body, state, parts, weighing, H, g, found.cost + float(away @ pull @ away))
 
 
 def settle(
@@ -170,6 +195,8 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
         out = told(theta, steps, states)
     unknown = [np.isnan(D) for D in out]
     left = np.any([u.any(axis=0) for u in unknown], axis=0)
+    if not left.any():
+        return out
     for D, u in zip(out, unknown):
         D[u] = 0.0
     on = [_segments(parts) for parts in centre]
@@ -243,12 +270,16 @@ def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list
 
 def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:
     """(n, m) H⁻¹ right of a pose, zero for what is held."""
-    n = len(H)
     A, right = H.copy(), np.ascontiguousarray(right).copy()
-    A[range(n), range(n)] += damping + _FLOOR * float(np.trace(H)) / n + 1e-12
+    A.flat[:: len(H) + 1] += damping + _floor(H)
     A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
     A[held, held] = 1.0
     return right if _kernels_border.solve(A.copy(), right) else np.linalg.lstsq(A, right)[0]
+
+
+def _floor(H: NDArray) -> float:
+    """What is added to the diagonal of a pose's equations (n, n) in any case."""
+    return _FLOOR * float(H.trace()) / len(H) + 1e-12
 
 
 def gram(A: NDArray, B: NDArray) -> NDArray:

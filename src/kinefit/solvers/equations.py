@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -59,10 +59,21 @@ class Equations:
 
 
 def normal_equations(
-    body: Body, state: BodyState, parts: AnyRows | Iterable[AnyRows], *, loss: Loss = SQUARED
-) -> Equations:
-    """Gather rows of any kinds at a state into H and g; `loss` is that of rows without their own."""
+    body: Body, state: BodyState, parts: AnyRows | Iterable[AnyRows], *, loss: Loss = SQUARED,
+    shares: Sequence[float] | None = None,
+) -> Equations:  # fmt: skip
+    """Gather rows of any kinds at a state into H and g.
+
+    Parameters
+    ----------
+    loss : of rows without their own
+    shares : how much each of several parts counts, beyond its loss; default: in full
+    """
     parts = [parts] if isinstance(parts, AnyRows) else list(parts)
+    if shares is None:
+        shares = (1.0,) * len(parts)
+    else:
+        parts = [_counting(p, share) for p, share in zip(parts, shares, strict=True)]
     rows, pairs, parameters, dense = sort_out(parts)
     tree = body.tree
     n = tree.n_dofs
@@ -73,16 +84,16 @@ def normal_equations(
     chain, depth = tree.chain, tree.depth
     factor, blocks = np.empty(len(rows)), np.empty((len(tree.segments), 27))
     C, g = np.empty(chain.shape), np.empty(n)
-    given = [p for p in parts if isinstance(p, Rows)]
-    one = given[0].loss or loss if len(given) == 1 else loss
-    mixed = np.ndim(one.scale) > 0 or any((p.loss or loss) is not one for p in given)
+    given = [(p, share) for p, share in zip(parts, shares, strict=True) if isinstance(p, Rows)]
+    one = given[0][0].loss or loss if len(given) == 1 else loss
+    mixed = np.ndim(one.scale) > 0 or any(share != 1.0 or (p.loss or loss) is not one for p, share in given)
     data, kind, scale, cost = rows.data, one.kind, one.scale, 0.0
     if mixed:  # each part by its own loss: in the weights already, with what that leaves of the cost
-        weighed = [(p.loss or loss).of_rows(p.data, p.group) for p in given]
-        robust = np.concatenate([f for f, _ in weighed])
+        weighed = [((p.loss or loss).of_rows(p.data, p.group), share) for p, share in given]
+        robust = np.concatenate([share * f for (f, _), share in weighed])
         data, kind, scale = np.array(rows.data), SQUARED.kind, 1.0
         data[7] *= robust
-        cost = sum(c for _, c in weighed) - float(data[7] @ np.square(data[6]))
+        cost = sum(share * c for (_, c), share in weighed) - float(data[7] @ np.square(data[6]))
     cost += _kernels.assemble(
         data, rows.segment, rows.group, len(rows), kind, scale, centre,
         tree.parents, tree.dof_start, chain, depth, screws, factor, blocks, C, g,
@@ -98,9 +109,10 @@ def normal_equations(
         _kernels_linear.unpack(C, chain, depth, H)
         for p in joint:
             pull = p.weight @ p.residual
-            if len(p) == n and (np.diff(p.index) == 1).all():
-                H += p.weight
-                g += pull
+            if len(p) and (p.index[1:] - p.index[:-1] == 1).all():
+                own = slice(int(p.index[0]), int(p.index[-1]) + 1)
+                H[own, own] += p.weight
+                g[own] += pull
             else:
                 H[np.ix_(p.index, p.index)] += p.weight
                 g[p.index] += pull
@@ -110,24 +122,29 @@ def normal_equations(
                 q.segments, q.point_a, q.point_b, q.direction, q.residual, q.weight,
                 centre, screws, tree.dof_parent, tree.last_dof, H, g,
             )  # fmt: skip
-        for d in dense:
-            cost += _add_dense(d, body, loss, H, g)
+        for d, share in zip(dense, (s for p, s in zip(parts, shares) if isinstance(p, DofRows))):
+            cost += _add_dense(d, share, body, loss, H, g)
         return Equations(body, state, rows, factor, H, g, float(cost), *dense_pattern(n))
     return Equations(body, state, rows, factor, C, g, float(cost), chain, depth)
 
 
-def _add_dense(rows: DofRows, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
-    """Add rows on all degrees of freedom; their cost."""
+def _counting(rows: AnyRows, share: float) -> AnyRows:
+    """Rows without a loss, counting by a share; those with one as they are."""
+    return rows if share == 1.0 or isinstance(rows, Rows | DofRows) else replace(rows, weight=share * rows.weight)
+
+
+def _add_dense(rows: DofRows, share: float, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
+    """Add a share of rows on all degrees of freedom; their cost."""
     if rows.jacobian.shape[1] != len(g):
         problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {len(g)}"
         raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
     data = np.zeros((8, len(rows)))
     data[6], data[7] = rows.residual, rows.weight
     factor, cost = (rows.loss or loss).of_rows(data, rows.group)
-    weighted = rows.jacobian * (rows.weight * factor)[:, None]
+    weighted = rows.jacobian * (share * rows.weight * factor)[:, None]
     H += rows.jacobian.T @ weighted
     g += rows.residual @ weighted
-    return float(cost)
+    return share * float(cost)
 
 
 @lru_cache(maxsize=8)

@@ -94,12 +94,19 @@ class MotionPrior:
         theta = np.geomspace(lowest, np.pi, 2000)
         z = np.exp(1j * theta)
         prior = np.abs((1 - z) * (1 - self.keep[0] * z) * (1 - self.keep[1] * z)) ** 2
+        width = np.zeros(len(theta))  # of the trapezoidal rule; below the lowest all is as there
+        width[1:], width[0] = 0.5 * np.diff(theta), lowest
+        width[:-1] += 0.5 * np.diff(theta)
         low, high = np.full(len(variance), -80.0), np.full(len(variance), 80.0)  # of log w
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            w = np.exp(middle)
-            density = 1.0 / (w[:, None] + prior)
-            whole = 0.5 * (density[:, 1:] + density[:, :-1]) @ np.diff(theta)  # trapezoidal rule
-            wide = (whole + lowest * density[:, 0]) / np.pi > variance
-            low, high = np.where(wide, middle, low), np.where(wide, high, middle)
-        return np.exp(0.5 * (low + high))
+        log, wanted = -np.log(variance), np.log(variance)
+        for _ in range(60):  # Newton's method on logarithms, halves where it leaves what is known
+            density = 1.0 / (np.exp(log)[:, None] + prior)
+            whole = density @ width / np.pi
+            wide = whole > variance
+            low, high = np.where(wide, log, low), np.where(wide, high, log)
+            slope = -np.exp(log) * (np.square(density) @ width) / np.pi / whole
+            step = (wanted - np.log(whole)) / np.where(slope < 0.0, slope, -1.0)
+            if np.abs(step).max(initial=0.0) < 1e-9:  # the next would be less than rounding
+                return np.exp(log + step)
+            log = np.where((log + step > low) & (log + step < high), log + step, 0.5 * (low + high))
+        return np.exp(log)

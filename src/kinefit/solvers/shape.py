@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,8 @@ class PixelFrames:
         return np.ones(len(self.column)) if self.share is None else self.share
 
 
-def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, NDArray]:
+@lru_cache(maxsize=32)  # every kind of parameters asks again
+def mirror_points(points: PointSet, segments: tuple[str, ...]) -> tuple[NDArray, NDArray]:
     """For each point the one whose shift it shares, and ±1 for the sign of z: left and right are alike.
 
     A point's image is the one on the mirrored segment at the mirrored place; a point in the middle is its own, sign 0.
@@ -71,6 +71,7 @@ def mirror_points(points: PointSet, segments: Sequence[str]) -> tuple[NDArray, N
         elif same and (names[k].endswith("_l") or points.points[k, 2] < -1e-9) and not names[k].endswith("_r"):
             rank = sum(1 for j in range(k) if names[j] == names[k] and np.allclose(points.points[j], points.points[k]))
             lead[k], sign[k] = same[min(rank, len(same) - 1)], -1.0
+    lead.flags.writeable = sign.flags.writeable = False
     return lead, sign
 
 

@@ -22,13 +22,10 @@ from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
-from kinefit.subject.subject import SubjectFit, Unmeasured
+from kinefit.subject.subject import SubjectFit
 
 REACH = (0.08, 0.05, 0.03)
 """[m] of correspondences that are sought anew, coarse to fine; the last for all further rounds."""
-
-TOLD = 0.1
-"""Share of the prior's variance that data must explain for a direction to count as measured."""
 
 COARSE = 4, SETTLING
 """Iterations of a round where correspondences are sought anew, or reach farther than in the end; and how many steps
@@ -122,23 +119,9 @@ def fit_subject(
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),
-        solved.states, solved.information, prior, told, unmeasured(names, prior, solved.information), solved.cost, used,
+        solved.states, solved.information, prior, told, solved.cost, used,
         tuple(parameters), World(body, rig),
     )  # fmt: skip
-
-
-def unmeasured(names: Sequence[str], prior: Prior, information: NDArray) -> tuple[Unmeasured, ...]:
-    """Directions of which data explain less than a tenth of the prior's variance."""
-    root = np.linalg.cholesky(inverse(prior.information))
-    values, vectors = np.linalg.eigh(root.T @ information @ root)
-    out = []
-    for value, vector in zip(values, vectors.T):
-        share = max(float(value), 0.0) / (1.0 + max(float(value), 0.0))
-        if share < TOLD:
-            moved = np.abs(root @ vector) / np.sqrt(np.diag(root @ root.T))
-            largest = [k for k in np.argsort(-moved) if moved[k] > 0.3 * moved.max()]
-            out.append(Unmeasured(vector, share, tuple(names[k] for k in largest)))
-    return tuple(out)
 
 
 def _followed(body: Body, solved: Bordered) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 
@@ -63,10 +64,11 @@ def fit_subject(
         progress("bone lengths", 0, 1)
     x = triangulated(channels, chosen)
     scales = first_scales(body, channels.points, x, height=height) if trial is None else trial.scales
-    sized = channels.with_points(body.scaled(scales))
+    near = body.scaled(scales)
+    sized = channels.with_points(near)
     states: dict[int, BodyState] = {}
     for i, f in enumerate(chosen):
-        state = _pose(body.scaled(scales), sized, x[i], next(reversed(states.values()), None))
+        state = _pose(near, sized, x[i], next(reversed(states.values()), None))
         if state is not None:
             states[int(f)] = state
         if progress:
@@ -76,7 +78,7 @@ def fit_subject(
             "no frame shows enough of the person in two cameras to start from",
             remedy="Check the calibration and that the cameras are in step (kinefit track -v).",
         )
-    weight = _weights(body.scaled(scales), sized, states)
+    weight = _weights(near, sized, states)
     sensor, layout = KeypointSensor(channels.rig, {}, 0.0, geman_mcclure(), joint.REACH[0]), Layout(channels, body)
     variance = np.square(channels.sigma)
     steps = [[KeypointMeasurement(sensor, layout, channels.uv[f], w * variance, 0.0)] for f, w in zip(states, weight)]
@@ -103,6 +105,7 @@ def _fitted(
     would move cameras: their calibration counts for more by the excess of the round before.
     """
     spread, excess_of, start, gear = _SHIFT, 1.0, None, Gear(body)
+    bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     for k in range(_ROUNDS):
         parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
@@ -118,7 +121,7 @@ def _fitted(
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            body, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
+            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
         )
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
@@ -129,6 +132,8 @@ def _fitted(
         told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
         spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
         excess_of = max(excess_of, 1.0)
+    prior_world = World(body, channels.rig)
+    found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
     return found, wider[:, None] * covariance * wider
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,17 +44,23 @@ class Worlds:
 
     def at(self, theta: NDArray) -> World:
         """The world with parameters (p,)."""
-        world = self._first
+        return self._chain(theta)[-1] if self._applied else self._first
+
+    def _chain(self, theta: NDArray) -> list[World]:
+        """The worlds that each kind of parameters makes of the one before."""
+        world, out = self._first, []
         for one, own in self._applied:
             values = theta[own]
             key = id(world), values.tobytes()
-            if key not in self._kept:
+            kept = self._kept.pop(key, None)
+            if kept is None:
                 if len(self._kept) >= _KEPT:
                     self._kept.pop(next(iter(self._kept)))
-                self._kept[key] = world, one.apply(world, values)
-            self._kept[key] = self._kept.pop(key)  # the latest last
-            world = self._kept[key][1]
-        return world
+                kept = world, one.apply(world, values)
+            self._kept[key] = kept  # the latest last
+            world = kept[1]
+            out.append(world)
+        return out
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
@@ -75,7 +82,16 @@ class Worlds:
         return [(one, own) for one, own in self._parameters if isinstance(one, CameraExtrinsics)]
 
     def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
-        """How points move with some parameters, all of which move nothing else; by central differences."""
+        """How points move with some parameters, all of which move nothing else; by differences where not told."""
+        chain = self._chain(theta)
+        moving = [
+            (one, own, after.body) for (one, own), before, after in zip(self._applied, [self._first, *chain], chain)
+            if after.body is not before.body
+        ]  # fmt: skip
+        slopes: list[Any] = [getattr(one, "slopes", None) for one, _, _ in moving]
+        if all(slopes):
+            made = [(tell, theta[own], own, body) for tell, (_, own, body) in zip(slopes, moving)]
+            return PointMoves.told(chain[-1].body, made, some, len(theta))
         worlds = self
         others = [one for one, _ in self._parameters if not isinstance(one, CameraExtrinsics)]
         if all(getattr(one, "of_points", False) for one in others):  # surfaces would be stretched for nothing
@@ -88,7 +104,7 @@ class Worlds:
             change = np.zeros(len(theta))
             change[together] = steps[together]
             pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
-        return PointMoves(pairs, some, steps, self.touches)
+        return PointMoves.between(pairs, some, steps, self.touches)
 
     def closing(self, theta: NDArray, steps: NDArray) -> ClosureMoves | None:
         """How closures of the body move with the parameters; None for a body without."""

@@ -100,9 +100,15 @@ class MetaballShape:
 
 def grown(limb: Metaballs, values: NDArray, *, weights: bool = False) -> Metaballs:
     """A limb with the logarithms of factors on its radii (3 K,), and on its weights (K,) after them."""
+    radii, w = _scaled(limb, values, weights)
+    return limb.changed(radii, w if weights else None)
+
+
+def _scaled(limb: Metaballs, values: NDArray, weights: bool) -> tuple[NDArray, NDArray]:
+    """Radii (K, 3) [m] and weights (K,)."""
     count = limb.radii.size
-    return limb.changed(limb.radii * np.exp(values[:count]).reshape(-1, 3),
-                        limb.weights * np.exp(values[count:]) if weights else None)  # fmt: skip
+    w = limb.weights * np.exp(values[count:]) if weights else limb.weights
+    return limb.radii * np.exp(values[:count]).reshape(-1, 3), w
 
 
 @lru_cache(maxsize=64)
@@ -188,9 +194,7 @@ def fit_balls(
 
 def _unmeshed(limb: Metaballs, values: NDArray, weights: bool) -> Metaballs:
     """As `grown`, with the old mesh: for its field alone."""
-    count = limb.radii.size
-    radii = limb.radii * np.exp(values[:count]).reshape(-1, 3)
-    w = limb.weights * np.exp(values[count:]) if weights else limb.weights
+    radii, w = _scaled(limb, values, weights)
     return replace(limb, radii=radii, weights=w)
 
 

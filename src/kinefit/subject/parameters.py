@@ -47,8 +47,10 @@ class Parameters(Protocol):
     """One kind of parameters: names, a prior, and a function from values to a world.
 
     It may have `of_points`, True where the values move nothing but points and joints of the body: derivatives of rows
-    of points then take no rows of other worlds. It may have `touches`, of each parameter the segments on which alone
-    rows can feel it.
+    of points then take no rows of other worlds. They take no other bodies either where it has `slopes(values, own,
+    name, segment, points, out)`: of points (K, 3) of a set by name, or of joints for None, on segments (K,), where its
+    body has them, it carries derivatives out (K, 3, p) by all parameters before it on, and adds its own in columns
+    `own`. It may have `touches`, of each parameter the segments on which alone rows can feel it.
     """
 
     @property
@@ -134,6 +136,15 @@ class SegmentScales:
         for parent, group in zip(body.tree.parents, body.segment_scale):
             above.append({int(group)} | (above[parent] if parent >= 0 else set()))
         return tuple(frozenset(s for s, groups in enumerate(above) if g in groups) for g in range(count))
+
+    def slopes(
+        self, values: NDArray, own: slice, name: str | None, segment: NDArray, points: NDArray, out: NDArray
+    ) -> None:
+        """Points stretch with the scale of their segment; see `Parameters`."""
+        fixed, group = self.body.gear_scale, self.body.segment_scale[segment]
+        out *= np.where(fixed, 1.0, np.exp(values))[group][:, None, None]
+        felt = np.flatnonzero(~fixed[group])
+        out[felt, :, own.start + group[felt]] += points[felt]
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these lengths; all its points, surfaces and morphs go along."""
@@ -233,6 +244,16 @@ class PointOffsets:
         lead, _, leaders = self._shared
         on = [frozenset(int(s) for s in self.points.segments[lead == k]) for k in leaders]
         return tuple(segments for segments in on for _ in "xyz")
+
+    def slopes(
+        self, values: NDArray, own: slice, name: str | None, segment: NDArray, points: NDArray, out: NDArray
+    ) -> None:
+        """Points of this set move along their segment's axes; see `Parameters`."""
+        if name == self.name:
+            lead, sign, leaders = self._shared
+            k, first = np.arange(len(points)), own.start + 3 * np.searchsorted(leaders, lead)
+            for axis, way in enumerate((1.0, 1.0, np.where(sign == 0.0, 1.0, sign))):
+                out[k, axis, first + axis] += way
 
     def shifts(self, values: NDArray) -> NDArray:
         """(K, 3) [m] of all points, mirrored where they share."""

@@ -1,21 +1,26 @@
 """How points of a body move with parameters: derivatives of rows of points, without the rows of other worlds.
 
 A row of a point feels the body by where the point sits in its segment and where joints sit in their parents'. Both do
-not depend on the pose: their derivatives are differences between bodies, taken once for all frames.
+not depend on the pose: their derivatives are taken once for all frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, KinematicTree, PointSet
 from kinefit.rows import Rows
+from kinefit.solvers import _kernels_border
 
 Place = tuple[str, str]
 """A set of points and a name in it; landmarks are in the set ""."""
+
+
+Slopes = Callable[[NDArray, slice, str | None, NDArray, NDArray, NDArray], None]
+"""Of a kind of parameters, see `Parameters`."""
 
 
 class PointMoves:
@@ -23,73 +28,109 @@ class PointMoves:
 
     Parameters
     ----------
-    pairs : parameters that change together, and bodies a step below and above in them
-    some : (q,) the parameters that columns are wanted of
-    steps : (p,)
-    touches : (p,) of each parameter the segments that it moves, or whose points; None for any
+    body : Body there
+    joints : (S, 3, q) derivatives of every joint in its parent
+    of_set : of the name of a set, derivatives (K, 3, q) of its points in their segments
     """
 
-    def __init__(
-        self, pairs: Sequence[tuple[list[int], Body, Body]], some: NDArray, steps: NDArray,
-        touches: Sequence[frozenset[int] | None],
-    ) -> None:  # fmt: skip
-        body, column = pairs[0][1], {int(k): j for j, k in enumerate(some)}
-        self._offsets = np.zeros((*body.tree.offsets.shape, len(some)))
-        owner = np.concatenate([points.segments for points in _sets(body).values()])
-        slopes = np.zeros((len(owner), 3, len(some)))
-        for together, below, above in pairs:
-            joints, points = above.tree.offsets - below.tree.offsets, _places(above) - _places(below)
-            for k in together:
-                touched, width = touches[k], 2.0 * steps[k]
-                here = np.ones(len(joints), bool) if touched is None else np.isin(np.arange(len(joints)), list(touched))
-                self._offsets[here, :, column[k]] = joints[here] / width
-                slopes[here[owner], :, column[k]] = points[here[owner]] / width
-        names = [(name, point) for name, points in _sets(body).items() for point in points.names]
-        self._points = dict(zip(names, slopes))
-        self._chosen: dict[tuple[Place, ...], NDArray] = {}
+    def __init__(self, body: Body, joints: NDArray, of_set: Callable[[str], NDArray]) -> None:
+        self._body, self._joints, self._of_set = body, np.ascontiguousarray(joints), of_set
+        self._chosen: dict[int, tuple[Sequence[Place], NDArray | None]] = {}
 
-    def columns(self, places: Sequence[Place], rows: Rows, tree: KinematicTree, frames: NDArray) -> NDArray | None:
-        """(N, p) how far the points of rows move along their directions, whitened; None where a point is not known.
+    @classmethod
+    def told(
+        cls, body: Body, made: Sequence[tuple[Slopes, NDArray, slice, Body]], some: NDArray, count: int
+    ) -> PointMoves:
+        """By what kinds of parameters tell of themselves.
 
         Parameters
         ----------
-        places : of the points that rows number by group
+        made : of each kind in turn its slopes, values, columns, and the body that it made
+        some : (q,) the parameters that columns are wanted of, out of `count`
+        """
+
+        def slopes(name: str | None, segment: NDArray, points: Callable[[Body], NDArray]) -> NDArray:
+            out = np.zeros((len(segment), 3, count))
+            for tell, values, own, there in made:
+                tell(values, own, name, segment, points(there), out)
+            return out[:, :, some]
+
+        def of_set(name: str) -> NDArray:
+            return slopes(name, _points(body, name).segments, lambda b: _points(b, name).points)
+
+        return cls(body, slopes(None, np.maximum(body.tree.parents, 0), lambda b: b.tree.offsets), of_set)
+
+    @classmethod
+    def between(
+        cls, pairs: Sequence[tuple[list[int], Body, Body]], some: NDArray, steps: NDArray,
+        touches: Sequence[frozenset[int] | None],
+    ) -> PointMoves:  # fmt: skip
+        """By differences between bodies.
+
+        Parameters
+        ----------
+        pairs : parameters that change together, and bodies a step below and above in them
+        some : (q,) the parameters that columns are wanted of
+        steps : (p,)
+        touches : (p,) of each parameter the segments that it moves, or whose points; None for any
+        """
+        body, column = pairs[0][1], {int(k): j for j, k in enumerate(some)}
+
+        def slopes(of: Callable[[Body], NDArray], owner: NDArray) -> NDArray:
+            out = np.zeros((len(owner), 3, len(some)))
+            for together, below, above in pairs:
+                moved = of(above) - of(below)
+                for k in together:
+                    touched = touches[k]
+                    here = np.ones(len(owner), bool) if touched is None else np.isin(owner, list(touched))
+                    out[here, :, column[k]] = moved[here] / (2.0 * steps[k])
+            return out
+
+        joints = slopes(lambda b: b.tree.offsets, np.arange(len(body.tree.segments)))
+        return cls(body, joints, lambda name: slopes(lambda b: _points(b, name).points, _points(body, name).segments))
+
+    def columns(self, places: Sequence[Place], rows: Rows, tree: KinematicTree, frames: NDArray) -> NDArray | None:
+        """(N, q) how far the points of rows move along their directions, whitened; None where a point is not known.
+
+        Parameters
+        ----------
+        places : of the points that rows number by group; not to be changed
         tree, frames : of the body, and (S, 12) of its segments
         """
-        moves = self._of(tuple(places))
+        moves = self._of(places)
         if moves is None:
             return None
-        turns = frames[:, :9].reshape(-1, 3, 3)
-        which, first, row = np.unique(rows.group, return_index=True, return_inverse=True)
-        owner = rows.segment[first]
-        moved = self.joints(tree, frames)[owner] + turns[owner] @ moves[which]
-        weighed = np.sqrt(rows.weight)[:, None] * rows.direction
-        return np.asarray((weighed[:, None] @ moved[row])[:, 0])
-
-    def joints(self, tree: KinematicTree, frames: NDArray) -> NDArray:
-        """(S, 3, p) how joint centres move in the world, the pose as it is."""
-        out = frames[:, :9].reshape(-1, 3, 3)[tree.parents] @ self._offsets
-        out[0] = 0.0
-        for s in range(1, len(out)):
-            out[s] += out[tree.parents[s]]
+        out = np.empty((len(rows), moves.shape[2]))
+        joints = self.joints(tree, frames)
+        _kernels_border.point_columns(rows.data, rows.segment, rows.group, frames, joints, moves, out)
         return out
 
-    def _of(self, places: tuple[Place, ...]) -> NDArray | None:
-        """(M, 3, p) derivatives of points in their segments."""
-        if places not in self._chosen:
-            if not all(place in self._points for place in places):
-                return None
-            self._chosen[places] = np.stack([self._points[place] for place in places])
-        return self._chosen[places]
+    def joints(self, tree: KinematicTree, frames: NDArray) -> NDArray:
+        """(S, 3, q) how joint centres move in the world, the pose as it is."""
+        out = np.empty(self._joints.shape)
+        _kernels_border.joint_columns(tree.parents, frames, self._joints, out)
+        return out
+
+    def _of(self, places: Sequence[Place]) -> NDArray | None:
+        """(M, 3, q) derivatives of points in their segments."""
+        if id(places) not in self._chosen:
+            self._chosen[id(places)] = places, self._slopes(places)
+        return self._chosen[id(places)][1]
+
+    def _slopes(self, places: Sequence[Place]) -> NDArray | None:
+        both = self._body.marker_sets.keys() & self._body.keypoint_sets.keys()
+        sets = {name for name, _ in places}
+        if not sets or sets & both or not sets <= {"", *self._body.marker_sets, *self._body.keypoint_sets}:
+            return None
+        row = {name: {p: k for k, p in enumerate(_points(self._body, name).names)} for name in sets}
+        if not all(point in row[name] for name, point in places):
+            return None
+        slopes = {name: self._of_set(name) for name in sets}
+        return np.stack([slopes[name][row[name][point]] for name, point in places])
 
 
-def _sets(body: Body) -> dict[str, PointSet]:
-    """All sets of points; those of one name, of keypoints and of markers, are left out."""
-    both = body.marker_sets.keys() & body.keypoint_sets.keys()
-    sets = {**body.marker_sets, **body.keypoint_sets, "": body.landmarks}
-    return {name: points for name, points in sets.items() if name not in both}
-
-
-def _places(body: Body) -> NDArray:
-    """(M, 3) [m] of all points of all sets in their segments."""
-    return np.concatenate([points.points for points in _sets(body).values()])
+def _points(body: Body, name: str) -> PointSet:
+    """A set of points of a body; landmarks for no name."""
+    if not name:
+        return body.landmarks
+    return body.marker_sets[name] if name in body.marker_sets else body.keypoints(name)

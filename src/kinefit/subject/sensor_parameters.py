@@ -14,6 +14,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.displaced import AXES, CLOCK
+from kinefit.solvers import _kernels_border
 from kinefit.subject.parameters import World
 
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
@@ -42,7 +43,7 @@ class CameraExtrinsics:
     def __post_init__(self) -> None:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
             self.rig.index(name)
-        if not min(self.std) > 0:
+        if not all(std > 0 for std in self.std):
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
 
     @property
@@ -90,12 +91,12 @@ class CameraExtrinsics:
         camera : (N,) number in the rig of the camera that sees each row's point; none for no rows through cameras
         """
         out = np.zeros((len(rows), 6 * len(self.free)))
-        for k, name in enumerate(self.free if len(camera) else ()):
-            mine = np.flatnonzero(camera == rig.index(name))
-            T = rig[name].T_camera_world
-            x, d = rows.point[mine] @ T[:3, :3].T + T[:3, 3], rows.direction[mine] @ T[:3, :3].T
-            moved = np.concatenate([d, np.cross(x, d)], axis=1)
-            out[mine, 6 * k : 6 * k + 6] = np.sqrt(rows.weight[mine])[:, None] * moved
+        if not len(camera):
+            return out
+        first = np.full(len(rig), -1)
+        first[[rig.index(name) for name in self.free]] = 6 * np.arange(len(self.free))
+        poses = np.array([c.T_camera_world for c in rig])
+        _kernels_border.camera_columns(rows.data, np.ascontiguousarray(camera, np.int64), poses, first, out)
         return out
 
 
@@ -130,7 +131,7 @@ class SensorFrames:
     arms: Mapping[str, NDArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not min(self.std) > 0:
+        if not all(std > 0 for std in self.std):
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give m, rad and s above 0.")
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.border import Prior
+from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
+
+TOLD = 0.1
+"""Share of the prior's variance that data must explain for a direction to count as measured."""
 
 Progress = Callable[[str, int, int], None]
 """(what is done, how many of it, of how many)."""
@@ -26,7 +31,7 @@ class Unmeasured:
     Parameters
     ----------
     direction : (p,) in prior standard deviations, of length 1.
-    share : of the prior's variance in it that data explain, below `fit.TOLD`.
+    share : of the prior's variance in it that data explain, below `TOLD`.
     names : of the parameters that make up most of it, the largest first.
     """
 
@@ -49,7 +54,6 @@ class SubjectFit:
     prior : Prior
     excess : {sensor: factor} by which what its frames measure together is less certain than its rows say; more certain
         below 1.
-    unmeasured : directions that the prior alone holds, the least measured first.
     cost : float
     rounds : of match and solve
     parameters : the kinds of them
@@ -66,11 +70,24 @@ class SubjectFit:
     information: NDArray
     prior: Prior
     excess: Mapping[str, float]
-    unmeasured: tuple[Unmeasured, ...]
     cost: float
     rounds: int
     parameters: tuple[Parameters, ...]
     prior_world: World
+
+    @cached_property
+    def unmeasured(self) -> tuple[Unmeasured, ...]:
+        """Directions of which data explain less than a tenth of the prior's variance, the least measured first."""
+        root = np.linalg.cholesky(inverse(self.prior.information))
+        values, vectors = np.linalg.eigh(root.T @ self.information @ root)
+        out = []
+        for value, vector in zip(values, vectors.T):
+            share = max(float(value), 0.0) / (1.0 + max(float(value), 0.0))
+            if share < TOLD:
+                moved = np.abs(root @ vector) / np.sqrt(np.diag(root @ root.T))
+                largest = [k for k in np.argsort(-moved) if moved[k] > 0.3 * moved.max()]
+                out.append(Unmeasured(vector, share, tuple(self.names[k] for k in largest)))
+        return tuple(out)
 
     @property
     def std(self) -> NDArray:

@@ -16,6 +16,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
 from kinefit.multiview.followed import Followed, follow
+from kinefit.multiview.people import Person
 from kinefit.observations import (
     ColourFrame,
     DepthFrame,
@@ -111,7 +112,7 @@ class Recording:
     @classmethod
     def of_keypoints(
         cls, rig: Rig, keypoints: Sequence[Keypoints], *, accuracy: float | Sequence[float] = 8.0,
-        person: int | str | None = None, **more: Any,
+        person: int | str | None = None, people: Sequence[Person] | None = None, **more: Any,
     ) -> Recording:  # fmt: skip
         """Keypoints of calibrated cameras; the person is chosen among all detected.
 
@@ -121,6 +122,7 @@ class Recording:
         keypoints : records of the same number of frames and the same rate.
         accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
         person : "first" (of whom most is seen, the default), "moving", "largest", "nearest X Y Z" [m], or a number
+        people : everybody in view, where `people_in_view` has found them; default: they are looked for
         more : other arguments of a recording
 
         Raises
@@ -140,10 +142,10 @@ class Recording:
             told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
             raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
         sigma = _sigmas(accuracy, len(keypoints))
-        one = follow(rig, keypoints, person)
-        people = tuple(choose_people(rig, one.keypoints))
+        one = follow(rig, keypoints, person, people)
+        whose = tuple(choose_people(rig, one.keypoints))
         return cls(
-            keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=people, followed=one,
+            keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=whose, followed=one,
             keypoint_sigma=sigma, **more,
         )  # fmt: skip
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
 
 import numpy as np
@@ -37,13 +37,13 @@ _USUAL = "humanoid"  # body of a take that names none
 def track_take(
     take: Take | str | PathLike[str], *, smooth: bool = True, contacts: bool = False,
     lag: float | None = None, noise: KnownNoise | None = None, settings: TrackSettings | None = None,
-    progress: Progress | None = None, checkpoint: Checkpoint | None = None,
+    progress: Progress | None = None, checkpoint: Checkpoint | None = None, view: InView | None = None,
 ) -> tuple[Motion, Observations]:
     """Track the person of a take file in all that its sensors saw; arguments as of `track`.
 
     Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
     videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays), with
-    cameras where the fit found them.
+    cameras where the fit found them. `view`: who is in view, where `people_in_view` has looked before.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def track_take(
     take = take if isinstance(take, Take) else read_take(take)
     check_enough(take)
     take = prepared(take, progress)
-    seen = with_names(take, load_observations(take), progress=progress)
+    seen = with_names(take, view.seen if view else load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
     alone = take.start or take.pose or any(sensors)
@@ -78,7 +78,7 @@ def track_take(
             f"the body is {take.body}, and the motion that the take starts from has another, {body.name}",
             file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
         )  # fmt: skip
-    recording, body = recording_of(take, seen, body)
+    recording, body = recording_of(take, seen, body, view.people if view else None)
     settings = settings_of(take, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings)
@@ -90,22 +90,30 @@ def track_take(
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
 
 
-def people_in_view(take: Take) -> tuple[Person, ...]:
-    """Everybody whom a take's keypoints show, the one of whom most is seen first; empty where that is one at most.
+@dataclass(frozen=True, eq=False)
+class InView:
+    """What the cameras of a take saw, and everybody in it.
 
-    Where other sensors take part it is empty, too: their pixels and markers are not parted by people.
+    Parameters
+    ----------
+    seen : Observations
+    people : the one of whom most is seen first; empty where nobody but one was ever detected
     """
+
+    seen: Observations
+    people: tuple[Person, ...]
+
+
+def people_in_view(take: Take) -> InView | None:
+    """Everybody whom a take's keypoints show; None where other sensors take part, which are not parted by people."""
     beside = (
         take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines,
         take.surface_points,
     )  # fmt: skip
     if any(beside) or not take.keypoints:
-        return ()
+        return None
     seen = load_observations(take)
-    if seen.rig is None:
-        return ()
-    people = follow(seen.rig, seen.keypoints).people
-    return people if len(people) > 1 else ()
+    return None if seen.rig is None else InView(seen, follow(seen.rig, seen.keypoints).people)
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:

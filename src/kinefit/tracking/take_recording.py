@@ -17,6 +17,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
+from kinefit.multiview.people import Person
 from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers, SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
@@ -58,13 +59,16 @@ class NamedMarkers:
         return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)
 
 
-def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording, Body]:
+def recording_of(
+    take: Take, seen: Observations, body: Body, people: Sequence[Person] | None = None
+) -> tuple[Recording, Body]:
     """What all sensors of a take saw, and the body with the marker sets that they name.
 
     Parameters
     ----------
     seen : of the take
     body : the take's
+    people : everybody whom its keypoints show, where they have been looked for
 
     Raises
     ------
@@ -104,7 +108,7 @@ def recording_of(take: Take, seen: Observations, body: Body) -> tuple[Recording,
     )  # fmt: skip
     if seen.keypoints:
         pixels = Recording.of_keypoints(
-            rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person
+            rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,

@@ -239,6 +239,7 @@ class Tracker:
             return self._last
         result: FrameResult | None = None
         measurements: list[Measurement] = []
+        covariance: NDArray | None = None
         if self._prediction.state is not None:
             if not len(frames):
                 self._prediction.halt()
@@ -246,12 +247,12 @@ class Tracker:
             scene, measurements = self._scene_of(frames, held[0], time)
             fitted = self._fit.run(scene, held, measurements, self._known(time))
             self._take(fitted, time)
-            result = fitted.result
+            result, covariance = fitted.result, fitted.stated
         result = self._recovery.run(self, time, frames, measurements, result)
         self._last = result
         if result is not None:
             moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self._others}
-            scene = self._scene.at(result.state, time=time, **moving)
+            scene = self._scene.at(result.state, time=time, covariance=covariance, **moving)
             for m in measurements:
                 sensor = self.sensors.of(m.sensor)
                 if sensor is not None:

@@ -190,7 +190,7 @@ class Player:
 def told(motion: Motion, frame: int) -> str:
     """Words about one frame (Markdown): quality, lost segments, residuals of every sensor."""
     lines = [f"quality **{motion.quality[frame]:.2f}** of 1"]
-    lost = [name for name, q in zip(motion.body.tree.segments, motion.segment_quality[frame]) if q <= 0]
+    lost = [name for name, gone in zip(motion.body.tree.segments, motion.lost[frame]) if gone]
     if lost:
         lines.append("lost: " + ", ".join(lost))
     for name, residuals in motion.residuals.items():

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
 
 RGB = tuple[int, int, int]
 LEFT, RIGHT, MIDDLE, LOST = (70, 140, 255), (255, 140, 50), (140, 205, 130), (150, 150, 150)
@@ -113,9 +113,9 @@ def ramp(values: NDArray) -> NDArray:
 def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tuple[NDArray, NDArray]:
     """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
 
-    A segment that nothing supports (0) is grey and half transparent whatever the colours mean.
+    A segment that is lost is grey and half transparent whatever the colours mean.
     """
-    lost = np.asarray(quality) <= 0
+    lost = np.asarray(quality) < BELIEVED
     colours = ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
     return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
 

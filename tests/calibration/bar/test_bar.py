@@ -53,7 +53,7 @@ def test_the_first_camera_defines_the_world_and_any_may_be_first(known, found):
     assert found.rig["cam0"].T_camera_world == pytest.approx(np.eye(4), abs=1e-12)
     assert found.cameras["cam0"].std[-6:] == pytest.approx(0.0)
     assert found.cameras["cam1"].std[-6:].min() > 0
-    assert other.distances["cam1", "cam0"] == pytest.approx(found.distances["cam0", "cam1"], rel=1e-5)
+    assert other.rig.distances["cam1", "cam0"] == pytest.approx(found.rig.distances["cam0", "cam1"], rel=1e-5)
     assert other.rig["cam1"].matrix == pytest.approx(found.rig["cam1"].matrix, rel=1e-5, abs=1e-3)
 
 
@@ -71,7 +71,7 @@ def test_lenses_that_are_given_stay(known):
     for camera, true in zip(out.rig, rig):
         assert np.array_equal(camera.matrix, true.matrix) and out.cameras[camera.name].std_of("fx") == 0
     true = np.linalg.norm(rig["cam0"].centre_world - rig["cam2"].centre_world)
-    assert out.distances["cam0", "cam2"] == pytest.approx(true, rel=3e-4)
+    assert out.rig.distances["cam0", "cam2"] == pytest.approx(true, rel=3e-4)
     with pytest.raises(CalibrationError, match="no intrinsics of camera 'cam2'"):
         calibrate_bar(seen, LENGTH, interiors=rig.select(("cam0", "cam1")))
 
@@ -183,7 +183,7 @@ def test_confused_targets_are_left_out(known, found):
 
     out = calibrate_bar(changed(known[2], confuse), LENGTH)
     assert out.sigma_px == pytest.approx(0.1, rel=0.2)
-    assert out.distances["cam0", "cam1"] == pytest.approx(found.distances["cam0", "cam1"], rel=1e-3)
+    assert out.rig.distances["cam0", "cam1"] == pytest.approx(found.rig.distances["cam0", "cam1"], rel=1e-3)
 
 
 def test_centroids_to_a_tenth_of_a_pixel_without_the_lamps():

@@ -79,7 +79,7 @@ def test_all_of_it_with_known_truth():
         assert np.linalg.norm(camera.centre_world - true.centre_world) < 0.012
         turn = se3.log_so3(camera.T_camera_world[:3, :3] @ true.T_camera_world[:3, :3].T)
         assert np.degrees(np.linalg.norm(turn)) < 0.2
-    for pair, metres in found.distances.items():
+    for pair, metres in found.rig.distances.items():
         assert metres == pytest.approx(np.linalg.norm(rig[pair[0]].centre_world - rig[pair[1]].centre_world), rel=4e-3)
     assert found.rms_px == pytest.approx(0.15 * np.sqrt(2), rel=0.15)
     assert "frame 7" in found.world and all(report.views > 30 for report in found.cameras.values())
@@ -122,7 +122,7 @@ def test_cameras_out_of_step_do_not_bend_the_lenses():
     found = calibrate_board(looked(rig, CHECKER, Ts, moved=moved), CHECKER)
     for camera, true in zip(found.rig, rig):
         assert camera.matrix[0, 0] == pytest.approx(true.matrix[0, 0], rel=5e-3)
-    for (a, b), metres in found.distances.items():
+    for (a, b), metres in found.rig.distances.items():
         assert metres == pytest.approx(np.linalg.norm(rig[a].centre_world - rig[b].centre_world), rel=0.01)
     assert found.own_rms_px < 0.3 < found.rms_px
     assert 1.5e-3 < found.jitter[0] < 5e-3 and 3e-3 < found.jitter[1] < 1e-2
@@ -502,7 +502,7 @@ def test_stereo_pair_of_opencv(data_dir):
     for camera, true in zip(found.rig, reference):
         assert camera.matrix[0, 0] == pytest.approx(true.matrix[0, 0], rel=0.01)
     baseline = np.linalg.norm(reference["right"].centre_world)
-    assert found.distances["left", "right"] == pytest.approx(baseline, rel=0.01)
+    assert found.rig.distances["left", "right"] == pytest.approx(baseline, rel=0.01)
     assert found.rms_px < 0.5
 
 
@@ -518,7 +518,7 @@ def test_four_webcams_see_the_front_and_the_back_of_a_board(data_dir):
     )
     assert all(view.mirrored for view in seen["port_1"].views) and not seen["port_2"].views[0].mirrored
     found = calibrate_board(seen, board, interiors=interiors)
-    for (a, b), metres in found.distances.items():
+    for (a, b), metres in found.rig.distances.items():
         centres = [reference[name.replace("port", "cam")].centre_world for name in (a, b)]
         assert metres == pytest.approx(np.linalg.norm(centres[0] - centres[1]), rel=0.01)
     assert found.rms_px < 1.0

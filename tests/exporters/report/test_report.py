@@ -102,6 +102,14 @@ def test_a_lost_segment_is_told_with_the_cameras_that_saw_it():
     assert moment.causes == ("Only cam2 saw it.",)
 
 
+def test_a_segment_that_more_speaks_against_than_for_is_told():
+    motion = changed(good_motion(), "segment_quality", slice(20, 30), segment(good_motion(), "hand_r"), 0.3)
+    (moment,) = doubtful_moments(motion)
+    assert (moment.start, moment.stop, moment.segments) == (20, 30, ("hand_r",))
+    assert "speaks against where right hand is" in moment.what[0]
+    assert motion.lost[20:30, segment(motion, "hand_r")].all() and motion.lost.sum() == 10
+
+
 def test_outliers_and_exchanged_sides_are_told_as_causes():
     motion = replace(good_motion(), quality=np.where((np.arange(F) >= 40) & (np.arange(F) < 46), 0.3, 0.9))
     motion = changed_residuals(motion, "cam1", slice(40, 46), slice(None), weights=0.0, values=2.0)

@@ -101,12 +101,13 @@ def test_every_wrong_line_is_named(folder, depth, head, more, words):
 
 
 def test_stereo_pairs_are_two_cameras_with_videos(folder):
-    (folder / "l.mp4").touch()
+    for name in ("l.mp4", "r.mp4"):
+        (folder / name).touch()
     cameras = '[calibration]\nfile = "rig.toml"\n[[camera]]\nname = "tof"\nvideo = "l.mp4"\n[[camera]]\nname = "rgb"\n'
     pair = '[[stereo]]\nleft = "tof"\nright = "{}"\n{}\n'
 
     def read(right, more=""):
-        video = 'video = "l.mp4"\n' if right == "rgb" else ""
+        video = 'video = "r.mp4"\n' if right == "rgb" else ""
         (folder / "take.toml").write_text(cameras + video + pair.format(right, more))
         return read_take(folder / "take.toml")
 

@@ -87,9 +87,11 @@ def test_what_cannot_be_is_told(folder):
         load(folder, SKIN_ENTRY)
     with pytest.raises(KinefitError, match="no face at"):
         load(folder, SKIN_ENTRY + "face = [500, 40, 36, 50]\n").skin[0].frame(0)
+    with pytest.raises(KinefitError, match="no larger than the picture"):
+        load(folder, SKIN_ENTRY + "face = [0, 0, 36, 1e308]\n")
     for keys, said in (
         ("face = [1, 2, 0, 4]\n", "face = "), (FACE + 'set = "BODY_25B"\n', "no keypoint set of skin 'BODY_25B'"),
-        (FACE + "frames = [30, 40]\n", "none of its frames"),
+        (FACE + "frames = [30, 40]\n", "none of its frames"), ("face = [1, 2, 3, nan]\n", "face = "),
     ):
         with pytest.raises(TakeError, match=said):
             load(folder, SKIN_ENTRY + keys)

@@ -8,7 +8,7 @@ from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.nearest import Nearest, nearest
 from kinefit.bodies.surfaces.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.tables import SurfaceTables
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, triangles
+from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, segment_middles, triangles
 
 Surface = TaperedCylinder | MeshSurface
 
@@ -29,5 +29,6 @@ __all__ = [
     "bounding_box",
     "nearest",
     "sample",
+    "segment_middles",
     "triangles",
 ]

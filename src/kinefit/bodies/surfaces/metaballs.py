@@ -15,9 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.obj import LONGEST
 from kinefit.errors import BodyError
 
 LEVEL = 0.5  # of the field on the surface (P4, w_t)
+_THINNEST = 1e-4  # [m] of a radius: thinner than any sensor sees
+_HEAVIEST = 12.0  # logarithm of a weight: such a ball is seen at 2.5 of its radii, and is as good as a solid one
 _AROUND, _RINGS = 32, 24  # corners of a cross-section, and cross-sections
 _SCANNED, _HALVED, _NEWTON = 12, 7, 4  # steps outwards to below the level, halvings of the last one, then secants
 
@@ -86,6 +89,13 @@ class Metaballs(MeshSurface):
             k = int(np.argmin(np.minimum(r.min(axis=1), w)))
             problem = f"ball {k + 1} has radii {np.round(r[k], 4).tolist()} m, weight {w[k]:g}"
             raise BodyError(problem, remedy="Give positive numbers; radii that collapse need more points.")
+        odd = (np.maximum(np.abs(c), r).max(axis=1) > LONGEST) | (r.min(axis=1) < _THINNEST)
+        odd |= np.abs(np.log(w)) > _HEAVIEST
+        if odd.any():
+            k = int(np.argmax(odd))
+            problem = f"ball {k + 1} at {c[k].tolist()} m has radii {r[k].tolist()} m, weight {w[k]:g}"
+            remedy = f"Give metres below {LONGEST:.0f}, radii above {_THINNEST:g}, and weights near 1."
+            raise BodyError(problem, remedy=remedy)
         vertices, faces = _mesh(c, r, w, A)
         for value in (c, r, w, A):
             value.flags.writeable = False
@@ -135,6 +145,13 @@ def _field(x: NDArray, centres: NDArray, radii: NDArray, weights: NDArray, axes:
         q = (x - c) @ (A / r[:, None]).T
         out += w * np.exp(-2.0 * np.einsum("...i,...i->...", q, q))
     return out
+
+
+def _log_field(x: NDArray, centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> NDArray:
+    """Logarithm of the field, finite also where the field is less than the smallest number."""
+    logs = np.stack([np.log(w) - 2.0 * (((x - c) @ (A / r[:, None]).T) ** 2).sum(-1)
+                     for c, r, w, A in zip(centres, radii, weights, axes)])  # fmt: skip
+    return np.logaddexp.reduce(logs, axis=0)
 
 
 def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
@@ -193,7 +210,7 @@ def _first_outside(starts: NDArray, ways: NDArray, reach: float, balls: tuple[ND
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     at, step = 0.5 * (low + high), 1e-6 * reach
     for _ in range(_NEWTON):
-        here, there = (np.log(_field(starts + s[:, None] * ways, *balls) / LEVEL) for s in (at, at + step))
+        here, there = (_log_field(starts + s[:, None] * ways, *balls) - np.log(LEVEL) for s in (at, at + step))
         at = np.clip(at - step * here / np.where(np.abs(there - here) > 1e-15, there - here, -1e-15), low, high)
     return at
 

@@ -28,8 +28,8 @@ def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
     """
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        problem = f"cannot read the mesh ({error.strerror or error})"
+    except (OSError, ValueError) as error:
+        problem = f"cannot read the mesh ({getattr(error, 'strerror', None) or error})"
         raise BodyError(problem, file=path, remedy="Give the path of an OBJ file.") from error
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []

@@ -67,9 +67,10 @@ def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
     """
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, ValueError, csv.Error) as error:
         remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
-        raise BodyError(f"cannot read the weights ({error})", file=path, place=_PLACE, remedy=remedy) from error
+        problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"
+        raise BodyError(problem, file=path, place=_PLACE, remedy=remedy) from error
     out = np.full((count, len(tree.segments)), np.nan)
     for number, line in enumerate(lines, 1):
         cells = [cell.strip() for cell in line]

@@ -45,6 +45,12 @@ class BodyMesh:
         return out
 
 
+def segment_middles(vertices: NDArray, segment: NDArray, count: int) -> NDArray:
+    """(S, 3) [m] mean of the vertices (V, 3) of each of so many segments, (V,) of which; 0 where there is none."""
+    number = np.maximum(np.bincount(segment, minlength=count), 1)
+    return np.stack([np.bincount(segment, x, count) / number for x in vertices.T], axis=1)
+
+
 def triangles(surface: TaperedCylinder | MeshSurface, around: int = 20, along: int = 6) -> tuple[NDArray, NDArray]:
     """Vertices (V, 3) [m] in the segment's frame and faces (T, 3), closed, outward counter-clockwise.
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,12 @@ from kinefit.calibration.bar.report import CameraReport, advice_of, reports_of
 from kinefit.calibration.bar.start import FEWEST, first_pairs, near, resect
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.bar.world import on_floor
-from kinefit.errors import CalibrationError, choices
+from kinefit.calibration.known import known_camera
+from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 
 LENGTH_SIGMA = 1e-4  # [m] to which a bar is usually measured, with a calliper or a good rule
+_SHORTEST, _LONGEST = 0.01, 20.0  # [m] of a bar
 _UNSURE = 0.03  # of the focal length, one standard deviation: no calibration but a guess
 _OUTLIER = 6.0  # standard deviations: none of 10,000 normal errors
 _LOOSE = 0.02  # of the length by which it may scatter: more is no bar, or cameras out of step
@@ -64,14 +65,6 @@ class BarCalibration:
     advice: tuple[str, ...]
     covariance: NDArray
 
-    @property
-    def distances(self) -> dict[tuple[str, str], float]:
-        """{(camera, camera): distance [m]}."""
-        return {
-            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
-            for a, b in combinations(self.rig, 2)
-        }
-
 
 @checked
 def calibrate_bar(
@@ -105,14 +98,9 @@ def calibrate_bar(
         Too few places, targets that do not belong together, an arrangement that does not determine the lenses or the
         cameras, a length that a second one contradicts.
     """
-    if not (0.01 < length < 20.0 and 0 < length_sigma < length):
-        raise CalibrationError(
-            f"a bar of {length:g} m, known to {length_sigma:g} m", place="length",
-            remedy="Give it in metres, such as 0.9.",
-        )
     names = list(seen)
-    if len(names) < 2:
-        raise CalibrationError(f"{len(names)} camera", remedy="Give what two cameras or more saw at the same times.")
+    check_bar(length, length_sigma)
+    check_cameras(names)
     cameras = [_camera(name, views, interiors) for name, views in seen.items()]
     frames = np.array(sorted({frame for views in seen.values() for frame in views.ends}))
     uv = np.full((len(frames), len(names), 2, 2), np.nan)
@@ -132,22 +120,28 @@ def calibrate_bar(
     )
 
 
+def check_bar(length: float, length_sigma: float = LENGTH_SIGMA) -> None:
+    """CalibrationError where a length [m] is that of no bar."""
+    if not (_SHORTEST < length < _LONGEST and 0 < length_sigma < length):
+        known = "" if 0 < length_sigma < length else f", known to {length_sigma:g} m"
+        metres = next((length * unit for unit in (0.001, 0.01) if 0.1 < length * unit < _LONGEST), 0.9)
+        remedy = f"Give it in metres, such as {metres:g}."
+        raise CalibrationError(f"a bar of {length:g} m{known}", place="length", remedy=remedy)
+
+
+def check_cameras(names: Collection[str]) -> None:
+    """CalibrationError where too few cameras are there."""
+    if len(names) < 2:
+        problem = f"{len(names)} camera: a bar calibrates two or more together"
+        raise CalibrationError(problem, remedy="Give what two cameras or more saw at the same times.")
+
+
 def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
     if interiors is None:
         width, height = views.size
         K = np.array([[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]])
         return Camera(name, views.size, K, np.zeros(5))
-    if name not in interiors:
-        problem = choices("intrinsics of camera", name, interiors.names)
-        raise CalibrationError(problem, remedy="Name the videos as the cameras.")
-    camera = interiors[name].with_pose(np.eye(4))
-    if camera.size != views.size:
-        raise CalibrationError(
-            f"its image has {views.size[0]}x{views.size[1]} px, "
-            f"its intrinsics are of {camera.size[0]}x{camera.size[1]}",
-            place=f"camera {name}", remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
-        )
-    return camera
+    return known_camera(interiors, name, views.size)
 
 
 def _adjusted(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,8 @@ from kinefit.calibration.board.bundle import BoardBundle, adjust_boards
 from kinefit.calibration.board.detection import Board, CameraViews
 from kinefit.calibration.board.extrinsics import Placed, place_cameras
 from kinefit.calibration.board.intrinsics import Interiors, calibrate_interiors, coverage
-from kinefit.errors import CalibrationError, choices
+from kinefit.calibration.known import known_camera
+from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse
 
@@ -81,14 +81,6 @@ class BoardCalibration:
     world: str
     advice: tuple[str, ...]
 
-    @property
-    def distances(self) -> dict[tuple[str, str], float]:
-        """{(camera, camera): distance [m]}."""
-        return {
-            (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
-            for a, b in combinations(self.rig, 2)
-        }
-
 
 @checked
 def calibrate_board(
@@ -124,7 +116,7 @@ def calibrate_board(
         single = {name: calibrate_interiors(name, views, board) for name, views in seen.items()}
         cameras = {name: of_camera.camera for name, of_camera in single.items()}
     else:
-        single, cameras = {}, {name: _given(interiors, name, views) for name, views in seen.items()}
+        single, cameras = {}, {name: known_camera(interiors, name, views.size) for name, views in seen.items()}
     if not exteriors:
         return _interiors_only(board, seen, cameras, single)
     placed = place_cameras(cameras, seen, board)
@@ -138,22 +130,6 @@ def calibrate_board(
         rig, board, reports, _rms(bundle.residuals), _rms(bundle.within), placed.agreeing, bundle.jitter, world,
         tuple(_advice(rig, reports, placed.agreeing, len(seen))),
     )
-
-
-def _given(interiors: Rig, name: str, views: CameraViews) -> Camera:
-    if name not in interiors:
-        raise CalibrationError(
-            choices("intrinsics of camera", name, interiors.names), remedy="Name the videos as the cameras."
-        )
-    camera = interiors[name].with_pose(np.eye(4))
-    if camera.size != views.size:
-        raise CalibrationError(
-            f"its image has {views.size[0]}x{views.size[1]} px, "
-            f"its intrinsics are of {camera.size[0]}x{camera.size[1]}",
-            place=f"camera {name}",
-            remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
-        )
-    return camera
 
 
 def _interiors_only(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,9 +84,7 @@ def _of_one_camera(views: Views) -> Mistake | None:
         for kind, text, axes, sides in _REVERSED:
             uv = views.uv.copy()
             uv[:, :, c] = uv[:, views.partner, c] if sides else uv[:, :, c]
-            for axis in axes:
-                uv[:, :, c, axis] = views.rig.cameras[c].size[axis] - 1 - uv[:, :, c, axis]
-            after = _beside_others(replace(views, uv=uv), c)
+            after = _beside_others(replace(views, uv=_mirrored(views.rig.cameras, uv, (c,), axes)), c)
             if after < _RIGHT * before and (best is None or after < 0.9 * best.after):
                 best = Mistake(kind, f"{name}'s image {text}", (name,), (), before, after)
     return best
@@ -142,17 +140,9 @@ def _trials(rig: Rig, uv: NDArray) -> Iterator[tuple[Mistake, Rig, NDArray]]:
     each = tuple(range(len(rig)))
     for axis, way in ((1, "upside down (or the world is left-handed)"), (0, "left to right (or the world is)")):
         yield mistake("mirrored", f"all images are mirrored {way}"), rig, _mirrored(rig.cameras, uv, each, (axis,))
-    for c, name in enumerate(rig.names):
-        yield (
-            mistake("turned", f"{name}'s image stands upside down", (name,)),
-            rig,
-            _mirrored(rig.cameras, uv, (c,), (0, 1)),
-        )
-        yield (
-            mistake("mirrored", f"{name}'s image is mirrored left to right", (name,)),
-            rig,
-            _mirrored(rig.cameras, uv, (c,), (0,)),
-        )
+    for (kind, text, axes, sides), (c, name) in product(_REVERSED, enumerate(rig.names)):
+        if not sides:
+            yield mistake(kind, f"{name}'s image {text}", (name,)), rig, _mirrored(rig.cameras, uv, (c,), axes)
 
 
 def _orders(cameras: int) -> Iterator[tuple[int, ...]]:
@@ -172,7 +162,7 @@ def _mirrored(cameras: tuple[Camera, ...], uv: NDArray, which: tuple[int, ...], 
     out = uv.copy()
     for c in which:
         for axis in axes:
-            out[:, c, axis] = cameras[c].size[axis] - 1 - out[:, c, axis]
+            out[..., c, axis] = cameras[c].size[axis] - 1 - out[..., c, axis]
     return out
 
 

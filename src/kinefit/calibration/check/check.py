@@ -29,6 +29,7 @@ from kinefit.errors import KinefitError, command
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import Followed, follow
 from kinefit.observations import Keypoints
+from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
 
@@ -105,7 +106,9 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
             text = (
                 f"Keypoints of {len({k.camera for k in seen.keypoints})} camera(s): a check needs those of two or more."
             )
-            missing.append(Finding("fault", "load", text, remedy=f"Run: {command('detect', take.path)}"))
+            alone = len(take.cameras) == 1
+            remedy = f"{ONE_CAMERA[0].upper()}{ONE_CAMERA[1:]}." if alone else f"Run: {command('detect', take.path)}"
+            missing.append(Finding("fault", "load", text, remedy=remedy))
         if seen is not None and seen.rig is not None:
             missing += lens_findings(seen.rig)
         return Check(take.name, ranked(missing), loaded.take, seen)

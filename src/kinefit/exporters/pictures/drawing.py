@@ -56,7 +56,7 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
     thick = np.clip(np.rint(0.022 * px_per_metre), 2, 24).astype(int)
     edge = max(1, round(image.shape[0] / 900))
     for b in np.argsort(-depth):
-        lost = motion.segment_quality[frame, owners[b]] <= 0
+        lost = motion.lost[frame, owners[b]]
         width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
         _line(image, uv[b], DARK, width + 2 * edge)
         _line(image, uv[b], LOST if lost else colours[b], width)
@@ -79,7 +79,7 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
         return
     mesh, vertices = outlined.mesh, outlined.pose(motion.state(frame)).vertices
     drawn = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True, labels=mesh.face_segment).segment
-    edge, lost = max(1, round(image.shape[0] / 480)), motion.segment_quality[frame] <= 0
+    edge, lost = max(1, round(image.shape[0] / 480)), motion.lost[frame]
     for s in np.unique(drawn[drawn >= 0]):
         rims, _ = cv2.findContours((drawn == s).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         for rim in rims:

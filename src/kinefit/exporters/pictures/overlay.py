@@ -175,7 +175,7 @@ def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]
         notes.append("left and right were taken for each other: put right")
     if motion.quality[frame] <= 0:
         return [*notes, "not tracked"]
-    lost = [name for name, q in zip(motion.body.tree.segments, motion.segment_quality[frame]) if q <= 0]
+    lost = [name for name, gone in zip(motion.body.tree.segments, motion.lost[frame]) if gone]
     if lost:
         notes.append("lost: " + ", ".join(lost[:4]) + (f" and {len(lost) - 4} more" if len(lost) > 4 else ""))
     return notes

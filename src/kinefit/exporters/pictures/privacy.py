@@ -31,7 +31,7 @@ def without_face(
     if "head" not in tree.segments or tree.segments.index("head") not in ends:
         raise ExportError("pictures with faces blurred, of a body without a head", remedy="Leave pictures out.")
     head = tree.segments.index("head")
-    if frame is None or motion.quality[frame] <= 0 or not motion.segment_quality[frame, head] > 0:
+    if frame is None or motion.quality[frame] <= 0 or motion.lost[frame, head]:
         return _coarse(image, max(image.shape[:2]) / 12)
     tip = np.asarray(ends[head], float)
     points = PointSet(("neck", "crown"), np.array([head, head]), np.stack([np.zeros(3), tip]))

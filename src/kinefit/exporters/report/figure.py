@@ -33,7 +33,7 @@ def figure(motion: Motion, rig: Rig | None = None) -> Html:
     x = motion.body.trajectories(T @ motion.Ts_world_root[frames], motion.angles[frames], points)
     floor = float(np.percentile((x[..., 2] - _reach(ends, radii, len(points))).min(axis=1), 5))
     cameras = [] if rig is None else [_pyramid(camera.name, camera, R) for camera in rig]
-    lost = motion.segment_quality[frames][:, owners] <= 0
+    lost = motion.lost[frames][:, owners]
     return player(
         x, ends, radii, rate=motion.rate / step, start=float(motion.times[0]), colours=colours, floor=floor,
         cameras=cameras, dimmed=lost,

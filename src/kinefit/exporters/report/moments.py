@@ -45,7 +45,7 @@ class Moment:
 class _Found:
     """One doubt: of one kind, about one segment ("" for the whole body) or one sensor (name, unit, usual residual)."""
 
-    kind: str  # "nobody", "weak", "lost", "wide" or "off"
+    kind: str  # "nobody", "weak", "unseen", "against", "wide" or "off"
     start: int
     stop: int
     worst: int
@@ -58,7 +58,7 @@ class _Found:
 def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     """All doubtful moments, the worst first.
 
-    Doubtful is a frame of low quality or without anybody, a segment that no measurement supports, a joint centre with
+    Doubtful is a frame of low quality or without anybody, a segment that is lost, a joint centre with
     a wide error bar that is usually narrower, and a frame that fits much worse than the others.
     """
     found = [*_whole_body(motion), *_lost(motion), *_wide(motion), *_off(motion)]
@@ -164,17 +164,18 @@ def _whole_body(motion: Motion) -> Iterable[_Found]:
 
 def _lost(motion: Motion) -> Iterable[_Found]:
     share = 1 / len(motion.body.tree.segments)
-    gone = (motion.segment_quality <= 0) & (motion.quality > 0)[:, None]
-    for s, name in enumerate(motion.body.tree.segments):
-        for start, stop in _runs(motion, gone[:, s]):
-            yield _Found("lost", start, stop, (start + stop) // 2, share * (stop - start), name)
+    gone = motion.lost & (motion.quality > 0)[:, None]
+    for kind, of in (("unseen", motion.segment_quality <= 0), ("against", motion.segment_quality > 0)):
+        for s, name in enumerate(motion.body.tree.segments):
+            for start, stop in _runs(motion, gone[:, s] & of[:, s]):
+                yield _Found(kind, start, stop, (start + stop) // 2, share * (stop - start), name)
 
 
 def _wide(motion: Motion) -> Iterable[_Found]:
     share = 0.5 / len(motion.body.tree.segments)
     std = np.linalg.norm(motion.joint_std, axis=-1)
     usual = np.median(std, axis=0) if len(std) else np.zeros(std.shape[1])
-    doubtful = (std > WIDE) & (std > 2 * usual) & (motion.segment_quality > 0) & (motion.quality > 0)[:, None]
+    doubtful = (std > WIDE) & (std > 2 * usual) & ~motion.lost & (motion.quality > 0)[:, None]
     for s, name in enumerate(motion.body.tree.segments):
         for start, stop in _runs(motion, doubtful[:, s]):
             part = np.where(doubtful[start:stop, s], std[start:stop, s], 0.0)
@@ -237,8 +238,10 @@ def _sentences(group: Sequence[_Found]) -> Iterable[str]:
             yield "Nothing of the person was seen; the body stays where it was."
         elif kind == "weak":
             yield f"The measurements support only {min(g.amount for g in same):.0f} % of the body at worst."
-        elif kind == "lost":
+        elif kind == "unseen":
             yield f"No measurement supports {names}: the pose follows from what is next to it and from earlier frames."
+        elif kind == "against":
+            yield f"More of what was measured speaks against where {names} is than for it."
         elif kind == "wide":
             far = f"up to ±{most:.0f} cm (2 σ)" if np.isfinite(most) else "in some direction nothing bounds it"
             yield f"The place of {names} is uncertain: {far}."

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fnmatch
+import os
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -57,7 +59,7 @@ class DepthSource:
 def natural(name: str) -> tuple[tuple[int, int, str], ...]:
     """Key that sorts names by the numbers in them: 2.png before 10.png."""
     parts = re.split(r"(\d+)", name)
-    return tuple((1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts)
+    return tuple((1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts)
 
 
 def listed(path: Path) -> list[Path]:
@@ -65,7 +67,8 @@ def listed(path: Path) -> list[Path]:
     if path.is_dir():
         found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
     elif "*" in path.name:
-        found = [file for file in path.parent.glob(path.name) if file.is_file()]
+        names = fnmatch.filter(os.listdir(path.parent), path.name) if path.parent.is_dir() else []
+        found = [file for name in names if (file := path.parent / name).is_file()]
     else:
         found = [path] if path.is_file() else []
     return sorted(found, key=lambda file: natural(file.name))

@@ -61,7 +61,7 @@ class Draft:
     calibration : the file, and keys of [calibration]
     others : calibrations that were not taken.
     cameras : name -> keys of its [[camera]]
-    keypoints, markers : (whether in use or a comment, keys) of each table
+    keypoints, markers, surface_points : (whether in use or a comment, keys) of each table
     """
 
     folder: Path
@@ -73,6 +73,7 @@ class Draft:
     cameras: dict[str, dict[str, Told]] = field(default_factory=dict)
     keypoints: list[tuple[bool, Entry]] = field(default_factory=list)
     markers: list[tuple[bool, Entry]] = field(default_factory=list)
+    surface_points: list[tuple[bool, Entry]] = field(default_factory=list)
     comments: list[str] = field(default_factory=list)
 
     def note(self, about: str, sure: str, told: str) -> None:
@@ -100,6 +101,7 @@ class Draft:
         parts += [_table("[[camera]]", {"name": Told(name), **keys}, self) for name, keys in self.cameras.items()]
         parts += [_table("[[keypoints]]", keys, self, active) for active, keys in self.keypoints]
         parts += [_table("[[markers]]", keys, self, active) for active, keys in self.markers]
+        parts += [_table("[[surface_points]]", keys, self, active) for active, keys in self.surface_points]
         return "\n".join(parts)
 
 

@@ -73,6 +73,9 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         if calibration is not None:
             describe_cameras(draft, calibration, videos, keypoints)
     _describe_markers(draft, markers)
+    for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
+        told = Told(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")
+        draft.surface_points.append((not draft.surface_points, {"file": draft.tell("surface", told, "file")}))
     draft.comments.append('height = 1.75  # open: the stature in metres, where you know it')
     return Guess(draft.text(), tuple(draft.notes))
 

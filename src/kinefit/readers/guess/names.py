@@ -50,7 +50,7 @@ def common_words(place: str, other: str) -> int:
 def natural(text: str) -> list[tuple[int, int, str]]:
     """Sorting key by which "cam2" stands before "cam10"."""
     parts = re.findall(r"\d+|\D+", text.lower())
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def trials(
@@ -117,10 +117,13 @@ def _by_name(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | N
     return None
 
 
+_DIGITS = 18  # of a camera's number that count: serial numbers have fewer
+
+
 def camera_number(name: str) -> int | None:
     """The last number in a camera's name."""
     found = re.findall(r"\d+", name)
-    return int(found[-1]) if found else None
+    return int(found[-1][-_DIGITS:]) if found else None
 
 
 def _by_number(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | None:
@@ -128,8 +131,8 @@ def _by_number(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] |
     if None in numbers or len(numbers) < len(names):
         return None
     for match in _NUMBERED.finditer(text):
-        if int(match[1]) in numbers:
-            return numbers[int(match[1])], match.span()
+        if int(match[1][-_DIGITS:]) in numbers:
+            return numbers[int(match[1][-_DIGITS:])], match.span()
     return None
 
 

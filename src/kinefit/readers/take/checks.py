@@ -11,6 +11,7 @@ import numpy as np
 from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
+from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 from kinefit.readers.units import LENGTHS, worth
@@ -109,7 +110,7 @@ def _values(take: Take) -> None:
             refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
         if source.file is None and source.format not in ("detect", "skin"):
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
-        if source.face is not None and not min(source.face[2:]) > 0:
+        if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
         if not 0 < source.sigma < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
             refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
@@ -209,7 +210,7 @@ def _odd_depth(take: Take) -> Iterator[tuple[str, str, str]]:
             yield f"camera = {entry.camera}, but no [calibration]", place, "Add one, or give intrinsics."
         if entry.distortion and entry.intrinsics is None:
             yield "distortion without intrinsics", place, "Write intrinsics = [fx, fy, cx, cy] too."
-        if entry.intrinsics is not None and not min(entry.intrinsics[:2]) > 0:
+        if entry.intrinsics is not None and not all(v > 0 for v in entry.intrinsics[:2]):
             yield f"intrinsics = {list(entry.intrinsics)}", place, "Give [fx, fy, cx, cy] in pixels."
     for pair in take.stereo:
         if not (0 < pair.range[0] < pair.range[1] and 0 < pair.sigma < 100):
@@ -279,6 +280,22 @@ def _names(take: Take) -> None:
         for camera in cameras:
             if cameras.count(camera) > 1:
                 raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
+    told: list[tuple[object, ...]] = []
+    told += [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
+    told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
+    told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
+    for one in told:
+        if told.count(one) > 1:
+            remedy = "Leave one out: what is there twice would count twice."
+            raise TakeError("the same file twice", file=take.path, place=str(one[0]), remedy=remedy)
+    of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]
+    of_one += [(f"keypoints of camera {k.camera}", k.camera, k.file) for k in take.keypoints
+               if k.file is not None and k.format != "caliscope"]  # fmt: skip
+    for place, camera, file in of_one:
+        others = [other for _, other, same in of_one if same == file and other != camera]
+        if others:
+            problem = f"{file.name} is of camera {others[0]}, too"
+            raise TakeError(problem, file=take.path, place=place, remedy="Give each camera its own file.")
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(
@@ -302,7 +319,7 @@ def _files(take: Take) -> None:
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:
-        if file is not None and not file.exists() and not ("*" in file.name and any(file.parent.glob(file.name))):
+        if file is not None and not file.exists() and not ("*" in file.name and listed(file)):
             raise FileError(
                 f"no such file or folder: {file}", file=take.path, place=place,
                 remedy="Correct the path; a relative one starts at the take file.",

@@ -192,3 +192,12 @@ class _Head(_Entry, frozen=True, kw_only=True):
     start: Path | None = None
     size: bool | None = None
     frames: tuple[int, int] | None = None
+
+
+TABLES: dict[str, type[msgspec.Struct]] = {
+    "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
+    "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
+    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+    "surface_points": SurfacePointsEntry,
+}  # fmt: skip
+"""Every table of a take file, and its keys as the fields of a record."""

@@ -17,6 +17,7 @@ from kinefit.errors import FileError, TakeError, choices, shortened
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
+    TABLES,
     CalibrationEntry,
     CameraEntry,
     DepthEntry,
@@ -69,14 +70,6 @@ class _File(_Entry, frozen=True, kw_only=True):
     lines: tuple[LinesEntry, ...] = ()
     surface_points: tuple[SurfacePointsEntry, ...] = ()
 
-
-TABLES: dict[str, type[msgspec.Struct]] = {
-    "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
-    "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
-    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
-    "surface_points": SurfacePointsEntry,
-}  # fmt: skip
-"""Every table of a take file, and its keys as the fields of a record."""
 
 _ONCE = ("take", "session", "start", "calibration")
 
@@ -188,14 +181,17 @@ def read_take(path: str | PathLike[str]) -> Take:
     return take
 
 
+_LONGEST = 2048  # bytes of a path within a take: systems allow 4096 in all
+
+
 def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     """Maker of absolute paths from the texts of a take file."""
 
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder is a text")
-        if any(len(part.encode()) > 255 for part in Path(value).parts):
-            raise ValueError(f"{shortened(value, 60)!r} is no path: a name in it is too long")
+        if len(value.encode()) > _LONGEST or any(len(part.encode()) > 255 for part in Path(value).parts):
+            raise ValueError(f"{shortened(value, 60)!r} is no path: it is too long")
         if any(ord(character) < 32 for character in value):
             raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
         return folder / value
@@ -222,7 +218,14 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
                 raise TakeError("not a table", file=path, place=place, remedy=f"Write [[{table}]] and its keys below.")
             for key in row:
                 if key not in _fields(TABLES[table]) and key not in RENAMED.get(table, {}):
-                    raise TakeError(choices("key", key, _fields(TABLES[table])), file=path, place=place)
+                    problem = choices("key", key, _fields(TABLES[table]))
+                    raise TakeError(problem, file=path, place=place, remedy=_belongs(key))
+
+
+def _belongs(key: str) -> str | None:
+    """Which tables have a key."""
+    tables = [f"[{name}]" if name in _ONCE else f"[[{name}]]" for name in TABLES if key in _fields(TABLES[name])]
+    return f"'{key}' belongs to {', '.join(tables)}." if tables else None
 
 
 def _rename(raw: dict[str, Any], path: Path) -> None:

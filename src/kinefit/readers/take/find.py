@@ -8,9 +8,7 @@ from pathlib import Path
 from kinefit._files import parse_toml
 from kinefit.errors import FileError, KinefitError, TakeError, command
 from kinefit.readers.guess.files import MARKERS, VIDEOS
-
-_TABLES = {"take", "start", "camera", "keypoints", "markers", "depth", "stereo", "silhouette", "lines"}
-"""Tables of which a take file has one; a calibration may have [calibration], too."""
+from kinefit.readers.take.entries import TABLES
 
 
 def find_take(path: str | PathLike[str]) -> Path:
@@ -58,4 +56,4 @@ def _is_take(file: Path) -> bool:
         tables = parse_toml(file.read_text("utf-8"), file)
     except (OSError, UnicodeDecodeError, KinefitError):
         return False
-    return bool(set(tables) & _TABLES) and not set(tables) - _TABLES - {"calibration"}
+    return bool(set(tables) - {"calibration"}) and not set(tables) - set(TABLES)  # which calibrations have, too

@@ -12,6 +12,7 @@ from kinefit.observations import SurfacePointVideo
 from kinefit.readers.take.file import Take
 
 _COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
+_FINEST = 1e-6  # [s] from time to time
 _REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with the columns {', '.join(_COLUMNS)}."
 
 
@@ -49,11 +50,12 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
     times, frame = np.unique(values[:, 0], return_inverse=True)
     if len(times) < 2:
         raise ObservationError(f"points of {len(times)} times", file=path, remedy=_REMEDY)
+    if not _FINEST < (step := float(np.median(np.diff(times)))) < 1 / _FINEST:
+        raise ObservationError(f"times {step:g} s apart", file=path, remedy="Give time_s in seconds.")
     order = np.argsort(frame, kind="stable")
     values, first = values[order], np.searchsorted(frame[order], np.arange(len(times) + 1))
-    rate = 1.0 / float(np.median(np.diff(times)))
     return SurfacePointVideo(
-        sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
+        sensor, 1.0 / step, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
         source=str(path),
     )  # fmt: skip
 

@@ -1,0 +1,172 @@
+"""One person before a real depth camera, by the command's road: hands, elbows and heads against what was read by hand.
+
+Pixels below were read from the images, to about 5 px: middle of the hand (between wrist and knuckles), middle of the
+head, and the lower end of a raised forearm. A hand lies 1.5 cm behind the surface that is seen there, an elbow 4 cm, a
+head 8 cm. Nothing was fitted to them. Two people are in the first and the last image of the Kinect: the nearer counts.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import amount, data, figure
+from kinefit import Motion, track_take
+from kinefit.motion import BELIEVED
+from kinefit.readers.take.load import Observations
+
+Read = dict[str, tuple[int, int]]  # part of the body: pixel
+KINECT: dict[str, Read] = {  # in the order of the files' numbers
+    "82823944": {"hand_r": (76, 241), "hand_l": (428, 241), "head": (247, 160)},
+    "1028894671": {"hand_r": (110, 367), "hand_l": (505, 331), "head": (306, 160)},
+    "1038901490": {"hand_r": (112, 415), "hand_l": (512, 105), "head": (309, 160)},
+    "1045879925": {"hand_r": (101, 126), "hand_l": (511, 100), "head": (318, 165)},
+    "1051883281": {"hand_r": (69, 52), "hand_l": (545, 53), "head": (302, 170)},
+    "1058893191": {"hand_r": (123, 216), "hand_l": (494, 192), "head": (302, 161)},
+    "1064898470": {"hand_r": (106, 418), "hand_l": (512, 383), "head": (310, 163)},
+    "1070905432": {"hand_r": (37, 68), "hand_l": (440, 327), "head": (314, 165)},
+    "1078881076": {"hand_r": (151, 327), "hand_l": (461, 301), "head": (289, 175)},
+    "1166565565": {"hand_r": (121, 386), "hand_l": (474, 50), "head": (309, 116)},
+    "1234568668": {"hand_r": (84, 282), "hand_l": (494, 117), "head": (284, 123)},
+    "1399145206": {"hand_l": (471, 185), "head": (309, 160)},
+}
+SR305: dict[str, dict[str, Read]] = {
+    "20210326-230536": {
+        "30": {"hand_r": (293, 315), "elbow_r": (402, 285)}, "50": {"hand_r": (292, 277), "elbow_r": (430, 283)},
+        "70": {"hand_r": (303, 262), "elbow_r": (408, 322)}, "90": {"hand_r": (312, 252)},
+        "110": {"hand_r": (277, 227), "elbow_r": (150, 235)}, "130": {"hand_r": (262, 212), "elbow_r": (110, 75)},
+        "150": {"hand_r": (302, 216)}, "170": {"hand_r": (287, 231)},
+    },
+    "20210326-231615": {
+        "0": {"hand_r": (265, 305)}, "20": {"hand_r": (338, 300), "elbow_r": (322, 435)},
+        "40": {"hand_r": (324, 296), "elbow_r": (328, 447)}, "60": {"hand_r": (328, 291), "elbow_r": (328, 445)},
+        "80": {"hand_r": (328, 293), "elbow_r": (333, 448)}, "100": {"hand_r": (333, 293), "elbow_r": (335, 450)},
+        "140": {"hand_r": (327, 297), "elbow_r": (333, 452)}, "160": {"hand_r": (333, 292), "elbow_r": (338, 455)},
+        "180": {"hand_r": (341, 282), "elbow_r": (335, 455)}, "200": {"hand_r": (338, 275), "elbow_r": (336, 458)},
+        "220": {"hand_r": (348, 287)},
+    },
+}  # fmt: skip
+BEHIND = {"hand": 0.015, "elbow": 0.04, "head": 0.08}  # [m] of the part's middle behind its surface
+SEGMENTS = {"hand": "hand", "elbow": "forearm", "head": "head"}
+_GOALS = {
+    "people_kinect_images": ("images with the person found", "== 12"),
+    "people_kinect_hands": ("% of hands within 6 cm", ">= 85"),
+    "people_sr305_right": ("% of hands and elbows within 4 cm, or said to be lost", ">= 90"),
+    "people_sr305_told": ("% of hands and elbows farther off that are said to be lost", ">= 95"),
+}  # fmt: skip
+_TAKE = """[take]
+rate = {rate}
+up = "-y"
+frames = [0, {frames}]
+[[depth]]
+name = "depth"
+file = "{folder}"
+rate = {rate}
+unit = {unit}
+intrinsics = {lens}
+range = {range}
+{more}"""
+
+
+def run() -> None:
+    """Print every figure."""
+    _kinect()
+    _sr305()
+
+
+def _kinect() -> None:
+    folder = data("depth_skeltrack_kinect1")
+    names = list(KINECT)[: amount(len(KINECT), 2)]
+    if folder is None:
+        return _none("people_kinect")
+    with tempfile.TemporaryDirectory() as work:
+        for name in names:
+            (Path(work) / f"depth-data-{name}").symlink_to(folder / f"depth-data-{name}")
+        text = _TAKE.format(rate=1.0, frames=len(names), folder=work, unit=0.001, lens=[575.0, 575.0, 319.5, 239.5],
+                            range=[0.5, 5.0], more="size = [640, 480]\n")  # fmt: skip
+        motion, seen = _tracked(text, Path(work))
+        gaps = _gaps(motion, seen, dict(enumerate(KINECT[name] for name in names)))
+    figure("people_kinect_images", float(np.sum(motion.quality > 0.0)), *_GOALS["people_kinect_images"])
+    off = {part: [gap for (_, of), (gap, _) in gaps.items() if of.startswith(part)] for part in ("hand", "head")}
+    figure("people_kinect_hands", 100 * float(np.mean(np.array(off["hand"]) <= 0.06)), *_GOALS["people_kinect_hands"])
+    print(f"# heads, the middle between the ears: median {100 * float(np.median(off['head'])):.0f} cm off")
+    _tell(gaps, names, 0.06)
+    return None
+
+
+def _sr305() -> None:
+    folder = data("depth_sr305_upperbody")
+    if folder is None:
+        return _none("people_sr305")
+    every = []
+    for take, images in SR305.items():
+        count = amount(len(images), 2)
+        with tempfile.TemporaryDirectory() as work:
+            text = _TAKE.format(rate=1.5, frames=count, folder=folder / take, unit=0.000125, range=[0.2, 2.0], more="",
+                                lens=[476.007, 476.007, 313.683, 242.755])  # fmt: skip
+            motion, seen = _tracked(text, Path(work))
+            gaps = _gaps(motion, seen, dict(enumerate(list(images.values())[:count])))
+        print(f"# {take}")
+        _tell(gaps, list(images), 0.04)
+        every += list(gaps.values())
+    gap, lost = np.array([g for g, _ in every]), np.array([gone for _, gone in every])
+    name = "people_sr305_right"
+    figure(name, 100 * float(np.mean((gap <= 0.04) | lost)), *_GOALS[name])
+    wrong = gap > 0.04
+    name = "people_sr305_told"
+    figure(name, 100 * float(lost[wrong].mean()) if wrong.any() else 100.0, *_GOALS[name])
+    return None
+
+
+def _none(area: str) -> None:
+    for name, (unit, goal) in _GOALS.items():
+        if name.startswith(area):
+            figure(name, None, unit, goal, "no recording")
+
+
+def _tracked(text: str, work: Path) -> tuple[Motion, Observations]:
+    path = work / "take.toml"
+    path.write_text(text, encoding="utf-8")
+    return track_take(path)
+
+
+def _gaps(motion: Motion, seen: Observations, read: Mapping[int, Read]) -> dict[tuple[int, str], tuple[float, bool]]:
+    """(image, part): distance [m] of the fitted part from what was read, and whether it is said to be lost."""
+    names, out = motion.body.landmarks.names, {}
+    x, segments = motion.positions(), motion.body.tree.segments
+    at = lambda name, i: x[i, names.index(name)]
+    for i, parts in read.items():
+        for part, pixel in parts.items():
+            kind, _, side = part.partition("_")
+            true = _point(seen, i, pixel, BEHIND[kind])
+            if kind == "head":
+                found = (at("r_tragion", i) + at("l_tragion", i)) / 2.0
+            elif kind == "elbow":
+                found = at(f"{side}_elbow", i)
+            else:
+                found = (at(f"{side}_wrist", i) + at(f"{side}_metacarpal_phalanx_3", i)) / 2.0
+            segment = segments.index("head" if kind == "head" else f"{SEGMENTS[kind]}_{side}")
+            lost = bool(motion.segment_quality[i, segment] < BELIEVED)
+            out[i, part] = float(np.linalg.norm(found - true)), lost
+    return out
+
+
+def _point(seen: Observations, i: int, pixel: tuple[int, int], behind: float) -> NDArray:
+    """(3,) [m] so far behind the surface that is measured about a pixel."""
+    frame, (u, v) = seen.depth[0].frame(i), pixel
+    assert seen.rig is not None
+    camera = seen.rig[frame.sensor]
+    about = frame.depth[max(v - 6, 0) : v + 7, max(u - 6, 0) : u + 7]
+    z = float(np.median(about[about > 0])) + behind
+    x = z * np.append(camera.ray_table[:, v, u], 1.0)
+    return np.asarray(x @ camera.T_world_camera[:3, :3].T + camera.centre_world)
+
+
+def _tell(gaps: Mapping[tuple[int, str], tuple[float, bool]], names: list[str], limit: float) -> None:
+    for (i, part), (gap, lost) in gaps.items():
+        if gap > limit:
+            print(f"# {names[i]} {part}: {100 * gap:.0f} cm off, {'said to be lost' if lost else 'NOT said'}")

@@ -1,0 +1,289 @@
+"""Names that skeletons of other programs give their joints: one map for recorded motions and for characters."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+from kinefit.bodies.files import load_body
+from kinefit.errors import BodyError, ObservationError, choices
+
+SIDES = {
+    "l": {"s": "l", "S": "L", "Side": "Left", "side": "left"},
+    "r": {"s": "r", "S": "R", "Side": "Right", "side": "right"},
+}
+"""What {s}, {S}, {Side} and {side} of a name stand for."""
+
+LIMBS = ("thigh", "shank", "foot", "toes", "upperarm", "forearm", "hand")
+"""Segments of both sides whose joint is the hip, the knee, ... of a skeleton."""
+
+SEGMENTS = ("pelvis", "abdomen", "thorax", "neck", "head") + tuple(
+    f"{name}_{side}" for name in ("clavicle", *LIMBS) for side in SIDES
+)
+"""Segments of the humanoid, and the neck, that a joint may move."""
+
+MORE = ("head_top",) + tuple(f"{name}_{side}" for name in ("toe_end", "knuckle") for side in SIDES)
+"""Ends of bones that a table of names may name, too."""
+
+_NEEDED = ("pelvis", "head") + tuple(
+    f"{name}_{side}" for name in ("thigh", "shank", "foot", "upperarm", "forearm", "hand") for side in SIDES
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Joint names of one family of skeletons; {s}, {S}, {Side}, {side} stand for l, L, Left, left.
+
+    Parameters
+    ----------
+    name : str
+    trunk : segment of `SEGMENTS` without a side -> name; "clavicle" with one.
+    limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist.
+    spine : of recorded motions, names of the joints at the sacrum, a third of the way up the spine, at the root of the
+        neck, in the head; those of abdomen, thorax, neck, head where there is none.
+    knuckle, toe_end : names of a finger's first joint, of the tip of the toes; None: the first child of hand and toes.
+    hand : names of the joint whose frame turns with the hand (at rest the thumbs are in front), or of two joints, the
+        second one on the thumb's side; none: the wrist's.
+    head_top : name of the top of the head; None where the eyes tell how the head is turned, or else the head's child.
+    eyes : name of the eyes, or None.
+    upright : (forward, up) of the bones "pelvis", "abdomen", "thorax", "head" of a person who stands upright; None
+        where the rest pose of the file is that.
+    """
+
+    name: str
+    trunk: Mapping[str, str]
+    limbs: tuple[str, ...]
+    spine: tuple[str, ...] = ()
+    knuckle: str | None = None
+    toe_end: str | None = None
+    hand: tuple[str, ...] = ()
+    head_top: str | None = None
+    eyes: str | None = None
+    upright: tuple[tuple[float, float], ...] | None = None
+
+    @property
+    def joints(self) -> dict[str, str]:
+        """Segment of `SEGMENTS` -> name of the joint that moves it."""
+        out = {segment: name for segment, name in self.trunk.items() if segment != "clavicle"}
+        for side, words in SIDES.items():
+            out |= {f"{limb}_{side}": name.format(**words) for limb, name in zip(LIMBS, self.limbs)}
+            if "clavicle" in self.trunk:
+                out[f"clavicle_{side}"] = self.trunk["clavicle"].format(**words)
+        return out
+
+    @property
+    def recorded(self) -> dict[str, str]:
+        """What a joint is, as in `Recorded` -> its name, of recorded motions."""
+        spine = self.spine or tuple(self.trunk[segment] for segment in ("abdomen", "thorax", "neck", "head"))
+        out = dict(zip(("sacrum", "spine", "neck", "head"), spine))
+        ends = {"knuckle": self.knuckle, "toe_end": self.toe_end, "eye": self.eyes}
+        sides = {**dict(zip(LIMBS, self.limbs)), **ends, **dict(zip(("palm", "thumb"), self.hand))}
+        for side, words in SIDES.items():
+            out |= {f"{role}_{side}": name.format(**words) for role, name in sides.items() if name}
+        return out | ({"head_top": self.head_top} if self.head_top else {})
+
+
+def _trunk(*names: str) -> dict[str, str]:
+    """Names of pelvis, abdomen, thorax, neck, head, clavicle; "" where there is none."""
+    return {segment: name for segment, name in zip((*SEGMENTS[:5], "clavicle"), names) if name}
+
+
+_LIMBS_BVH = ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand")
+
+FAMILIES = (
+    Family(
+        "Mixamo", _trunk("Hips", "Spine", "Spine2", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
+        knuckle="{Side}HandMiddle1", toe_end="{Side}Toe_End", head_top="HeadTop_End",
+    ),
+    Family(
+        "Acclaim (CMU)", _trunk("root", "lowerback", "thorax", "lowerneck", "head", "{s}clavicle"),
+        ("{s}femur", "{s}tibia", "{s}foot", "{s}toes", "{s}humerus", "{s}radius", "{s}wrist"),
+        ("root", "upperback", "lowerneck", "head"), "{s}fingers", "{s}toes_end", ("{s}hand",), "head_end",
+    ),
+    Family(
+        "MotionBuilder (CMU)", _trunk("Hips", "LowerBack", "Spine1", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
+        ("Hips", "Spine", "Neck", "Head"), "{Side}HandIndex1", "{Side}ToeBase_end", ("{Side}FingerBase",), "Head_end",
+    ),
+    Family(
+        "hip and knee (CMU)", _trunk("Hips", "", "Chest", "lowerneck", "Head", "{Side}Collar"),
+        ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist"),
+        ("Hips", "Chest", "lowerneck", "Head"), "{S}Fingers", "{Side}Toe_end", ("{s}hand",), "Head_end",
+    ),
+    Family(
+        "AnimatedDrawings", _trunk("Hips", "Spine", "Spine1", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
+        ("Hips", "Spine1", "Neck", "Head"), "{Side}HandEnd", "{Side}ToeBase_end", ("{Side}Hand",), "Head_end",
+    ),
+    Family(
+        "iClone", _trunk("CC_Base_Hip", "CC_Base_Waist", "CC_Base_Spine02", "CC_Base_NeckTwist01", "CC_Base_Head",
+                         "CC_Base_{S}_Clavicle"),
+        ("CC_Base_{S}_Thigh", "CC_Base_{S}_Calf", "CC_Base_{S}_Foot", "CC_Base_{S}_ToeBase", "CC_Base_{S}_Upperarm",
+         "CC_Base_{S}_Forearm", "CC_Base_{S}_Hand"),
+        ("CC_Base_Waist", "CC_Base_Spine01", "CC_Base_NeckTwist01", "CC_Base_Head"), "CC_Base_{S}_Mid1",
+        "CC_Base_{S}_MidToe1", ("CC_Base_{S}_Pinky1", "CC_Base_{S}_Index1"), eyes="CC_Base_{S}_Eye",
+        upright=((0.17, 0.985), (0.588, 0.809), (-0.19, 0.982), (0.543, 0.84)),
+    ),
+    Family(
+        "VRM, Unity", _trunk("hips", "spine", "chest", "neck", "head", "{side}Shoulder"),
+        ("{side}UpperLeg", "{side}LowerLeg", "{side}Foot", "{side}Toes", "{side}UpperArm", "{side}LowerArm",
+         "{side}Hand"), knuckle="{side}MiddleProximal",
+    ),
+    Family(
+        "Unreal", _trunk("pelvis", "spine_01", "spine_03", "neck_01", "head", "clavicle_{s}"),
+        ("thigh_{s}", "calf_{s}", "foot_{s}", "ball_{s}", "upperarm_{s}", "lowerarm_{s}", "hand_{s}"),
+        knuckle="middle_01_{s}",
+    ),
+    Family(
+        "Biped", _trunk("Pelvis", "Spine", "Spine2", "Neck", "Head", "{S} Clavicle"),
+        ("{S} Thigh", "{S} Calf", "{S} Foot", "{S} Toe0", "{S} UpperArm", "{S} Forearm", "{S} Hand"),
+        knuckle="{S} Finger2",
+    ),
+    Family(
+        "SMPL", _trunk("Pelvis", "Spine1", "Spine3", "Neck", "Head", "{S}_Collar"),
+        ("{S}_Hip", "{S}_Knee", "{S}_Ankle", "{S}_Foot", "{S}_Shoulder", "{S}_Elbow", "{S}_Wrist"),
+        knuckle="{S}_Hand",
+    ),
+)  # fmt: skip
+"""Known families; those of `conventions`, which the body files name, come beside them."""
+
+
+@cache
+def conventions() -> tuple[Family, ...]:
+    """`FAMILIES`, and the conventions under which motions are exported ("mixamo", "hanim", ...)."""
+    out = list(FAMILIES)
+    body = load_body("humanoid")
+    for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
+        out.append(_Told(name, names, told=names))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class _Told(Family):
+    """A family of which every joint is told."""
+
+    limbs: tuple[str, ...] = ()
+    told: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def joints(self) -> dict[str, str]:
+        return {segment: name for segment, name in self.told.items() if segment in SEGMENTS}
+
+
+def plain(name: str) -> str:
+    """A name without namespace, program's prefix, capitals and separators: "mixamorig1:LeftArm" is "leftarm"."""
+    last = re.split(r"[:|]", name)[-1]
+    last = re.sub(r"(?i)^(mixamorig\d*|bip0*1)[ _]", "", last)
+    return re.sub(r"[\s_.\-]+", "", last).lower()
+
+
+def find(names: Sequence[str], name: str) -> int | None:
+    """Index of a joint: of exactly that name, or the first that differs in prefix, capitals or separators only."""
+    if name in names:
+        return list(names).index(name)
+    key = plain(name)
+    return next((i for i, other in enumerate(names) if plain(other) == key), None)
+
+
+def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, source: str = "") -> dict[str, int]:
+    """Which joint of a character moves which segment.
+
+    Parameters
+    ----------
+    names : (J,) of the joints.
+    table : segment of `SEGMENTS` -> name of a joint, optional
+        Goes before what the names tell.
+    source : str
+        File of the character, for messages.
+
+    Returns
+    -------
+    segment -> index of the joint
+
+    Raises
+    ------
+    BodyError
+        A table that names what there is not; joints that a person needs are not there: they are named.
+    """
+    told = {}
+    for segment, name in (table or {}).items():
+        index = find(names, name)
+        if index is None:
+            raise BodyError(choices("joint", name, names), file=source or None, place=f"table of names, {segment}")
+        if segment in SEGMENTS:
+            told[segment] = index
+    found = [
+        (family, {s: i for s, n in family.joints.items() if (i := find(names, n)) is not None} | told)
+        for family in conventions()
+    ]
+    family, best = max(found, key=lambda pair: (-len(lacking(pair[1])), len(pair[1])))
+    if lost := lacking(best):
+        wanted = [f"{segment} ('{family.joints[segment]}' in {family.name})" if segment in family.joints else segment
+                  for segment in lost]  # fmt: skip
+        known = ", ".join(family.name for family in FAMILIES)
+        remedy = f"Name its joints by a table (--names-table), or as one of: {known}. It has: {', '.join(names)}"
+        raise BodyError(f"the character has no joint for {', '.join(wanted)}", file=source or None, remedy=remedy)
+    twice = [names[i] for i in set(best.values()) if list(best.values()).count(i) > 1]
+    if twice:
+        raise BodyError(f"the joint '{twice[0]}' is named for two segments", file=source or None)
+    return best
+
+
+def lacking(segments: Iterable[str]) -> list[str]:
+    """Segments that a character needs and that are not among some."""
+    there = set(segments)
+    return [segment for segment in _NEEDED if segment not in there]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Joints of a recorded skeleton.
+
+    Parameters
+    ----------
+    family : str
+    joints : what a joint is -> its index
+        "sacrum", "spine", "neck", "head", of both sides `LIMBS`; where they are there "head_top", "knuckle_l",
+        "toe_end_l", "eye_l", "palm_l" (its frame turns with the hand), "thumb_l" (then "palm_l" is on the other side).
+    upright : as of `Family`.
+    """
+
+    family: str
+    joints: Mapping[str, int]
+    upright: tuple[tuple[float, float], ...] | None = None
+
+
+def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None, *, source: str = "") -> Recorded:
+    """What the joints of a recorded skeleton are, by their names; by a table alone where one is given.
+
+    Parameters
+    ----------
+    names : (J,) of the joints.
+    table : segment of `SEGMENTS`, or one of `MORE` -> name of a joint, optional
+    source : str
+        File of the skeleton, for messages.
+
+    Raises
+    ------
+    ObservationError
+        No family fits; the message tells which joints lack for the nearest one.
+    """
+    if table:
+        family = Family("table of names", {}, ())
+        wanted = {"sacrum": table.get("abdomen", table.get("pelvis", "")), "spine": table.get("thorax", ""), **table}
+        known = ("sacrum", "spine", "neck", "head", *(f"{limb}_{side}" for limb in LIMBS for side in SIDES), *MORE)
+        wanted = {role: wanted.get(role, "") for role in known if role not in MORE or role in wanted}
+    else:
+        short = {family: [n for n in family.recorded.values() if find(names, n) is None] for family in FAMILIES}
+        exact = {family: sum(n not in names for n in family.recorded.values()) for family in FAMILIES}
+        family = min(FAMILIES, key=lambda f: (len(short[f]) / len(f.recorded), exact[f]))
+        wanted = family.recorded
+    lost = {role: name for role, name in wanted.items() if find(names, name) is None}
+    if lost:
+        of = f"of no known family ({', '.join(f.name for f in FAMILIES)}); for '{family.name}' it"
+        words = [f"{name or 'no name'} ({role})" if table else name for role, name in lost.items()]
+        told = ", ".join(dict.fromkeys(words))
+        remedy = "Rename its joints to those of a known family, or name them by --names-table."
+        problem = f"the skeleton is {of} lacks: {told}" if not table else f"for the table of names it lacks: {told}"
+        raise ObservationError(problem, file=source or None, remedy=remedy)
+    return Recorded(family.name, {role: find(names, name) or 0 for role, name in wanted.items()}, family.upright)

@@ -1,0 +1,32 @@
+"""Intrinsics that are given to a calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, choices
+from kinefit.geometry.camera import Camera, Rig
+
+
+def known_camera(interiors: Rig, name: str, size: tuple[int, int]) -> Camera:
+    """A camera whose intrinsics are known, at the world's origin.
+
+    Parameters
+    ----------
+    size : width, height [px] of the images that it took now
+
+    Raises
+    ------
+    CalibrationError
+        No camera of this name, or one whose images are of another size.
+    """
+    if name not in interiors:
+        problem = choices("intrinsics of camera", name, interiors.names)
+        raise CalibrationError(problem, remedy="Name the videos as the cameras.")
+    camera = interiors[name].with_pose(np.eye(4))
+    if camera.size != size:
+        raise CalibrationError(
+            f"its image has {size[0]}x{size[1]} px, its intrinsics are of {camera.size[0]}x{camera.size[1]}",
+            place=f"camera {name}", remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
+        )  # fmt: skip
+    return camera

@@ -1,0 +1,128 @@
+"""A take's first pose from joints that are clicked in its images, or were: `kinefit init --click`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kinefit.cli import _screen
+from kinefit.errors import TakeError, TrackingError, choices
+
+if TYPE_CHECKING:
+    from kinefit.bodies import Body
+    from kinefit.readers.clicks import Clicks
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
+
+_INSIDE = 1e-6  # [rad] or [m] from a joint's limits, that rounding does not cross them
+BODY = "clicked-body.npz"
+CLICKS = "clicks.json"
+
+
+def start_from_clicks(out: Path, points: Path | None, step: int | None, body: str, browser: bool) -> None:
+    """Put body and pose of clicked joints into a take file that was just written.
+
+    Parameters
+    ----------
+    out : the take file
+    points : clicks as JSON; None: they are clicked in the browser
+    step : of the images that are shown; the first where None
+    body : name or file of the body
+    """
+    from kinefit.bodies import load_body
+    from kinefit.readers.clicks import read_clicks
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.load import load_observations
+
+    take = read_take(out)
+    seen, generic = load_observations(take), load_body(body)
+    if seen.rig is None or (not seen.videos and points is None):
+        raise TakeError("no videos of calibrated cameras, in which to click", file=out, remedy="Leave out --click.")
+    if points is not None:
+        _screen.say(_started(out, take, seen, generic, read_clicks(points)))
+        return
+    _ask(out, take, seen, generic, seen.frames[0] if step is None else step, browser)
+
+
+def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, browser: bool) -> None:
+    """Show the page until its clicks give a start."""
+    import webbrowser
+
+    from kinefit.exporters.atomic import write_text
+    from kinefit.initialization.from_clicks import clickable
+    from kinefit.readers.clicks import clicks_of
+    from kinefit.viewers.clicks import ClickPage
+
+    def taken(told: Any) -> str:
+        clicks = clicks_of(told)
+        answer = _started(out, take, seen, body, clicks)
+        write_text(out.with_name(CLICKS), clicks.text())
+        return answer
+
+    page = ClickPage(_pictures(take, seen, step), clickable(body), taken, step=step)
+    page.start()
+    try:
+        _screen.say(f"Click the joints at {page.url} ; Ctrl-C leaves the take without a start.")
+        if browser:
+            webbrowser.open(page.url)
+        while not page.done.wait(0.5):
+            pass
+    finally:
+        page.stop()
+    _screen.say(f"{out}: start written, from {out.with_name(CLICKS)}")
+
+
+def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
+    """JPEG of every camera's image at a step."""
+    import cv2
+
+    from kinefit.readers.video import Video
+
+    if not seen.frames[0] <= step < seen.frames[1]:
+        problem = f"step {step} of a recording of the steps {seen.frames[0]} to {seen.frames[1] - 1}"
+        raise TakeError(problem, file=take.path, remedy="Name one of these by --step.")
+    out = {}
+    for entry in take.cameras:
+        if entry.name in seen.videos:
+            with Video(seen.videos[entry.name], rate=seen.rate) as video:
+                frame = min(max(round((step / seen.rate - entry.time_offset) * video.rate), 0), len(video) - 1)
+                picture = cv2.cvtColor(video.read(frame), cv2.COLOR_RGB2BGR)
+            out[entry.name] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+    return out
+
+
+def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clicks) -> str:
+    """Write body and start into the take file; what to tell."""
+    import numpy as np
+
+    from kinefit.bodies.serial import save_body
+    from kinefit.exporters.atomic import write_text
+    from kinefit.initialization.from_clicks import clicked_points, clicked_start
+
+    assert seen.rig is not None
+    unknown = [camera for camera in clicks.points if camera not in seen.rig.names]
+    if unknown:
+        raise TrackingError(choices("camera of the take", unknown[0], seen.rig.names))
+    names = clicks.names
+    uv = np.full((len(names), len(seen.rig), 2), np.nan)
+    for c, camera in enumerate(seen.rig.names):
+        places = clicks.places(camera)
+        uv[:, c] = seen.images[camera].to_calibration(places) if camera in seen.images else places
+    x_world = clicked_points(seen.rig, names, uv)
+    fitted, state, left = clicked_start(body, names, x_world)
+    save_body(fitted, out.with_name(BODY))
+    tree, R = fitted.tree, state.T_world_root[:3, :3]
+    angles = np.clip(state.angles, tree.lower + _INSIDE, tree.upper - _INSIDE)
+    told = ", ".join(
+        f"{name} = {value if slides else np.degrees(value):.6f}"
+        for name, value, slides in zip(tree.coordinates, angles, tree.prismatic)
+    )
+    vectors = {"at": state.T_world_root[:3, 3], "forward": R[:, 0], "upward": R[:, 1]}
+    lines = [f"{key} = [{', '.join(f'{v:.6f}' for v in vector)}]" for key, vector in vectors.items()]
+    text = re.sub(r"\n\[start\]  # clicked\n.*?(?=\n\[|\Z)", "", out.read_text("utf-8"), flags=re.S)
+    text = re.sub(r"(?m)^body = .*$", f'body = "{BODY}"  # {body.name} of the clicked lengths', text, count=1)
+    start = "\n".join(["[start]  # clicked", f"step = {clicks.step}", *lines, f"angles = {{ {told} }}"])
+    write_text(out, f"{text.rstrip()}\n\n{start}\n")
+    known = np.isfinite(x_world).all(axis=1).sum()
+    return f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."

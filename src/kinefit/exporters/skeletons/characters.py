@@ -1,0 +1,156 @@
+"""A character's own file with a motion in it: mesh, skin and pictures stay as they are."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import write_bytes, write_lines
+from kinefit.exporters.skeletons.common import euler_zxy
+from kinefit.exporters.skeletons.retarget import Retargeted, retargeted
+from kinefit.geometry import se3
+from kinefit.motion import Motion
+from kinefit.motion_columns import continuous_quaternions
+from kinefit.readers.skeletons.characters import KINDS, read_character
+
+
+@checked
+def write_character(
+    motion: Motion, character: str | PathLike[str], path: str | PathLike[str], *, names: Mapping[str, str] | None = None
+) -> Retargeted:
+    """Write a motion on another character: GLB of a GLB, VRM or glTF, BVH of a BVH.
+
+    Of glTF all that the file holds stays, byte for byte; an animation that comes first is added. Of BVH the hierarchy
+    stays, and the motion is replaced.
+
+    Parameters
+    ----------
+    motion : Motion
+    character : path
+    path : path
+        Of the new file, with the ending of its format.
+    names : segment -> name of the character's joint, optional
+
+    Returns
+    -------
+    Retargeted
+        What was written.
+
+    Raises
+    ------
+    FileError
+        The character cannot be read.
+    BodyError
+        It lacks joints, which are named; or the motion's body has no arms or legs.
+    ExportError
+        No frames, another ending, or the file cannot be written.
+    """
+    source = read_character(character)
+    kind = KINDS[source.path.suffix.lower()]
+    fitting = [ending for ending, of in KINDS.items() if of == kind and ending != ".gltf"]
+    if Path(path).suffix.lower() not in fitting:
+        remedy = f"Name it with {' or '.join(fitting)}."
+        raise ExportError(f"a motion on '{source.path.name}' is written as {kind.upper()}", file=path, remedy=remedy)
+    found = retargeted(motion, source, names)
+    if kind == "glb":
+        write_bytes(path, _glb(motion, found))
+    else:
+        write_lines(path, _bvh(motion, found))
+    return found
+
+
+def _glb(motion: Motion, found: Retargeted) -> bytes:
+    assert found.character.gltf is not None
+    told: dict[str, Any] = json.loads(json.dumps(found.character.gltf.json))
+    data = bytearray(found.character.gltf.binary)
+
+    def add(array: NDArray, kind: str, **more: Any) -> int:
+        data.extend(bytes(-len(data) % 4))
+        content = np.ascontiguousarray(array, "<f4").tobytes()
+        views, accessors = told.setdefault("bufferViews", []), told.setdefault("accessors", [])
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content)})
+        data.extend(content)
+        accessors.append({
+            "bufferView": len(views) - 1, "componentType": 5126, "count": len(array), "type": kind, **more,
+        })  # fmt: skip
+        return len(accessors) - 1
+
+    times = (motion.times - motion.times[0]).astype(np.float32)
+    clock = add(times, "SCALAR", min=[float(times.min())], max=[float(times.max())])
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+
+    def channel(node: int, path: str, values: NDArray, kind: str) -> None:
+        samplers.append({"input": clock, "output": add(values, kind), "interpolation": "LINEAR"})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
+
+    for node in map(int, np.flatnonzero(found.moving)):
+        _as_parts(told["nodes"][node], found.character.gltf.local(node))
+        channel(node, "rotation", np.roll(continuous_quaternions(found.rotations[:, node]), -1, axis=-1), "VEC4")
+        if node == found.mover:
+            channel(node, "translation", found.places, "VEC3")
+    animation = {"name": motion.name, "samplers": samplers, "channels": channels}
+    told["animations"] = [animation, *told.get("animations", [])]
+    data.extend(bytes(-len(data) % 4))
+    told["buffers"] = [{**told["buffers"][0], "byteLength": len(data)}]
+    text = json.dumps(told, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
+    return head + text + struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
+
+
+def _as_parts(node: dict[str, Any], M: NDArray) -> None:
+    """A node that is to move says its pose in parts, not as a matrix."""
+    if node.pop("matrix", None) is None:
+        return
+    scale = np.linalg.norm(M[:3, :3], axis=0) * np.sign(np.linalg.det(M[:3, :3]))
+    w, x, y, z = se3.quaternion(M[:3, :3] / scale)
+    node.update(translation=M[:3, 3].tolist(), rotation=[float(v) for v in (x, y, z, w)], scale=scale.tolist())
+
+
+def _bvh(motion: Motion, found: Retargeted) -> Iterator[str]:
+    """Lines of the character's BVH with another motion."""
+    character = found.character
+    head = re.split(r"^[ \t]*MOTION\b", character.text, maxsplit=1, flags=re.M | re.I)[0]
+    channels = [words.lower().split() for words in re.findall(r"^\s*CHANNELS\s+\d+\s+(.*)$", head, flags=re.M | re.I)]
+    joints = [node for node, name in enumerate(character.names) if not name.endswith("_end")]
+    if len(channels) != len(joints):
+        remedy = "Export the character again, one CHANNELS line for each joint."
+        raise ExportError("its joints and CHANNELS differ in number", file=character.path, remedy=remedy)
+    columns: list[NDArray] = []
+    for node, names in zip(joints, channels):
+        parent = int(character.parents[node])
+        rest = character.positions[node] - (character.positions[parent] if parent >= 0 else 0.0)
+        turn = character.rotations[parent] if parent >= 0 else character.world
+        place = np.tile(rest @ turn / character.unit, (len(motion), 1))
+        place = found.places if node == found.mover else place
+        axes = "".join(name[0] for name in names if name.endswith("rotation"))
+        if len(set(axes)) not in (0, 3):
+            problem = f"joint '{character.names[node]}' turns about {len(set(axes))} axes, not three"
+            raise ExportError(problem, file=character.path, remedy="Export the character again, for animation.")
+        angles = iter(_euler(found.rotations[:, node], axes).T if axes else ())
+        columns += [
+            np.degrees(next(angles)) if name.endswith("rotation") else place[:, "xyz".index(name[0])] for name in names
+        ]  # fmt: skip
+    yield from head.rstrip().splitlines()
+    yield from ("MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}")
+    table = np.stack(columns, axis=1) + 0.0
+    row = " ".join(["%.8f"] * table.shape[1])
+    yield from (row % tuple(values) for values in table.tolist())
+
+
+def _euler(rotations: NDArray, axes: str) -> NDArray:
+    """(F, 3) [rad] angles about three different axes in this order, without jumps, of rotations (F, 3, 3)."""
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
+    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)

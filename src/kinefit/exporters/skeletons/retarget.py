@@ -1,0 +1,298 @@
+"""A motion on the skeleton of another character: its bones point where the body's do, its feet keep to the ground.
+
+Where both stand upright their trunks, heads and feet agree; of arms and legs the bones' directions agree, however the
+character rests (T, A, arms hanging). Every joint turns by D = R_segment Cᵀ from its rest, C the segment's axes at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.joint_names import conventions, joint_map
+from kinefit.errors import BodyError, ExportError, FileError
+from kinefit.geometry import se3
+from kinefit.motion import Motion
+from kinefit.readers.skeletons.characters import Character
+
+_FAR = {"thigh": "shank", "shank": "foot", "upperarm": "forearm", "forearm": "hand"}  # bones whose direction is kept
+_BODY_NEEDED = tuple(f"{name}_{side}" for name in ("thigh", "shank", "upperarm", "forearm") for side in "lr")
+_UP = np.array([0.0, 1.0, 0.0])
+_ALONG = 0.9  # cosine above which a bone that points forward tells nothing of what is in front of it
+_STANCE = 0.01  # [m] a foot so much lower than the other carries most of the weight; a swinging one clears some cm
+_LOWEST = 5.0  # percentile of the lowest point's height that counts as the ground
+
+
+@dataclass(frozen=True, eq=False)
+class Retargeted:
+    """A motion of a character's nodes.
+
+    Parameters
+    ----------
+    character : Character
+    rotations : (F, J, 3, 3) of every node in its parent.
+    moving : (J,) bool, nodes that turn against their parent; all others rest.
+    mover : int, the node that moves.
+    places : (F, 3) of the mover in its parent, in the file's unit.
+    positions : (F, J, 3) [m] of all nodes, y up.
+    segments : node -> segment of the body whose turn it does.
+    """
+
+    character: Character
+    rotations: NDArray
+    moving: NDArray
+    mover: int
+    places: NDArray
+    positions: NDArray
+    segments: Mapping[int, str]
+
+
+def retargeted(motion: Motion, character: Character, names: Mapping[str, str] | None = None) -> Retargeted:
+    """Put a motion onto a character.
+
+    Parameters
+    ----------
+    motion : Motion
+        Of a person: arms and legs are needed.
+    character : Character
+    names : segment -> name of the character's joint, optional
+        Goes before what the names tell (`bodies.joint_names`).
+
+    Raises
+    ------
+    BodyError
+        The character lacks joints, or the body does; they are named.
+    ExportError
+        No frames; a character that does not stand at rest, or whose sides are exchanged.
+    """
+    if not len(motion):
+        raise ExportError("a motion without frames cannot be put onto a character", file=character.path)
+    nodes, motion = _nodes(character, names), motion.turned("y")
+    segments = _segments(motion.body)
+    used = {segment: node for segment, node in nodes.items() if segment in segments}
+    poses = motion.segment_poses()
+    turns = {
+        node: poses[:, segments[name], :3, :3] @ C.T
+        for (name, node), C in zip(used.items(), _axes(character, nodes, motion.body, segments, used).values())
+    }
+    mover = _common(character, list(nodes.values()))
+    turns[mover] = turns[nodes["pelvis"]]
+    _between(character, nodes, used, turns)
+    D = np.tile(np.eye(3), (len(motion), len(character.names), 1, 1))
+    places = np.tile(character.positions, (len(motion), 1, 1))
+    for node in character.order:
+        parent = character.parents[node]
+        if parent >= 0:
+            D[:, node] = D[:, parent]
+            step = character.positions[node] - character.positions[parent]
+            places[:, node] = places[:, parent] + D[:, parent] @ step
+        D[:, node] = turns.get(int(node), D[:, node])
+    below = _below(character, mover)
+    places[:, below] += _root(motion, poses, segments, character, nodes, D, places)[:, None]
+    frames = D @ character.rotations
+    parents = character.parents
+    above = np.where((parents >= 0)[:, None, None], frames[:, parents], character.world)
+    moving = np.zeros(len(parents), bool)
+    moving[list(turns)] = True
+    return Retargeted(
+        character, above.swapaxes(-1, -2) @ frames, moving, mover, character.in_parent(mover, places[:, mover]), places,
+        {node: segment for segment, node in used.items()},
+    )
+
+
+def _nodes(character: Character, names: Mapping[str, str] | None) -> dict[str, int]:
+    """Segment -> node of a character that stands, its left to the left; the thorax carries arms and head."""
+    there = np.flatnonzero(character.joints)
+    told = {segment: character.names[node] for segment, node in character.told.items()}
+    found = joint_map([character.names[n] for n in there], {**told, **(names or {})}, source=str(character.path))
+    nodes = {segment: int(there[i]) for segment, i in found.items()}
+    carrier = _common(character, [nodes["upperarm_l"], nodes["upperarm_r"], nodes["head"]])
+    if carrier != nodes["pelvis"] and "thorax" not in (names or {}):
+        nodes = {segment: node for segment, node in nodes.items() if node != carrier} | {"thorax": carrier}
+    x, path = character.positions, character.path
+    height = x[nodes["head"], 1] - 0.5 * (x[nodes["foot_l"], 1] + x[nodes["foot_r"], 1])
+    if height < 0.5 * np.ptp(x[list(nodes.values()), 1]) or height <= 0:
+        raise ExportError("the character does not stand upright at rest", file=path, remedy="Save it in a T or A pose.")
+    forward = _standing(character, nodes)[:, 0]
+    toes = [(x[nodes[f"toes_{s}"]] - x[nodes[f"foot_{s}"]]) @ forward for s in "lr" if f"toes_{s}" in nodes]
+    if toes and max(toes) < 0:
+        remedy = "Exchange them in the table of names."
+        raise ExportError("the toes point backwards: left and right are exchanged", file=path, remedy=remedy)
+    return nodes
+
+
+def _segments(body: Body) -> dict[str, int]:
+    """Segment as the humanoid's are called -> index in a body, by its own names or by those that it gives for BVH."""
+    usual = {name: segment for f in conventions() if f.name == "bvh" for segment, name in f.joints.items()}
+    own = body.tree.segments
+    out = {usual.get(body.alias("bvh", name), name): number for number, name in enumerate(own)}
+    out |= {name: number for number, name in enumerate(own)}
+    lost = [name for name in ("pelvis", *_BODY_NEEDED) if name not in out]
+    if lost:
+        remedy = "A character takes the motion of a body with arms and legs, such as the humanoid."
+        raise BodyError(f"body '{body.name}' has no {', '.join(lost)}", remedy=remedy)
+    return out
+
+
+def _standing(character: Character, nodes: Mapping[str, int]) -> NDArray:
+    """(3, 3) columns forward, up and right of the character at rest."""
+    across = character.positions[nodes["thigh_r"]] - character.positions[nodes["thigh_l"]]
+    right = _unit(across * (1.0, 0.0, 1.0))
+    return np.stack([np.cross(_UP, right), _UP, right], axis=1)
+
+
+def _axes(
+    character: Character, nodes: Mapping[str, int], body: Body, segments: Mapping[str, int], used: Mapping[str, int]
+) -> dict[str, NDArray]:
+    """Segment -> C (3, 3), the axes of the body's segment in the character's world at rest."""
+    x, stand = character.positions, _standing(character, nodes)
+    forward, out = stand[:, 0], {}
+    for segment in used:
+        bone, _, side = segment.rpartition("_")
+        if bone == "foot" and f"toes_{side}" in nodes and f"toes_{side}" in segments:
+            mine = (x[nodes[f"toes_{side}"]] - x[nodes[segment]]) * (1.0, 0.0, 1.0)
+            own = body.tree.offsets[segments[f"toes_{side}"]] * (1.0, 0.0, 1.0)
+            out[segment] = _frame(_UP, mine) @ _frame(_UP, own).T
+        elif bone == "toes" and f"foot_{side}" in out:
+            out[segment] = out[f"foot_{side}"]
+        elif bone in _FAR or bone == "hand":
+            far = _FAR.get(bone)
+            mine = x[nodes[f"{far}_{side}"]] - x[nodes[segment]] if far else _hand(character, nodes, side)
+            number = segments.get(f"{far}_{side}")
+            own = np.array([0.0, -1.0, 0.0]) if number is None else body.tree.offsets[number]
+            front, own_front = forward if abs(_unit(mine) @ forward) < _ALONG else _UP, np.array([1.0, 0.0, 0.0])
+            if bone in ("forearm", "hand"):  # thumbs are in front in T and A, outside where palms face forward
+                front, own_front = _thumb(character, nodes, side, front), np.array([0, 0, 1.0 if side == "r" else -1.0])
+            out[segment] = _frame(mine, front) @ _frame(own, own_front).T
+        else:
+            out[segment] = stand
+    return out
+
+
+def _hand(character: Character, nodes: Mapping[str, int], side: str) -> NDArray:
+    """Direction of a hand at rest: to its fingers, or as the forearm where it has none."""
+    x, hand = character.positions, nodes[f"hand_{side}"]
+    fingers = np.flatnonzero(character.parents == hand)
+    along = x[hand] - x[nodes[f"forearm_{side}"]]
+    to = x[fingers].mean(axis=0) - x[hand] if len(fingers) else along
+    return to if _unit(to) @ _unit(along) > 0.5 else along
+
+
+def _thumb(character: Character, nodes: Mapping[str, int], side: str, front: NDArray) -> NDArray:
+    """Direction towards the thumb at rest: from the little to the index finger where they are named, else the front."""
+    x, below = character.positions, _below(character, nodes[f"hand_{side}"])
+    ends = []
+    for word in ("index", "pinky|little"):
+        found = [n for n in below if any(w in character.names[n].lower() for w in word.split("|"))]
+        ends += [x[found[0]]] if found else []
+    return ends[0] - ends[1] if len(ends) == 2 and np.linalg.norm(ends[0] - ends[1]) > 1e-4 else front
+
+
+def _between(
+    character: Character, nodes: Mapping[str, int], used: Mapping[str, int], turns: dict[int, NDArray]
+) -> None:
+    """Give joints of spine and neck between two that turn a share of the turn, each an equal one."""
+    trunk = [used[segment] for segment in ("pelvis", "abdomen", "thorax", "head") if segment in used]
+    for low, high in pairwise(trunk):
+        chain, node = [], int(character.parents[high])
+        while node >= 0 and node != low:
+            chain.append(node)
+            node = int(character.parents[node])
+        if node == low and not set(chain) & set(turns):
+            step = se3.log_so3(turns[high] @ turns[low].swapaxes(-1, -2))
+            for k, joint in enumerate(reversed(chain), 1):
+                turns[joint] = se3.exp_so3(step * (k / (len(chain) + 1))) @ turns[low]
+
+
+def _root(
+    motion: Motion, poses: NDArray, segments: Mapping[str, int], character: Character, nodes: Mapping[str, int],
+    D: NDArray, places: NDArray,
+) -> NDArray:  # fmt: skip
+    """(F, 3) [m] shift of a character whose mover rests: its feet go the way of the body's, longer by its legs."""
+    tree, x, points = motion.body.tree, character.positions, motion.body.landmarks
+    feet, own_low, own, mine = [], [], 0.0, 0.0
+    ends = motion.body.segment_ends()
+    for side in "lr":
+        leg = x[[nodes[f"{bone}_{side}"] for bone in ("thigh", "shank", "foot")]]
+        mine += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
+        shank, foot = segments[f"shank_{side}"], segments.get(f"foot_{side}")
+        ankle = tree.offsets[foot] if foot is not None else ends[shank]
+        own += float(np.linalg.norm(tree.offsets[shank]) + np.linalg.norm(ankle))
+        feet.append(se3.apply(poses[:, shank], ankle))
+        parts = [segments[name] for name in (f"foot_{side}", f"toes_{side}") if name in segments]
+        sole = points.select(tuple(name for name, s in zip(points.names, points.segments) if s in parts))
+        heights = motion.positions(sole)[..., 1] if len(sole) else feet[-1][:, None, 1]
+        own_low.append(heights.min(axis=1))
+    scale = mine / own
+    low = np.min(own_low, axis=0)
+    ground = float(np.percentile(low, _LOWEST))
+    weight = 1.0 / (1.0 + np.exp(np.clip((own_low[0] - own_low[1]) / _STANCE, -50, 50)))[:, None]  # of the left foot
+    target = scale * (weight * feet[0] + (1 - weight) * feet[1])
+    there = weight * places[:, nodes["foot_l"]] + (1 - weight) * places[:, nodes["foot_r"]]
+    shift = target - there
+    shift[:, 1] = ground + scale * (low - ground) - _lowest(character, nodes, D, places)
+    return shift
+
+
+def _lowest(character: Character, nodes: Mapping[str, int], D: NDArray, places: NDArray) -> NDArray:
+    """(F,) [m] height of the lowest point of the soles; without a mesh, of the joints of the feet."""
+    out = []
+    for side in "lr":
+        below = _below(character, nodes[f"foot_{side}"])
+        floor = character.positions[below, 1].min()
+        for node in below:
+            points = character.points[character.owners == node]
+            if not len(character.points):  # below each joint, at the height of the lowest
+                points = character.positions[[node]] * (1.0, 0.0, 1.0) + (0.0, floor, 0.0)
+            if len(points):
+                away = _hull(points) - character.positions[node]
+                out.append((places[:, node, 1, None] + D[:, node, 1] @ away.T).min(axis=1))
+    return np.min(out, axis=0)
+
+
+def _hull(points: NDArray) -> NDArray:
+    """The points that are farthest in some of many directions: those that may touch the ground."""
+    golden = np.arange(256) * np.pi * (3.0 - np.sqrt(5.0))
+    height = 1.0 - 2.0 * (np.arange(256) + 0.5) / 256
+    around = np.sqrt(1.0 - height**2)
+    directions = np.stack([around * np.cos(golden), height, around * np.sin(golden)])
+    return points[np.unique(np.argmax(points @ directions, axis=0))]
+
+
+def _below(character: Character, node: int) -> NDArray:
+    """A node and all below it, parents first."""
+    inside = np.zeros(len(character.names), bool)
+    inside[node] = True
+    for other in character.order:
+        inside[other] |= character.parents[other] >= 0 and inside[character.parents[other]]
+    return character.order[inside[character.order]]
+
+
+def _common(character: Character, nodes: list[int]) -> int:
+    """The lowest node above all of some, or one of them that is above the others."""
+    paths = []
+    for node in nodes:
+        path = [node]
+        while character.parents[path[-1]] >= 0:
+            path.append(int(character.parents[path[-1]]))
+        paths.append(path)
+    shared = [node for node in paths[0] if all(node in path for path in paths[1:])]
+    if not shared:
+        raise FileError("its joints hang on different roots", file=character.path, remedy="Join them under one node.")
+    return shared[0]
+
+
+def _frame(along: NDArray, beside: NDArray) -> NDArray:
+    """(3, 3) columns: the first direction, the second at right angles to it, their cross product."""
+    first = _unit(along)
+    second = _unit(beside - (first @ beside) * first)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+def _unit(vector: NDArray) -> NDArray:
+    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))

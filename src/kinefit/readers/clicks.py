@@ -1,0 +1,87 @@
+"""Joints that somebody clicked in the images of one time, as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError
+
+_FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}.'
+
+
+@dataclass(frozen=True)
+class Clicks:
+    """Clicked points of one step.
+
+    Parameters
+    ----------
+    step : int, of the take's common time
+    points : {camera: {landmark: (u, v)}} [px] of the camera's own image
+    """
+
+    step: int
+    points: Mapping[str, Mapping[str, tuple[float, float]]]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Landmarks that were clicked in two images or more, in the order of the first clicks."""
+        every = [name for points in self.points.values() for name in points]
+        return tuple(name for name in dict.fromkeys(every) if every.count(name) > 1)
+
+    def places(self, camera: str) -> NDArray:
+        """(N, 2) [px] of `names` in a camera's image; NaN where not clicked."""
+        told = self.points.get(camera, {})
+        return np.array([told.get(name, (np.nan, np.nan)) for name in self.names], float).reshape(-1, 2)
+
+    def text(self) -> str:
+        """As JSON."""
+        told = {"step": self.step, "points": {c: {n: list(p) for n, p in of.items()} for c, of in self.points.items()}}
+        return json.dumps(told, indent=1) + "\n"
+
+
+def read_clicks(path: str | PathLike[str]) -> Clicks:
+    """Clicked points from a JSON file.
+
+    Raises
+    ------
+    FileError
+        Not readable, not JSON, or of another form.
+    """
+    try:
+        told = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy=_FORM) from error
+    except ValueError as error:
+        raise FileError(f"is no JSON ({error})", file=path, remedy=_FORM) from error
+    try:
+        return clicks_of(told)
+    except FileError as error:
+        raise FileError(error.problem, file=path, place=error.place, remedy=error.remedy) from error
+
+
+def clicks_of(told: Any) -> Clicks:
+    """Clicked points of a JSON value; FileError where it has another form."""
+    if not isinstance(told, dict) or not isinstance(told.get("points"), dict):
+        raise FileError("holds no points", remedy=_FORM)
+    step = told.get("step", 0)
+    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+        raise FileError(f"step {step!r} is no number of a frame", remedy=_FORM)
+    points: dict[str, dict[str, tuple[float, float]]] = {}
+    for camera, of in told["points"].items():
+        if not isinstance(of, dict):
+            raise FileError("holds no points", place=f"camera {camera}", remedy=_FORM)
+        points[camera] = {}
+        for name, place in of.items():
+            numbers = isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)
+            if not numbers or not np.isfinite(place).all():
+                raise FileError(f"{place!r} is no pixel", place=f"camera {camera}, {name}", remedy=_FORM)
+            points[camera][name] = (float(place[0]), float(place[1]))
+    return Clicks(step, points)

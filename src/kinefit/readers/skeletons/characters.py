@@ -1,0 +1,213 @@
+"""Characters of animation programs: a skeleton at rest, with what is needed to put a motion onto it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._files import parse_toml
+from kinefit.bodies.joint_names import FAMILIES, MORE, SEGMENTS
+from kinefit.errors import FileError, choices
+from kinefit.motion import rotation_between_up
+from kinefit.readers.skeletons.bvh import read_bvh
+from kinefit.readers.skeletons.gltf import Gltf, read_gltf
+
+KINDS = {".glb": "glb", ".vrm": "glb", ".gltf": "glb", ".bvh": "bvh"}
+"""What characters are read from, and in which format a motion on them is written."""
+
+_UNEVEN = 1e-3  # of the scales along the axes: less is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A skeleton at rest, its world y up.
+
+    Parameters
+    ----------
+    path : Path
+    names : (J,) of the nodes.
+    parents : (J,) int, -1 for none.
+    order : (J,) int, parents before their children.
+    positions : (J, 3) [m]
+    rotations : (J, 3, 3) of their frames, without scale; mirrored where the file mirrors.
+    scales : (J,) factor of lengths in each node.
+    world : (3, 3) rotation that takes the file's world to one with y up.
+    joints : (J,) bool, nodes whose names count: those of the skin, where there is one.
+    told : segment -> index, joints that the file itself names (VRM).
+    points, owners : (P, 3) [m], (P,) int
+        Vertices of the mesh at rest, each with the node that moves it most; none where there is no mesh.
+    unit : float, metres of the file's unit.
+    gltf, text : what the file holds, one of the two.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    parents: NDArray
+    order: NDArray
+    positions: NDArray
+    rotations: NDArray
+    scales: NDArray
+    world: NDArray
+    joints: NDArray
+    told: Mapping[str, int]
+    points: NDArray
+    owners: NDArray
+    unit: float = 1.0
+    gltf: Gltf | None = None
+    text: str = ""
+
+    def in_parent(self, node: int, places: NDArray) -> NDArray:
+        """Places (F, 3) [m] in the world in the frame and the unit of a node's parent, which rests."""
+        parent = int(self.parents[node])
+        if parent < 0:
+            return np.asarray(places @ self.world / self.unit)
+        away = (places - self.positions[parent]) @ self.rotations[parent]
+        return np.asarray(away / (self.scales[parent] * self.unit))
+
+
+def read_character(path: str | PathLike[str]) -> Character:
+    """A character from a GLB, VRM, glTF or BVH file, in the pose in which its nodes stand there.
+
+    Of BVH that is the pose of all angles zero, or where that is not upright the first frame.
+
+    Raises
+    ------
+    FileError
+        Not of these, not readable, without nodes, or unevenly scaled.
+    """
+    path = Path(path)
+    kind = KINDS.get(path.suffix.lower())
+    if kind is None:
+        remedy = f"Give a character as {', '.join(KINDS)}; FBX becomes GLB in Blender."
+        raise FileError(f"'{path.suffix}' is no format of characters", file=path, remedy=remedy)
+    return _from_gltf(path) if kind == "glb" else _from_bvh(path)
+
+
+def read_names(path: str | PathLike[str]) -> dict[str, str]:
+    """A table of names: TOML of lines `segment = "joint"`.
+
+    Returns
+    -------
+    segment (of `SEGMENTS`, or of `MORE`) -> name of a joint
+
+    Raises
+    ------
+    FileError
+        Not TOML, an unknown segment, or a name that is no text.
+    """
+    try:
+        table = parse_toml(Path(path).read_text(encoding="utf-8-sig"), path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
+    for segment, name in table.items():
+        if segment not in SEGMENTS and segment not in MORE:
+            remedy = 'A line is: thigh_l = "LeftUpLeg".'
+            raise FileError(choices("segment", segment, SEGMENTS), file=path, remedy=remedy)
+        if not isinstance(name, str):
+            raise FileError("is no name of a joint", file=path, place=segment, remedy="Write it in quotes.")
+    return dict(table)
+
+
+def _order(parents: NDArray, path: Path) -> NDArray:
+    """Parents before their children."""
+    out = [int(node) for node in np.flatnonzero(parents < 0)]
+    for node in out:
+        out += [int(child) for child in np.flatnonzero(parents == node)]
+    if len(out) != len(parents):
+        raise FileError("its nodes form a circle", file=path)
+    return np.array(out, int)
+
+
+def _from_gltf(path: Path) -> Character:
+    gltf = read_gltf(path)
+    parents = gltf.parents()
+    if not len(parents):
+        raise FileError("holds no nodes", file=path, remedy="Export the character with its skeleton.")
+    try:
+        return _of_gltf(gltf, parents, _order(parents, path), path)
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        problem = f"is no whole glTF file ({type(error).__name__}: {error})"
+        raise FileError(problem, file=path, remedy="Export the character again, as GLB.") from error
+
+
+def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Character:
+    Ms = np.array([gltf.local(node) for node in range(len(parents))])
+    for node in order:
+        if parents[node] >= 0:
+            Ms[node] = Ms[parents[node]] @ Ms[node]
+    names = tuple(node.get("name", f"node {n}") for n, node in enumerate(gltf.json["nodes"]))
+    in_skin = np.zeros(len(parents), bool)
+    for skin in gltf.json.get("skins", []):
+        in_skin[skin["joints"]] = True
+    joints = in_skin if in_skin.any() else np.ones(len(parents), bool)
+    sizes = np.linalg.norm(Ms[:, :3, :3], axis=1)
+    scales = sizes.mean(axis=1)
+    for node in np.flatnonzero(joints):
+        R = Ms[node, :3, :3] / max(scales[node], 1e-12)
+        if not np.allclose(R.T @ R, np.eye(3), atol=_UNEVEN):
+            remedy = "Apply the scale in the program that it comes from (Blender: Ctrl-A, Scale)."
+            raise FileError("is scaled unevenly", file=path, place=f"node '{names[node]}'", remedy=remedy)
+    points, owners = _vertices(gltf, Ms)
+    rotations = Ms[:, :3, :3] / np.maximum(scales, 1e-12)[:, None, None]
+    return Character(
+        path, names, parents, order, Ms[:, :3, 3], rotations, scales, np.eye(3), joints, _told(gltf.json), points,
+        owners, gltf=gltf,
+    )  # fmt: skip
+
+
+def _vertices(gltf: Gltf, Ms: NDArray) -> tuple[NDArray, NDArray]:
+    """Vertices (P, 3) of all skinned meshes at rest, and the node (P,) that moves each most."""
+    points, owners = [np.zeros((0, 3))], [np.zeros(0, int)]
+    for node in gltf.json["nodes"]:
+        if "mesh" not in node or "skin" not in node:
+            continue
+        skin = gltf.json["skins"][node["skin"]]
+        joints = np.array(skin["joints"])
+        inverse = gltf.array(skin["inverseBindMatrices"]) if "inverseBindMatrices" in skin else None
+        moves = Ms[joints] if inverse is None else Ms[joints] @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)
+        for primitive in gltf.json["meshes"][node["mesh"]]["primitives"]:
+            has = primitive["attributes"]
+            if not {"POSITION", "JOINTS_0", "WEIGHTS_0"} <= set(has):
+                continue
+            x, which, weights = (gltf.array(has[name]) for name in ("POSITION", "JOINTS_0", "WEIGHTS_0"))
+            if x is None or which is None or weights is None:
+                continue
+            which = which.astype(int)
+            placed = np.einsum("vkij,vj->vki", moves[which][..., :3, :3], x) + moves[which][..., :3, 3]
+            points.append(np.einsum("vk,vki->vi", weights, placed))
+            owners.append(joints[which[np.arange(len(x)), np.argmax(weights, axis=1)]])
+    return np.concatenate(points), np.concatenate(owners)
+
+
+def _told(file: Mapping[str, Any]) -> dict[str, int]:
+    """Joints that a VRM file tells, of both of its versions."""
+    more = file.get("extensions", {})
+    new = more.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
+    old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
+    bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
+    joints = next(family for family in FAMILIES if family.name == "VRM, Unity").joints
+    return {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
+
+
+def _from_bvh(path: Path) -> Character:
+    skeleton = read_bvh(path)
+    parents, R = np.array(skeleton.parents), rotation_between_up(skeleton.up, "y")
+    rest = np.array(skeleton.offsets)
+    for joint, parent in enumerate(parents):
+        rest[joint] += rest[parent] if parent >= 0 else 0.0
+    rotations = np.tile(np.eye(3), (len(parents), 1, 1))
+    if np.ptp(rest @ R[1]) < 0.6 * np.ptp(skeleton.positions[0] @ R[1]):  # lies, or its bones lie along one axis
+        rest, rotations = skeleton.positions[0], skeleton.Ts_world_joint[0, :, :3, :3]
+    unit = re.search(r"\(unit (\S+) m\)$", skeleton.source)
+    return Character(
+        path, skeleton.names, parents, np.arange(len(parents)), rest @ R.T, R @ rotations, np.ones(len(parents)), R,
+        np.ones(len(parents), bool), {}, np.zeros((0, 3)), np.zeros(0, int), unit=float(unit[1]) if unit else 1.0,
+        text=path.read_text(encoding="utf-8-sig", errors="replace"),
+    )  # fmt: skip

@@ -1,0 +1,143 @@
+"""glTF 2.0 as it stands in a file: its JSON, its one binary buffer, and arrays of it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError
+from kinefit.geometry import se3
+
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_IMAGES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+_AGAIN = "Export the character again, as GLB."
+
+
+@dataclass(frozen=True, eq=False)
+class Gltf:
+    """A glTF file.
+
+    Parameters
+    ----------
+    json : dict, as the file has it, of one buffer without URI and images inside.
+    binary : bytes of that buffer.
+    """
+
+    json: dict[str, Any]
+    binary: bytes
+
+    def array(self, number: int) -> NDArray | None:
+        """(N, width) values of an accessor, normalised ones as fractions; None of a compressed or sparse one."""
+        accessor = self.json["accessors"][number]
+        if "bufferView" not in accessor or "sparse" in accessor:
+            return None
+        view = self.json["bufferViews"][accessor["bufferView"]]
+        kind, width = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        step = view.get("byteStride", kind.itemsize * width)
+        shape, strides = (accessor["count"], width), (step, kind.itemsize)
+        out = np.ndarray(shape, kind, self.binary, start, strides).astype(float)
+        return out / np.iinfo(kind).max if accessor.get("normalized") and kind.kind in "iu" else out
+
+    def parents(self) -> NDArray:
+        """(N,) int, parent of every node, -1 for none."""
+        out = np.full(len(self.json.get("nodes", [])), -1)
+        for number, node in enumerate(self.json.get("nodes", [])):
+            out[node.get("children", [])] = number
+        return out
+
+    def local(self, node: int) -> NDArray:
+        """(4, 4) pose of a node in its parent, with its scale."""
+        told = self.json["nodes"][node]
+        if "matrix" in told:
+            return np.reshape(np.array(told["matrix"], float), (4, 4)).T
+        x, y, z, w = told.get("rotation", (0, 0, 0, 1))
+        R = se3.rotation_from_quaternion(np.array([w, x, y, z], float))
+        return se3.transform(R * np.array(told.get("scale", (1, 1, 1)), float), told.get("translation", (0, 0, 0)))
+
+
+def read_gltf(path: str | PathLike[str]) -> Gltf:
+    """Read a GLB (also VRM) or glTF file; other buffers and images that it names are taken in.
+
+    Raises
+    ------
+    FileError
+        Missing, truncated, not glTF 2.0, or a file that it names is missing.
+    """
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+        told, binary = _chunks(content) if content[:4] == b"glTF" else (json.loads(content), b"")
+        if not str(told["asset"]["version"]).startswith("2."):
+            raise FileError(f"is glTF {told['asset']['version']}, not 2.0", file=path, remedy=_AGAIN)
+        return _in_one(told, binary, path)
+    except OSError as error:
+        name = error.filename or path
+        raise FileError(f"cannot be read ({error.strerror})", file=name, remedy="Give a GLB or glTF file.") from error
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+        problem = f"is no whole glTF file ({type(error).__name__}: {error})"
+        raise FileError(problem, file=path, remedy=_AGAIN) from error
+
+
+def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk of a GLB."""
+    _, version, total, length, kind = struct.unpack("<4sIII4s", content[:20])
+    if version != 2 or total > len(content) or kind != b"JSON":
+        raise ValueError("version, length or first chunk")
+    told, rest = json.loads(content[20 : 20 + length]), content[20 + length : total]
+    size, kind = struct.unpack("<I4s", rest[:8]) if len(rest) >= 8 else (0, b"BIN\0")
+    if kind != b"BIN\0" or len(rest) < size:
+        raise ValueError("binary chunk")
+    return told, rest[8 : 8 + size]
+
+
+def _in_one(told: dict[str, Any], binary: bytes, path: Path) -> Gltf:
+    """All buffers in one, the first one first, and images inside."""
+    data, starts = bytearray(), []
+    for buffer in told.get("buffers", []):
+        starts.append(_aligned(data))
+        data += (_content(buffer["uri"], path) if "uri" in buffer else binary)[: buffer["byteLength"]]
+    for view in told.get("bufferViews", []):
+        start = starts[view["buffer"]]
+        if start:
+            view["byteOffset"] = view.get("byteOffset", 0) + start
+        view["buffer"] = 0
+        if view.get("byteOffset", 0) + view["byteLength"] > len(data):
+            raise ValueError("a buffer is shorter than it should be")
+    for image in told.get("images", []):
+        if "uri" in image:
+            uri = image.pop("uri")
+            image.setdefault("mimeType", _image_type(uri))
+            start, content = _aligned(data), _content(uri, path)
+            data += content
+            image["bufferView"] = len(told.setdefault("bufferViews", []))
+            told["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": len(content)})
+    told["buffers"] = [{**(told.get("buffers") or [{}])[0], "byteLength": len(data)}]
+    told["buffers"][0].pop("uri", None)
+    return Gltf(told, bytes(data))
+
+
+def _aligned(data: bytearray) -> int:
+    """Where the next piece begins: at a multiple of four."""
+    data += bytes(-len(data) % 4)
+    return len(data)
+
+
+def _content(uri: str, path: Path) -> bytes:
+    if uri.startswith("data:"):
+        return base64.b64decode(uri.partition(",")[2])
+    return (path.parent / unquote(uri)).read_bytes()
+
+
+def _image_type(uri: str) -> str:
+    return uri[5:].partition(";")[0] if uri.startswith("data:") else _IMAGES.get(Path(uri).suffix.lower(), "image/png")
