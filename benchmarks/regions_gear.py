@@ -57,8 +57,8 @@ def run() -> None:
     """Print the figures, and draw curves and pictures; the quick form is a fifth of a second of the cyclist alone."""
     for name, make in MAKERS.items():
         if quick() and name == "snowboarder":
-            for figures in ("joints", "tracked", "hidden_leg", "boot"):
-                figure(f"{name}_regions_{figures}", None, "", "<= 0", LEFT_OUT)
+            for part, goal in (("joints", "<= 20"), ("tracked", ">= 100"), ("hidden_leg", "<= 0.5"), ("boot", "<= 2")):
+                figure(f"{name}_regions_{part}", None, "", goal, LEFT_OUT)
             continue
         whole = [followed(make(seed)) for seed in amount(SEEDS[name], SEEDS[name][:1])]
         hidden = [followed(make(seed, cover=True)) for seed in amount(SEEDS[name], ())]
