@@ -29,7 +29,10 @@ def run() -> None:
     count = int(os.environ.get("KINEFIT_FUZZ") or amount(10_000, 40))
     chosen = os.environ.get("KINEFIT_FUZZ_READERS")
     totals: Counter[str] = Counter()
-    for name in chosen.split(",") if chosen else READERS:
+    names = [name.strip() for name in chosen.split(",")] if chosen else list(READERS)
+    if unknown := set(names) - set(READERS):
+        raise SystemExit(f"no reader {', '.join(sorted(unknown))}; there are: {', '.join(READERS)}")
+    for name in names:
         found = fuzz(name, count)
         totals += found
         told = ", ".join(f"{kind} {found[kind]}" for kind in ("read", "typed", *FAULTS) if found[kind])

@@ -18,6 +18,7 @@ from benchmarks.figures import amount, figure
 from benchmarks.surface_body import OFF, moving_arm
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import Metaballs, nearest
+from kinefit.bodies.surfaces.spline_skin import chain_skin, chains
 from kinefit.correspondences import surface_rows
 from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
@@ -59,6 +60,24 @@ def run() -> None:
         figure(f"metaballs_angles_arm_{name}", float(np.sqrt(np.mean(of_angle[:4] ** 2))), "deg RMS", "<= 2")
         figure(f"metaballs_angles_hand_{name}", float(np.sqrt(np.mean(of_angle[4:] ** 2))), "deg RMS", "<= 2")
     _time()
+    _skin()
+
+
+def _skin() -> None:
+    """The seamless skin of arms: how far vertices are from where the balls' fields end, and edges without a twin."""
+    off, open_edges = [], 0
+    for seed in range(20, 20 + amount(4, 1)):
+        body = arm(seed, 1, 10)[0]
+        for limbs in chains(body):
+            x, faces, _ = chain_skin(body, limbs).patch.mesh()
+            told = [limb.derivatives(x - body.tree.rest[limb.segment]) for limb in limbs]
+            value = np.array([one.value for one in told])
+            slope = np.array([one.by_point for one in told])[np.argmax(value, axis=0), np.arange(len(x))]
+            off.append((value.max(axis=0) - 0.5) / np.linalg.norm(slope, axis=1))
+            edges = {tuple(edge) for i in range(3) for edge in faces[:, [i, (i + 1) % 3]].tolist()}
+            open_edges += sum((b, a) not in edges for a, b in edges)
+    figure("metaballs_skin_open_edges", open_edges, "edges", "== 0")
+    figure("metaballs_skin_off", 1e3 * float(np.sqrt(np.mean(np.concatenate(off) ** 2))), "mm RMS", "<= 1")
 
 
 def _told(radii: NDArray) -> str:

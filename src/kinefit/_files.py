@@ -6,6 +6,7 @@ import os
 import re
 import tomllib
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,6 +19,13 @@ _LARGEST = 4_000_000  # characters of a TOML file, which tomllib reads in about 
 _DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
 BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes, or single quotes."
 """What to do about C:\\Users in a TOML file."""
+
+
+def no_column(missing: Iterable[str], names: Iterable[str] | None) -> str:
+    """What to say of a table that lacks columns; `names` are those of its first line."""
+    told = f"no column {', '.join(missing)}"
+    other = next((mark for mark in (";", "\t") if any(mark in name for name in names or ())), None)
+    return told if other is None else f"{told}: its columns are separated by {other!r}, not by commas"
 
 
 def read_bytes(path: Path) -> bytes:
@@ -41,6 +49,7 @@ def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError
     `error`
         No TOML, with line and column; or tables so deep, keys or numbers so long that nobody wrote them.
     """
+    text = text.removeprefix("\ufeff")  # that some editors of Windows begin a file with
     if len(text) > _LARGEST:
         raise error(f"a TOML file of {len(text) / 1e6:.0f} MB", file=file, remedy="Is it another file?")
     if (dotted := _DOTTED.search(text)) is not None:  # tomllib's time grows with the square of their number

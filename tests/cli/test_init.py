@@ -179,3 +179,12 @@ def test_options_of_clicks_that_do_not_fit(folder, tmp_path):
         assert answer.exit_code == 2 and problem in answer.stderr
     answer = run("init", folder, "--points", tmp_path / "x.json")
     assert answer.exit_code == 2 and "cannot be read" in answer.stderr
+
+
+def test_a_surface_that_was_followed_is_entered(folder):
+    (folder / "surface").mkdir()
+    (folder / "surface" / "trajectories.csv").write_text(
+        "time_s,point,x,y,z,std_x,std_y,std_z\n0.0,1,0,0,0,0.001,0.001,0.001\n"
+    )
+    assert "surface/trajectories.csv" in run("init", folder).stdout
+    assert [entry.file.name for entry in read_take(folder / "take.toml").surface_points] == ["trajectories.csv"]

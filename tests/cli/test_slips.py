@@ -257,3 +257,12 @@ def test_units_and_axes_of_an_export_are_spelled_as_people_do(tmp_path):
 def test_static_points_are_looked_for_before_any_work(take):
     told = run("check", take, "--refine", "--points", "nothing.toml")
     assert told.exit_code == 2 and "no such file: nothing.toml" in told.stderr and not told.stdout
+
+
+def test_a_take_of_an_editor_of_windows_is_read(take):
+    text = take.read_text()
+    take.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert read_take(take).rate == 30.0
+    take.unlink()
+    take.with_name("monday.toml").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert read_take(take.parent).path.name == "monday.toml"

@@ -69,3 +69,14 @@ def test_colour_becomes_grey_and_what_is_no_image_is_refused():
     for wrong in (np.zeros((20, 20, 4)), np.zeros((5, 50)), np.zeros(9), np.full((20, 20), np.nan)):
         with pytest.raises(ObservationError):
             grey(wrong)
+
+
+def test_smoothing_comes_first_where_it_is_asked_for(image):
+    np.testing.assert_array_equal(SplineImage.of(image, smooth=0.0).grey, SplineImage.of(image).grey)
+    told = SplineImage.of(image, smooth=1.0)
+    weights = np.exp(-0.5 * np.arange(-2, 3) ** 2)
+    kernel = np.outer(weights, weights) / weights.sum() ** 2
+    window = SplineImage.of(image).grey[28:33, 38:43]
+    assert told.grey[30, 40] == pytest.approx((kernel * window).sum(), rel=1e-5)
+    with pytest.raises(ObservationError, match="smoothing of -1"):
+        SplineImage.of(image, smooth=-1.0)

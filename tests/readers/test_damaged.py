@@ -26,6 +26,7 @@ from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError,
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
+from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess.names import camera_number, natural
 from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
 from kinefit.readers.skeletons.asf import read_asf
@@ -290,3 +291,26 @@ def test_a_camera_of_five_thousand_digits_is_none_of_a_table(tmp_path):
     with pytest.raises(ObservationError, match="no camera in this table") as error:
         read_keypoints(path, format="caliscope", camera="cam" + "9" * 5000, rate=10.0)
     assert len(str(error.value).replace(str(tmp_path), "")) <= LONGEST
+
+
+def test_a_table_that_a_spreadsheet_wrote_is_read(tmp_path):
+    path = caliscope(tmp_path / "xy.csv", "0,0,0.0,3,5,6", "1,0,0.1,3,5,6")
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert set(read_caliscope_csv(path)) == {"cam_0"}
+    seed = seed_of("body skin", tmp_path)
+    (tmp_path / "skin.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "skin.csv").read_bytes())
+    assert seed.read().skin is not None
+
+
+@pytest.mark.parametrize("name", ["caliscope", "surface points", "bar"])
+def test_columns_that_semicolons_separate_are_told(tmp_path, name):
+    seed = seed_of(name, tmp_path)
+    seed.files[0].write_text(seed.files[0].read_text().replace(",", ";"))
+    with pytest.raises(KinefitError, match="separated by ';', not by commas"):
+        seed.read()
+
+
+def test_a_folder_of_photographs_is_no_depth(tmp_path):
+    (tmp_path / "0001.jpg").write_bytes(bytes(100))
+    with pytest.raises(FileError, match=r"\.jpg files hold colours"):
+        read_depth(tmp_path, rate=30.0)

@@ -108,7 +108,8 @@ def export(
     if table is not None:
         raise click.UsageError("--names-table names the joints of a --retarget CHARACTER.")
     if format is None:
-        raise click.UsageError("Missing option '--to' (or --retarget CHARACTER).")
+        told = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
+        raise click.UsageError(told)
     options = {
         key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None

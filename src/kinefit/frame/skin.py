@@ -120,9 +120,9 @@ def skin_of(
     left = H - H @ kept[..., :6]
     g = inverse @ kept[..., 6:]
     turned = np.zeros((S, 6))
-    for segment, turn_by in (pair for m in matched for pair in m.turns.items()):
-        if turn_by @ turn_by > turned[segment] @ turned[segment]:
-            turned[segment, 3:] = R[segment] @ turn_by
+    for s, by in (pair for m in matched for pair in m.turns.items()):
+        if by @ by > turned[s] @ turned[s]:
+            turned[s, 3:] = R[s] @ by
     return Skin(0.5 * (left + left.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
 
 

@@ -55,7 +55,7 @@ def clicked_points(rig: Rig, names: Sequence[str], uv: NDArray) -> NDArray:
     miss, px = _missed(rig, x, uv)
     bad = np.flatnonzero(np.nanmax(np.where(np.isfinite(miss), miss, 0.0), axis=1) > 0.5 * _BESIDE)
     told, blamed = [], list[tuple[int, float]]()
-    for n in bad:
+    for n in map(int, bad):
         seen = np.flatnonzero(np.isfinite(uv[n]).all(axis=1))
         off = {int(c): _without(rig, uv[n], int(c)) for c in seen} if len(seen) > 2 else {}
         agree = [c for c, (away, _, rest) in off.items() if rest < 0.5 * _BESIDE and away > _BESIDE]
@@ -126,9 +126,13 @@ def clicked_start(body: Body, names: Sequence[str], x_world: NDArray) -> tuple[B
     points = body.landmarks.select(tuple(names))
     fitted = body.scaled(first_scales(body, points, x_world[None]))
     points = fitted.landmarks.select(tuple(names))
-    given, known = {"sigma": _SIGMA, "fewest": _FEWEST, "robust": False}, np.isfinite(x_world).all(axis=1)
-    state, left = pose_from_points(fitted, points, x_world, **given)
+    known = np.isfinite(x_world).all(axis=1)
+
+    def posed(near: BodyState | None) -> tuple[BodyState, float]:
+        return pose_from_points(fitted, points, x_world, sigma=_SIGMA, near=near, fewest=_FEWEST, robust=False)
+
+    state, left = posed(None)
     for _ in range(0 if body.tree.root_free else _TURNS):  # a root that stays where it is put is put better
         T = se3.aligned(fitted.positions(state, points)[known], x_world[known]) @ state.T_world_root
-        state, left = pose_from_points(fitted, points, x_world, near=BodyState(T, state.angles), **given)
+        state, left = posed(BodyState(T, state.angles))
     return fitted, state, left

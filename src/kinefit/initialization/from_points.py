@@ -9,7 +9,7 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3
-from kinefit.losses import geman_mcclure
+from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.solvers.least_squares import levenberg_marquardt
 
@@ -92,8 +92,8 @@ def pose_from_points(
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 
-    `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and turned about its long axis; the
-    cheaper end wins. `near` is a start that is known to be close, and the only one then.
+    `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and
+    turned about its long axis; the cheaper end wins. `near` is a start that is known to be close, the only one then.
 
     Raises
     ------
@@ -114,8 +114,8 @@ def pose_from_points(
     fits = []
     for start in starts:
         rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state
-        loss = {"loss": geman_mcclure()} if robust else {}
-        fits.append(levenberg_marquardt(body, rough, rows, **loss, max_iterations=40, tolerance=1e-4))
+        loss = geman_mcclure() if robust else SQUARED
+        fits.append(levenberg_marquardt(body, rough, rows, loss=loss, max_iterations=40, tolerance=1e-4))
     best = min(fits, key=lambda fit: fit.equations.cost)
     left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
     return best.state, float(np.median(left))

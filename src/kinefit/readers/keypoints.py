@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_npy
+from kinefit._files import no_column, read_npy
 from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import MEDIAPIPE_33, Keypoints
@@ -185,11 +185,11 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     path, names = Path(path), KEYPOINT_SETS["MEDIAPIPE_33"]
     columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
                 needed = f"Needed: {', '.join(columns)}."
-                raise ObservationError(f"no column {', '.join(missing)}", file=path, remedy=needed)
+                raise ObservationError(no_column(missing, reader.fieldnames), file=path, remedy=needed)
             table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
     except FileNotFoundError as error:
         raise FileError("no such file", file=path, remedy="Check the path.") from error

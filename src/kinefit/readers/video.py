@@ -40,7 +40,7 @@ class Video:
         self.path = Path(path)
         pattern = "*" in self.path.name
         if not (pattern or self.path.exists()):
-            raise FileError("no such video", file=self.path, remedy="Check the path; relative paths start at the take.")
+            raise FileError("no such video", file=self.path, remedy="Check the path.")
         images = pattern or self.path.is_dir()
         self._source: VideoFile | ImageFolder = ImageFolder(self.path, rate) if images else VideoFile(self.path)
         self.size: tuple[int, int] = self._source.size

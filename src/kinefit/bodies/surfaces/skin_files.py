@@ -66,7 +66,7 @@ def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
         A file that cannot be read, a line that is not what it says, an unknown segment or vertex, a weight given twice.
     """
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, ValueError, csv.Error) as error:
         remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
         problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"

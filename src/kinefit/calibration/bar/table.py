@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import no_column
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.errors import CalibrationError, FileError
 
@@ -41,7 +42,7 @@ def read_centroids(
             reader = csv.DictReader(file)
             missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
             if missing:
-                problem = f"no column {', '.join(missing)}"
+                problem = no_column(missing, reader.fieldnames)
                 raise FileError(problem, file=path, remedy="Write camera,frame,u,v in its first line.")
             for line, row in enumerate(reader, 2):
                 try:

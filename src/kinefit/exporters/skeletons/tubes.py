@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
+from kinefit.bodies.surfaces import Metaballs
+from kinefit.bodies.surfaces.spline_skin import ChainSkin, chain_skin, chains
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
@@ -41,8 +43,13 @@ def side_colour(name: str) -> tuple[int, int, int]:
 
 
 def body_mesh(body: Body) -> SkinnedMesh:
-    """Tubes with rounded ends around all cylinders, meshes as they are; near a joint a tube follows both segments."""
-    parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in body.surfaces]
+    """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that follow each other.
+
+    Near a joint tubes and skins follow both segments.
+    """
+    others = [c for c in body.surfaces if not isinstance(c, Metaballs)]
+    parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
+    parts += [_skin(body, chain_skin(body, limbs)) for limbs in chains(body)]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))
         return SkinnedMesh(*(np.zeros((0, count), kind) for count, kind in columns))
@@ -76,6 +83,20 @@ def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
         triangles=mesh.faces,
         segments=np.full((count, 2), mesh.segment),
         weights=np.tile([1.0, 0.0], (count, 1)),
+    )
+
+
+def _skin(body: Body, skin: ChainSkin) -> SkinnedMesh:
+    vertices, faces, u = skin.patch.mesh()
+    segments, weights = skin.weights(u)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], np.cross(b - a, c - a))
+    colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
+    return SkinnedMesh(
+        vertices=vertices, normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30),
+        colours=colours[segments[:, 0]], triangles=faces, segments=segments, weights=weights,
     )
 
 

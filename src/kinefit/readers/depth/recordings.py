@@ -161,6 +161,9 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
         return picture_source(pictures)
     if pieces := _of_ending(files, clouds.ENDINGS):
         return _organised(pieces, name)
+    if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
+        problem = f"{colour[0].suffix} files hold colours, no depth"
+        raise FileError(problem, file=path, remedy=f"kinefit reads {FORMATS}.")
     return raw_source(files, size)
 
 

@@ -266,7 +266,7 @@ def _array_shape(path: Path) -> tuple[int, ...] | None:
 def _caliscope_frames(path: Path) -> int:
     """Frames of a table of caliscope that holds points of a body, not of a board; 0 for any other table."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             if not set(reader.fieldnames or ()) >= _CALISCOPE:
                 return 0

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit._files import no_column
 from kinefit.errors import FileError, ObservationError
 from kinefit.observations import SurfacePointVideo
 from kinefit.readers.take.file import Take
@@ -33,7 +34,7 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
             names = [name.strip() for name in next(table, [])]
             missing = [name for name in _COLUMNS if name not in names]
             if missing:
-                raise FileError(f"no column {', '.join(missing)}", file=path, remedy=_REMEDY)
+                raise FileError(no_column(missing, names), file=path, remedy=_REMEDY)
             at = [names.index(name) for name in _COLUMNS]
             for line, row in enumerate(table, 2):
                 try:
