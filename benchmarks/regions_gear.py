@@ -29,7 +29,7 @@ from kinefit.motion import Motion
 from kinefit.rendering import Canvas, render_body
 from kinefit.tracking.take import track_take
 
-SEEDS = {"cyclist": (11, 12), "snowboarder": (11,)}
+SEEDS = (11, 12)
 TRACKED = 50.0  # [mm] mean joint error of a frame up to which it counts as tracked
 THRESHOLDS = (5, 10, 15, 20, 30, 40, 60, 80)  # [grey levels] of a plain subtraction; the best of them is told
 MAKERS = {"cyclist": rendered_cyclist, "snowboarder": rendered_snowboarder}
@@ -60,8 +60,8 @@ def run() -> None:
             for part, goal in (("joints", "<= 20"), ("tracked", ">= 100"), ("hidden_leg", "<= 0.5"), ("boot", "<= 2")):
                 figure(f"{name}_regions_{part}", None, "", goal, LEFT_OUT)
             continue
-        whole = [followed(make(seed)) for seed in amount(SEEDS[name], SEEDS[name][:1])]
-        hidden = [followed(make(seed, cover=True)) for seed in amount(SEEDS[name], ())]
+        whole = [followed(make(seed)) for seed in amount(SEEDS, SEEDS[:1])]
+        hidden = [followed(make(seed, cover=True)) for seed in amount(SEEDS, ())]
         errors(name, whole, hidden)
         if name == "cyclist":
             pedals(whole, hidden)
