@@ -179,11 +179,11 @@ def from_drive(
     if leg:
         hidden[frames // 4 : 3 * frames // 4] = True
         seen = [_without(k, hidden) for k in seen]
-    recording = Recording.of_keypoints(_calibrated(rig, seed), seen, accuracy=noise, up="y")
+    recording = Recording.of_keypoints(calibrated(rig, seed), seen, accuracy=noise, up="y")
     return Take(motion, generic, recording, hidden)
 
 
-def _calibrated(rig: Rig, seed: int) -> Rig:
+def calibrated(rig: Rig, seed: int) -> Rig:
     """The cameras as a calibration has them, by what the tracker takes a calibration to be off."""
     std, random = TrackSettings().camera_std, np.random.default_rng(seed + 1000)
     if std is None:

@@ -9,6 +9,7 @@ PARTS = {
     "regions_body10": "a rendered body of ten parts in colour and depth",
     "regions_rendered": "rendered objects in the manner of RBOT: moving light, noise, an occluder, larger steps",
     "regions_people": "the balancing trial by colours alone, beside keypoints, and by the paper's own recipe",
+    "regions_gear": "a rendered cyclist in a lab and a snowboarder outdoors, with closures and without",
     "regions_speed": "time of a frame of a whole person",
 }
 

@@ -171,3 +171,17 @@ def test_forgetting_is_marginalising():
     assert not out[lost].any() and not out[:, lost].any()
     np.testing.assert_allclose(forgetting(information, np.zeros(N, bool)), information, rtol=1e-6, atol=1e-8)
     assert not forgetting(information, np.ones(N, bool)).any()
+
+
+def test_a_crank_goes_on_where_a_knee_fades():
+    """Of gear that closes a chain the speed lasts, of limbs it does not; without the closure neither does."""
+    body = load_body("cyclist")
+    names = ("crank_angle", "left_pedal_angle", "knee_angle_l", "arm_flex_r")
+    chosen = np.array([6 + body.tree.coordinates.index(name) for name in names])
+    for rider, lasts in ((body, [1.0, 1.0, np.exp(-1.0), np.exp(-1.0)]), (replace(body, closures=()), np.exp(-1.0))):
+        prediction = Prediction(rider, DT, angle_acceleration=1.0, root_acceleration=1.0, memory=0.1)
+        speed = np.zeros(body.tree.n_dofs)
+        speed[chosen] = 0.01
+        prediction.go_on(body.usual_state(), np.full(body.tree.n_dofs, 0.1), speed)
+        prediction.ahead(0.1 / DT)
+        np.testing.assert_allclose(prediction.velocity[chosen], 0.01 * np.array(lasts), rtol=1e-9)

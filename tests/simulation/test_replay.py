@@ -47,6 +47,8 @@ def test_a_film_shows_the_person_on_the_slope(motion, tmp_path):
     assert len(frames) == len(motion) and frames[0].shape == (240, 320, 3)
     middle = frames[4][80:160, 130:190].reshape(-1, 3).astype(int)
     assert np.mean(middle[:, 2] < 160) > 0.1  # darker than the sky
+    low = frames[4][-40:].reshape(-1, 3).astype(int)
+    assert np.mean(np.abs(low - (226, 232, 240)).max(axis=1) < 12) > 0.5  # snow below, in RGB
     with pytest.raises(ExportError, match=r"\.mp4"):
         film(motion, tmp_path / "ride.gif")
 

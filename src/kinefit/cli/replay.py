@@ -22,7 +22,7 @@ Examples:
 @click.option("--heading", type=float, default=0.0, show_default=True, help="[deg] of the fall line.")
 @click.option("--speed", type=float, default=4.0, show_default=True, help="[m/s] down the slope at first.")
 @click.option("--gain", type=float, default=0.0, show_default=True, help="[m/s²] by which it grows.")
-@click.option("--azimuth", type=float, default=60.0, show_default=True, help="[deg] of the camera from the fall line.")
+@click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] of the camera from the fall line.")
 @_screen.verbose_option
 def replay(
     source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float, verbose: bool

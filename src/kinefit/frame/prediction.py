@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import looped
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import inverse
 
@@ -26,7 +27,7 @@ class Prediction:
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         One standard deviation of the random acceleration that drives the motion.
     memory : float [s]
-        How long a velocity lasts that nothing confirms.
+        How long a velocity lasts that nothing confirms; of gear in a closed chain it lasts.
     """
 
     def __init__(
@@ -34,7 +35,8 @@ class Prediction:
     ) -> None:
         n = body.tree.n_dofs
         self._bounds = body.tree.lower, body.tree.upper
-        self._keep = float(np.exp(-dt / memory))
+        turns = np.concatenate([np.zeros(6, bool), looped(body) & ~np.isfinite(body.tree.spread)])
+        self._keep = np.where(turns, 1.0, np.exp(-dt / memory))  # a crank goes on, a knee turns back
         jolt = np.concatenate([np.full(3, root_acceleration), np.full(n - 3, angle_acceleration)]) * dt**2
         self._moves = (np.arange(n) >= 6) | body.tree.root_free
         jolt = jolt * self._moves
@@ -93,9 +95,9 @@ class Prediction:
         self._ahead = self.state
         whole = int(steps + 1e-6)
         for h in [1.0] * whole + [steps - whole] * (steps - whole > 1e-6):
-            keep = 1.0 if self._halted else self._keep**h
+            keep = np.ones(len(self._keep)) if self._halted else self._keep**h
             self._velocity = keep * self._velocity
-            vx, vv = keep * self._vx, keep**2 * self._vv
+            vx, vv = keep[:, None] * self._vx, keep[:, None] * self._vv * keep
             self._xx = self._xx + h * (vx + vx.T) + h**2 * vv + h**3 * self._noise[0]
             self._vx = vx + h * vv + h**2 * self._noise[1]
             self._vv = vv + h * self._noise[2]

@@ -27,7 +27,7 @@ _WORN = {
     "thigh": "trousers", "shank": "trousers", "pelvis": "trousers", "foot": "shoes", "toes": "shoes",
 }  # fmt: skip
 _NOTHING = (105, 120, 95)
-_CELL = 0.015  # [m] of the grain: a little more than a pixel at three metres, so that few samples alias
+GRAIN = 0.015  # [m] of the grain: a little more than a pixel at three metres, so that few samples alias
 _GRAINS = 64  # cells after which it repeats
 _CONTRAST = {"skin": 0.10}  # share of the colour, one standard deviation; cloth and walls have more
 _CLOTH = 0.25
@@ -124,8 +124,8 @@ def _shaded(scene: Scene, view: View) -> NDArray:
     light = 0.8 * up - 0.5 * view.camera.T_camera_world[2, :3] + 0.3 * view.camera.T_camera_world[0, :3]
     towards = np.clip(view.normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
     shade = (_LIGHT[0] + (_LIGHT[1] - _LIGHT[0]) * towards).astype(np.float32)[view.raster.face]
-    grain = 1.0 + contrast[label] * _grain(view.x_rest, label)
-    return np.clip(base[label] * (shade * grain)[..., None], 0.0, 255.0)
+    shade *= 1.0 + contrast[label] * grain(view.x_rest, label)
+    return np.clip(base[label] * shade[..., None], 0.0, 255.0)
 
 
 def _worn(segment: str) -> str:
@@ -134,7 +134,7 @@ def _worn(segment: str) -> str:
 
 
 @cache
-def _table() -> NDArray:
+def grain_table() -> NDArray:
     """(n, n, n) grain, periodic, mean 0 and deviation 1: three sizes of blobs, 1.5, 4 and 12 cm."""
     random = np.random.default_rng(20)
     waves = np.fft.fftfreq(_GRAINS)
@@ -147,8 +147,8 @@ def _table() -> NDArray:
     return ((out - out.mean()) / out.std()).astype(np.float32)
 
 
-def _grain(x: NDArray, label: NDArray) -> NDArray:
-    """(H, W) grain at places x (H, W, 3) [m]; every label has its own."""
-    cell = np.floor(x * (1.0 / _CELL)).astype(np.int64) + (label.astype(np.int64) * 17)[..., None]
+def grain(x: NDArray, label: NDArray) -> NDArray:
+    """(...) grain of mean 0 and deviation 1 at places x (..., 3) [m] of surfaces; every label (...) int has its own."""
+    cell = np.floor(x * (1.0 / GRAIN)).astype(np.int64) + (label.astype(np.int64) * 17)[..., None]
     i, j, k = np.moveaxis(cell % _GRAINS, -1, 0)
-    return _table()[i, j, k]
+    return grain_table()[i, j, k]

@@ -19,7 +19,7 @@ from kinefit.motion import UP_AXES, Motion
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.placing import look_at, places
 
-_SNOW, _SKY = (245, 240, 235), (225, 190, 150)  # BGR
+_SNOW, _TRACKS, _SKY = (240, 232, 226), (214, 202, 192), (225, 190, 150)  # BGR: the slope, its grid, the sky
 _GRID, _FAR = 1.0, 30  # [m] between the lines of a slope, and how many of them to either side
 _BEHIND = 0.3  # [m] before a camera, nearer than which no line is drawn
 
@@ -78,7 +78,7 @@ def _turned(std: NDArray, R: NDArray) -> NDArray:
 
 
 def film(
-    motion: Motion, path: str | os.PathLike[str], *, slope: float = 30.0, heading: float = 0.0, azimuth: float = 60.0,
+    motion: Motion, path: str | os.PathLike[str], *, slope: float = 30.0, heading: float = 0.0, azimuth: float = 100.0,
     size: tuple[int, int] = (960, 720),
 ) -> None:  # fmt: skip
     """Write a video (.mp4) of a motion that `replayed` gave, on its slope, by a camera that pans with it.
@@ -97,14 +97,14 @@ def film(
     target = Path(path)
     if target.suffix.lower() != ".mp4":
         raise ExportError("a video is an .mp4 file", file=path, remedy=f"Call it {target.stem}.mp4.")
-    lines = _lines(motion, slope, heading)
+    lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
     try:
         with av.open(str(target), "w") as container:
             stream = container.add_stream(codec, rate=Fraction(motion.rate).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             for frame, camera in enumerate(_cameras(motion, heading, azimuth, size)):
-                image = draw_figure(motion, frame, camera, _backdrop(camera, lines))
+                image = draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up))
                 container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
             container.mux(stream.encode())
     except OSError as error:
@@ -141,9 +141,11 @@ def _lines(motion: Motion, slope: float, heading: float) -> NDArray:
     return np.array([*along, *((at + r * down - _FAR * across, at + r * down + _FAR * across) for r in rungs)])
 
 
-def _backdrop(camera: Camera, lines: NDArray) -> NDArray:
-    """The slope's grid before the sky."""
-    image = np.full((camera.size[1], camera.size[0], 3), _SKY, np.uint8)
+def _backdrop(camera: Camera, lines: NDArray, normal: NDArray) -> NDArray:
+    """The slope, upwards of which its normal (3,) points, with its grid before the sky."""
+    horizon = np.linalg.inv(camera.matrix).T @ camera.T_camera_world[:3, :3] @ normal  # rays below it meet the slope
+    u, v = np.meshgrid(np.arange(camera.size[0]), np.arange(camera.size[1]))
+    image = np.full((camera.size[1], camera.size[0], 3), _SNOW, np.uint8)
     ends = lines @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     for a, b in ends:
         if min(a[2], b[2]) < _BEHIND:
@@ -154,5 +156,6 @@ def _backdrop(camera: Camera, lines: NDArray) -> NDArray:
             a, b = far, near
         p, q = (camera.matrix @ v for v in (a, b))
         start, end = (np.clip(np.round(v[:2] / v[2]), -20000, 20000).astype(int).tolist() for v in (p, q))
-        cv2.line(image, start, end, _SNOW, 1, cv2.LINE_AA)
+        cv2.line(image, start, end, _TRACKS, 1, cv2.LINE_AA)
+    image[horizon[0] * u + horizon[1] * v + horizon[2] >= 0.0] = _SKY
     return image
