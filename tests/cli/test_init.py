@@ -3,8 +3,10 @@
 import json
 import threading
 import urllib.request
+from dataclasses import replace
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -12,6 +14,7 @@ from click.testing import CliRunner
 import kinefit.cli
 from kinefit.bodies import load_body
 from kinefit.cli import main
+from kinefit.errors import TakeError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
@@ -170,6 +173,23 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
     assert "Camera cam03 is off in" in seen["answers"][0]["told"]
     assert read_take(folder / "take.toml").pose is not None
     assert json.loads((folder / "clicks.json").read_text())["points"]["cam01"]
+
+
+def test_joints_are_clicked_in_images_of_one_time_alone(folder):
+    from kinefit.cli._clicks import _pictures
+
+    assert run("init", folder).exit_code == 0
+    take = read_take(folder / "take.toml")
+    seen = load_observations(take)
+    assert list(_pictures(take, seen, 0)) == ["cam01", "cam02", "cam03", "cam04"]
+
+    def late(names):
+        cameras = [msgspec.structs.replace(c, time_offset=1.0 if c.name in names else 0.0) for c in take.cameras]
+        return replace(take, cameras=tuple(cameras))
+
+    assert list(_pictures(late({"cam02"}), seen, 0)) == ["cam01", "cam03", "cam04"]
+    with pytest.raises(TakeError, match="at step 0 1 of 4 cameras took an image"):
+        _pictures(late({"cam01", "cam02", "cam03"}), seen, 0)
 
 
 def test_options_of_clicks_that_do_not_fit(folder, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 
 from kinefit.bodies.files import load_body
@@ -154,20 +154,19 @@ def conventions() -> tuple[Family, ...]:
     out = list(FAMILIES)
     body = load_body("humanoid")
     for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
-        out.append(_Told(name, names, told=names))
+        out.append(_Told(name, names))
     return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
 class _Told(Family):
-    """A family of which every joint is told."""
+    """A family whose `trunk` tells the joints of limbs, too."""
 
     limbs: tuple[str, ...] = ()
-    told: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def joints(self) -> dict[str, str]:
-        return {segment: name for segment, name in self.told.items() if segment in SEGMENTS}
+        return {segment: name for segment, name in self.trunk.items() if segment in SEGMENTS}
 
 
 def plain(name: str) -> str:

@@ -74,7 +74,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
 
 
 def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
-    """JPEG of every camera's image at a step."""
+    """JPEG of every image that cameras took at a step."""
     import cv2
 
     from kinefit.readers.video import Video
@@ -86,9 +86,14 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     for entry in take.cameras:
         if entry.name in seen.videos:
             with Video(seen.videos[entry.name], rate=seen.rate) as video:
-                frame = min(max(round((step / seen.rate - entry.time_offset) * video.rate), 0), len(video) - 1)
+                frame = round(step - entry.time_offset * seen.rate)
+                if not 0 <= frame < len(video):  # its first or last image would be of another time
+                    continue
                 picture = cv2.cvtColor(video.read(frame), cv2.COLOR_RGB2BGR)
             out[entry.name] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+    if len(out) < 2:
+        problem = f"at step {step} {len(out)} of {len(seen.videos)} cameras took an image, and joints need two"
+        raise TakeError(problem, file=take.path, remedy="Name a step by --step at which more had begun.")
     return out
 
 

@@ -292,3 +292,11 @@ class SkeletonMotion:
     def positions(self) -> NDArray:
         """(F, J, 3) [m] joint positions in the world."""
         return self.Ts_world_joint[..., :3, 3]
+
+    @property
+    def rest(self) -> NDArray:
+        """(J, 3) [m] joint positions at rest, the roots' offsets included, in the axes of the file's world."""
+        rest = np.array(self.offsets)
+        for joint, parent in enumerate(self.parents):
+            rest[joint] += rest[parent] if parent >= 0 else 0.0
+        return rest

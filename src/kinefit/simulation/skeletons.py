@@ -143,10 +143,7 @@ def _child(skeleton: SkeletonMotion, joint: int) -> int:
 
 def _rest(skeleton: SkeletonMotion, found: Recorded, R_up: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Joints (J, 3) of the rest pose, y up, and the directions (3,) to the right and forward in it."""
-    rest = np.array(skeleton.offsets)
-    for joint, parent in enumerate(skeleton.parents):
-        rest[joint] += rest[parent] if parent >= 0 else 0.0
-    rest = rest @ R_up.T
+    rest = skeleton.rest @ R_up.T
     across = _unit(rest[found.joints["thigh_r"]] - rest[found.joints["thigh_l"]])
     return rest, across, _unit(np.cross([0.0, 1.0, 0.0], across))
 

@@ -71,14 +71,19 @@ def is_last(body: Body, c: TaperedCylinder) -> bool:
     return not follows and not np.any(body.tree.parents == c.segment)
 
 
+def _normals(vertices: NDArray, faces: NDArray) -> NDArray:
+    """(V, 3) unit normals of vertices, of the faces about each by their areas."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, faces, np.cross(b - a, c - a)[:, None])
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
+
+
 def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normals = np.zeros_like(mesh.vertices)
-    np.add.at(normals, mesh.faces, np.cross(b - a, c - a)[:, None])
     count = len(mesh.vertices)
     return SkinnedMesh(
         vertices=mesh.vertices + body.tree.rest[mesh.segment],
-        normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30),
+        normals=_normals(mesh.vertices, mesh.faces),
         colours=np.tile(np.array(side_colour(body.tree.segments[mesh.segment]), np.uint8), (count, 1)),
         triangles=mesh.faces,
         segments=np.full((count, 2), mesh.segment),
@@ -89,13 +94,9 @@ def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
 def _skin(body: Body, skin: ChainSkin) -> SkinnedMesh:
     vertices, faces, u = skin.patch.mesh()
     segments, weights = skin.weights(u)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], np.cross(b - a, c - a))
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return SkinnedMesh(
-        vertices=vertices, normals=normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30),
+        vertices=vertices, normals=_normals(vertices, faces),
         colours=colours[segments[:, 0]], triangles=faces, segments=segments, weights=weights,
     )
 

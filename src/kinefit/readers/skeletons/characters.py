@@ -199,9 +199,7 @@ def _told(file: Mapping[str, Any]) -> dict[str, int]:
 def _from_bvh(path: Path) -> Character:
     skeleton = read_bvh(path)
     parents, R = np.array(skeleton.parents), rotation_between_up(skeleton.up, "y")
-    rest = np.array(skeleton.offsets)
-    for joint, parent in enumerate(parents):
-        rest[joint] += rest[parent] if parent >= 0 else 0.0
+    rest = skeleton.rest
     rotations = np.tile(np.eye(3), (len(parents), 1, 1))
     if np.ptp(rest @ R[1]) < 0.6 * np.ptp(skeleton.positions[0] @ R[1]):  # lies, or its bones lie along one axis
         rest, rotations = skeleton.positions[0], skeleton.Ts_world_joint[0, :, :3, :3]
