@@ -1,4 +1,5 @@
-"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure."""
+"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure, or
+until the frame's work is used up."""
 
 from __future__ import annotations
 
@@ -102,7 +103,7 @@ def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float, se
                 before = race.run(root, scale, before)
                 best = race.best()
                 searches -= 1
-                if best.settled or searches < 1:
+                if best.settled or searches < 1 or frame.idle:
                     return best
                 if before.noise < FITTING * scale or before.matched < ENOUGH * race.most:
                     break
@@ -154,7 +155,7 @@ class Race:
         if key in self.begun:  # what that led to needs no second time
             return self.begun[key]
         best = min((found.cost for found in self.reached.values()), default=0.0)
-        if first.matched < HOPEFUL * self.most or first.cost > HOPEFUL * best:
+        if self.frame.idle or first.matched < HOPEFUL * self.most or first.cost > HOPEFUL * best:
             return first
         chosen = polish(first.search, first.chosen)
         self.begun[key] = solution(first.search, chosen, len(self.model))

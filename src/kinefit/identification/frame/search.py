@@ -35,6 +35,7 @@ class Frame:
     volume : [m³] of the box they are in
     gain : what a matched marker earns against a missing one, log(1/m³)
     gate : deviations by which a distance may differ
+    work : (1,) tries that are left for all searches of the frame together; they use it up
     """
 
     points: NDArray
@@ -42,6 +43,12 @@ class Frame:
     volume: float
     gain: float
     gate: float
+    work: NDArray = field(default_factory=lambda: np.full(1, np.inf))
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is left to search with: what was found so far has to do."""
+        return bool(self.work[0] <= 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +137,7 @@ class Search:
     @property
     def spent(self) -> bool:
         """Whether the search has had its nodes."""
-        return len(self.memo) > min(self.quota, self.budget)
+        return self.frame.idle or len(self.memo) > min(self.quota, self.budget)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's, its choices followed downwards."""
@@ -209,8 +216,9 @@ class Search:
         count = enumerate_segment(
             frame.points, frame.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
             hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
-            frame.gate, frame.gain, self.slack, 2 if free else 1, index, cost, squares,
+            frame.gate, frame.gain, self.slack, 2 if free else 1, frame.work, index, cost, squares,
         )  # fmt: skip
+        self.cut |= frame.idle
         return index[:count], cost[:count], squares[:count]
 
     def expand(self, table: SegmentTable, context: tuple, given: NDArray, hold: Hold, taken: NDArray) -> Node:
