@@ -265,16 +265,3 @@ def range_cost(points, theirs, index, low, high, width, out):
                 total += e if e < MOST_EXCESS else MOST_EXCESS
                 count += 1
         out[c] = 3 * total / count if count > 0 else 0.0
-
-
-@jit
-def cheapest_free(new, best, extra, taken):
-    """Least of best + extra (C,) over the choices (C, W bits) that take none of the points `taken`."""
-    low = math.inf
-    for c in range(len(best)):
-        free = True
-        for i in range(len(taken)):
-            free = free and (new[c, i] & taken[i]) == 0
-        if free and best[c] + extra[c] < low:
-            low = best[c] + extra[c]
-    return low
