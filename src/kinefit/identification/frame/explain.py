@@ -158,6 +158,7 @@ class Race:
         best = min((found.cost for found in self.reached.values()), default=0.0)
         if self.frame.idle or first.matched < HOPEFUL * self.most or first.cost > HOPEFUL * best:
             return first
+        first.search.allow(self.means[-1])
         chosen = polish(first.search, first.chosen)
         self.begun[key] = solution(first.search, chosen, len(self.model))
         return self.begun[key]

@@ -48,7 +48,7 @@ class IdentifySettings:
     gate: float = 4.5
     miss: float = 0.05
     searches: int = 60
-    work: float = 7e7
+    work: float = 1e8
 
 
 @dataclass(frozen=True, eq=False)

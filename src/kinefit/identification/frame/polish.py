@@ -79,7 +79,7 @@ def polish(search: Search, found: Explanation) -> Explanation:
     small = [node.table.index for node, _ in found[1:] if len(below[node.table.index]) < largest][::-1]
     for _ in range(SWEEPS):
         before = cost
-        for s in () if search.frame.idle else small:
+        for s in () if search.idle else small:
             trial = anew(search, found, below[s])
             now = cost_of(search, trial)
             if now < cost - 1e-6 and not shared(search, trial).any():
@@ -148,6 +148,7 @@ def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple
 
     These are all, unless the frame's work was used up before.
     """
+    search.allow(1.0)
     for _ in range(RESTARTS):
         cost, found, seen = cost_of(search, chosen), [], set()
         for trial in _others(search, chosen, seen):

@@ -130,7 +130,7 @@ class Search:
         self.promise = {t.index: 0.0 for t in tables}  # least cost so far of a segment and all below
         self.cut, self.slack = False, SLACK
         self.budget, self.each, self.quota = budget, quota, quota
-        self.floor = (1 - share) * frame.work[0] if share < 1 else 0.0
+        self.allow(share)
 
     def beside(self, outside: NDArray, slack: float = SLACK) -> Search:
         """The same search, nothing of it known yet, without the points `outside` (W,) bits."""
@@ -143,12 +143,21 @@ class Search:
     def grant(self, nodes: int) -> None:
         """So many nodes from now on."""
         self.budget = self.quota = len(self.memo) + nodes
-        self.each, self.floor = nodes, 0.0
+        self.each = nodes
+
+    def allow(self, share: float) -> None:
+        """This share of the frame's work that is left, from now on."""
+        self.floor = (1 - share) * float(self.frame.work[0]) if share < 1 else 0.0
+
+    @property
+    def idle(self) -> bool:
+        """Whether the search has had its share of the work."""
+        return bool(self.frame.work[0] <= self.floor)
 
     @property
     def spent(self) -> bool:
-        """Whether the search has had its nodes."""
-        return bool(self.frame.work[0] <= self.floor) or len(self.memo) > min(self.quota, self.budget)
+        """Whether the search has had its nodes, or its share of the work."""
+        return self.idle or len(self.memo) > min(self.quota, self.budget)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's, its choices followed downwards."""
