@@ -10,7 +10,7 @@ from kinefit.identification.frame._kernels_evidence import evidence, place_joint
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
 MOST_STEPS = 100_000  # of the search in one segment, about 10 ms: reached only where noise is as large as the segment
 LEAST_WORK = 4_000  # a call that begins without any left is granted this much
-CALL, LEAF = 8_000, 20  # a call with what Python does around it, and a rigid fit, in tries of a point for a marker
+CALL, LEAF = 8_000, 5  # a call with what Python does around it, and a point of a rigid fit, in tries of a distance
 MOST_EXCESS = 4.0
 LEAST = 4.0  # what a choice must earn that nothing above holds: accidents are many
 
@@ -164,7 +164,7 @@ def enumerate_segment(
                 if has_pivot:
                     xs[n], ys[n], ss[n] = x_pivot, pivot, pivot_sigma
                     n += 1
-                left -= LEAF
+                left -= LEAF * n
                 cost, rss = evidence(n, xs, ys, ss, work)
                 cost -= base + matched[depth] * gain
                 if loose and (len(anchors) == 0 or n < 3):
@@ -203,7 +203,7 @@ def enumerate_segment(
         found = False
         while place < many[depth] and not found:
             q = maybe[depth, place]
-            left -= 1
+            left -= 1 + 0.3 * (depth - known)
             if not used[q]:
                 ok = True
                 lb = least[depth, place]

@@ -71,7 +71,7 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
     if isinstance(marker_set, MarkerSet):
         skeleton = adopt(skeleton_of(labels, marker_set), tables[1])
     else:
-        skeleton = learn_segments(positions, labels, tables[1])
+        skeleton = learn_segments(positions, labels, tables[0], tables[1])
     return fit_model(positions, labels, skeleton, tables, name, gaps)
 
 
