@@ -45,6 +45,7 @@ class Case:
     chosen : whether settings were chosen on it; the figures that count are of the others
     exercised : whether the training motion moves the joints that the test moves
     full : whether it is a full body (or all but a head)
+    held : whether it was taken out of all tuning before any of its figures was looked at
     """
 
     name: str
@@ -53,12 +54,15 @@ class Case:
     chosen: bool = False
     exercised: bool = True
     full: bool = True
+    held: bool = False
 
 
-def _halves(name: str, file: str, *, chosen: bool = False, back: bool = False, full: bool = True) -> Case:
+def _halves(
+    name: str, file: str, *, chosen: bool = False, back: bool = False, full: bool = True, held: bool = False
+) -> Case:
     """Trained on one part of a take, asked of the other; a tenth of the take lies between."""
     parts = ((0.55, 1.0), (0.0, 0.45)) if back else ((0.0, 0.45), (0.55, 1.0))
-    return Case(name, ((file, *parts[0]),), (file, *parts[1]), chosen, full=full)
+    return Case(name, ((file, *parts[0]),), (file, *parts[1]), chosen, full=full, held=held)
 
 
 def _whole(file: str) -> tuple[str, float, float]:
@@ -101,6 +105,18 @@ CASES = (
         _whole("../markers_pycgm/Test_Files/Movement_trial.c3d"), exercised=False,
     ),
 )
+
+HELD = (
+    _halves("squats of another", "nimblephysics/data__osim__DetectMarkerFlip__squats1.trc", held=True),
+    Case(
+        "walk 1 to walk 2", (_whole("../markers_bmc_run/walk1.trc"),), _whole("../markers_bmc_run/walk2.trc"),
+        full=False, held=True,
+    ),
+    _halves("dance of 40", "btkdata/Input__C3DSamples__c3d.org__sample13__Dance.c3d", held=True),
+    _halves("golf swing", "btkdata/Input__C3DSamples__c3d.org__sample13__golfswing.c3d", held=True),
+)
+"""Four takes that no setting was chosen on: named before any of their figures was looked at. The last two have labels
+that no set of the catalogue knows."""
 
 
 def load(part: tuple[str, float, float]) -> Markers | None:
