@@ -65,7 +65,7 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
             "does not tell where its markers sit on a body", file=source, place="markers",
             remedy=f"Add [markers] to a file of your own, or use one of: {', '.join(placed_set_names())}.",
         )  # fmt: skip
-    return _placed(body, record)
+    return placed(body, record)
 
 
 def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> Placement:
@@ -123,7 +123,8 @@ def _listed(labels: tuple[str, ...]) -> str:
     return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
 
 
-def _placed(body: Body, record: SetRecord) -> Placement:
+def placed(body: Body, record: SetRecord) -> Placement:
+    """A set's record on a body; markers on segments or landmarks that the body does not have are left out."""
     names, segments, at, spread = [], [], [], []
     for label, entry in record.markers.items():
         for name, mirrored in _with_image(label, record):

@@ -38,7 +38,7 @@ class IdentifySettings:
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
     searches : of one frame, from several segments and noise levels; most need one or two
-    work : tries of a point for a marker that a frame may take: 0.5 to 0.9 s on one core
+    work : tries of a point for a marker that a frame may take: 0.6 to 0.95 s on one core of 3 GHz
         What was not found by then stays unknown. It is counted, so that the same frame has the same names anywhere.
     """
 
@@ -48,7 +48,7 @@ class IdentifySettings:
     gate: float = 4.5
     miss: float = 0.05
     searches: int = 60
-    work: float = 1e8
+    work: float = 1.5e8
 
 
 @dataclass(frozen=True, eq=False)
