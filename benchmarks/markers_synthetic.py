@@ -1,7 +1,7 @@
 """The paper's synthetic test (P5 4.1) for SAPM as printed and for `identify`: `python -m benchmarks.markers_synthetic`.
 
-Neither is told distortion, missing or extra. POSES poses a cell (200), CLEAN noise-free poses (2000). With a file's name
-(`... surface.svg`) it draws the surface of P5 Fig. 3 for both.
+Neither is told distortion, missing or extra. POSES poses a cell (200), CLEAN noise-free poses (2000). With a file's
+name (`... surface.svg`) it draws the surface of P5 Fig. 3 for both.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def score(method: Identifier, model: MarkerModel, poses: int, seed: int = 1, **k
 
 def table(model: MarkerModel) -> None:
     """Every distortion with every share missing and number extra."""
-    print("distortion missing extra | identify: right wrong median ms slowest | SAPM: right wrong median ms", flush=True)
+    print("distortion missing extra | identify: right wrong median ms slowest | SAPM: right wrong median ms")
     worst, medians, slowest = 0.0, [], []
     goals = {(0.04, 0.0, 0): 99.95, (0.06, 0.0, 0): 99.7, (0.1, 0.0, 0): 98.3, (0.0, 0.1, 0): 99.6,
              (0.04, 0.1, 0): 99.6,

@@ -30,11 +30,11 @@ ENOUGH, PARTS = 8, 3
 """Labels with a known word, and segments that they are on, from which a body is fitted to them."""
 
 NEARER = 0.03
-"""By which a marker's way to a segment's bone, as if it were a spread, counts: what was held still goes to the nearest."""
+"""By which a marker's way to a segment's bone counts, as a spread would: what was held still goes to the nearest."""
 
 SHARED, AROUND = 0.010, 0.12
-"""[m] a marker that strays less than the first from a neighbouring segment, and is nearer than the second to their joint,
-is both segments'."""
+"""[m] a marker that strays less than the first from a neighbouring segment, and is nearer than the second to their
+joint, is both segments'."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +82,10 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
         model = learn_model(markers, template="")
         parents = {j.child: model.names[j.parent] for j in model.joints}
         segments = {n: tuple(bare(model.labels[m]) for m in s) for n, s in zip(model.names, model.segments)}
-        rows = {n: (parents.get(i), None) for i, n in enumerate(model.names)}
-        return FirstSet(_toml(name, segments, rows, {}, {}), segments, (), tuple(pairs.items()))
-    segments, rows, places, at = found
-    return FirstSet(_toml(name, segments, rows, places, at), segments, tuple(places), tuple(pairs.items()))
+        links: dict[str, Link] = {n: (parents.get(i), None) for i, n in enumerate(model.names)}
+        return FirstSet(_toml(name, segments, links, {}, {}), segments, (), tuple(pairs.items()))
+    segments, links, places, at = found
+    return FirstSet(_toml(name, segments, links, places, at), segments, tuple(places), tuple(pairs.items()))
 
 
 def sides(labels: Sequence[str]) -> dict[str, str]:
@@ -108,7 +108,8 @@ def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple
     middle, sided = dict[str, MarkerRecord](), dict[str, MarkerRecord]()
     for record in catalogue().values():
         for label, entry in record.markers.items():
-            word = next((label[len(r) :] for r, _ in record.sides if record.mirror(label) and label.startswith(r)), None)
+            right = [r for r, _ in record.sides if record.mirror(label) and label.startswith(r)]
+            word = label[len(right[0]) :] if right else None
             if entry.spread <= FIRM:
                 (middle if word is None else sided).setdefault(plain(label if word is None else word), entry)
     out = dict[str, tuple[MarkerRecord, bool]]()
@@ -135,10 +136,10 @@ def _word(label: str, pairs: dict[str, str]) -> str:
     return tail[1:] if plain(tail) in ("ight", "eft") else tail
 
 
-Found = tuple[
-    dict[str, tuple[str, ...]], dict[str, tuple[str | None, NDArray | None]], dict[str, NDArray],
-    dict[str, tuple[str, NDArray]],
-]  # fmt: skip
+Link = tuple[str | None, NDArray | None]
+"""A segment's parent and the joint with it (3,) [m]; none for the root, or where it is not known."""
+
+Found = tuple[dict[str, tuple[str, ...]], dict[str, Link], dict[str, NDArray], dict[str, tuple[str, NDArray]]]
 
 
 def _by_fit(
@@ -187,9 +188,9 @@ def _by_fit(
                     members[b].append(label)
     name = {i: tree.segments[candidates[i]] for i in members}
     segments = {name[i]: tuple(members[i]) for i in tied}
-    links = {name[i]: (None if p is None else name[p], joints.get(i)) for i, p in tied.items()}
+    linked: dict[str, Link] = {name[i]: (None if p is None else name[p], joints.get(i)) for i, p in tied.items()}
     places = {label: at[label][home[label]] + tree.rest[candidates[home[label]]] for label in labels}
-    return segments, links, places, {label: (name[home[label]], at[label][home[label]]) for label in labels}
+    return segments, linked, places, {label: (name[home[label]], at[label][home[label]]) for label in labels}
 
 
 def replace_side(entry: MarkerRecord, mirrored: bool) -> MarkerRecord:
@@ -246,7 +247,7 @@ def _tied(members: dict[int, list[str]], candidates: NDArray, parents: NDArray) 
 
 
 def _toml(
-    name: str, segments: dict[str, tuple[str, ...]], rows: dict[str, tuple[str | None, NDArray | None]],
+    name: str, segments: dict[str, tuple[str, ...]], links: dict[str, Link],
     places: dict[str, NDArray], at: dict[str, tuple[str, NDArray]],
 ) -> str:  # fmt: skip
     """The file."""
@@ -255,7 +256,7 @@ def _toml(
 
     lines = [
         "# A first marker set, written by `kinefit markers set`. Look through it: is every marker on its segment?",
-        "# x forward, y up, z to the right [m], of a body of average size; places from the middle of the hips, joints too.",
+        "# [m] on a body of average size: x forward, y up, z to the right; places and joints from the middle of the hips.",
         f"name = {json.dumps(name)}", "",
     ]  # fmt: skip
     if places:
@@ -266,7 +267,7 @@ def _toml(
             )
         lines.append("")
     for segment, labels in segments.items():
-        parent, joint = rows[segment]
+        parent, joint = links[segment]
         lines += ["[[segment]]", f"name = {json.dumps(segment)}"]
         lines += [f"parent = {json.dumps(parent)}"] if parent else []
         lines += [f"joint = {row(joint)}"] if joint is not None else []

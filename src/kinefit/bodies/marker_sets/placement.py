@@ -87,12 +87,18 @@ def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike
         shared = whole.select(n for n in whole.points.names if n in known)
         if best is None or len(shared.points) > len(best.points):
             best = shared
+    if (best is None or not len(best.points)) and labels and all(label.startswith("*") for label in labels):
+        raise ObservationError(
+            f"{len(labels)} trajectories without names",
+            remedy="Identify first: `kinefit markers identify TAKE SUBJECT.json`, or `fit --subject SUBJECT.json`.",
+        )
     if best is None or len(best.points) < FEWEST:
         count = 0 if best is None else len(best.points)
         sets = f"set '{marker_set}'" if marker_set else "any marker set"
         raise ObservationError(
             f"only {count} of the labels are known to {sets}: {_listed(labels)}",
-            remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or give a file.",
+            remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "
+            "`kinefit markers set` writes a first one.",
         )
     return best
 

@@ -1,5 +1,7 @@
-"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure, or
-until the frame's work is used up."""
+"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure.
+
+They end, too, where the frame's work is used up.
+"""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class IdentifySettings:
     gate: float = 4.5
     miss: float = 0.05
     searches: int = 60
-    work: float = 1.5e8
+    work: float = 1.3e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +125,8 @@ def identify(
 def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
     """Labels that are probable enough against all rivals; where it may all be accident, only what two starts say."""
     count = len(found.labels)
-    chosen, near, seen = found.chosen, [], {node.table.index for node, _ in found.chosen}
-    if not found.clear:
-        chosen, near, seen = rivals(found.search, found.chosen)
+    every = {node.table.index for node, _ in found.chosen}
+    chosen, near, seen = (found.chosen, [], every) if found.clear else rivals(found.search, found.chosen)
     pool = {labels_of(e, count).tobytes(): (dearer, e) for dearer, e in [*near, (0.0, chosen)]}
     labels = np.array([labels_of(e, count) for _, e in pool.values()])
     cost = np.array([dearer for dearer, _ in pool.values()]) + _moved(labels, found.search.frame.points, before)

@@ -150,7 +150,8 @@ def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple
     """
     search.allow(1.0)
     for _ in range(RESTARTS):
-        cost, found, seen = cost_of(search, chosen), [], set()
+        cost, found = cost_of(search, chosen), []
+        seen: set[int] = set()
         for trial in _others(search, chosen, seen):
             found.append((cost_of(search, trial), trial))
             if found[-1][0] < cost - 1e-6:

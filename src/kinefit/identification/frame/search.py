@@ -232,7 +232,8 @@ class Search:
         index, cost, squares, new, every, union, empty = expand_segment(
             frame.points, frame.gaps, self.bits, taken | self.outside, table.x, table.D, self.sigma[table.index], given,
             joint, hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
-            frame.gate, frame.gain, self.slack, 2 if free else 1, frame.work, ROOM, self.slack if kept is None else kept,
+            frame.gate, frame.gain, self.slack, 2 if free else 1, frame.work, ROOM,
+            self.slack if kept is None else kept,
         )  # fmt: skip
         self.cut |= frame.idle
         return Node(

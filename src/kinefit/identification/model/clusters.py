@@ -20,9 +20,9 @@ FIRMEST, LONGEST = 0.015, 0.6
 """[m] deviation of a distance, and the distance, beyond which two markers are of no segment together: skin gives less,
 and of a body's parts only a tall man's trunk is longer. What was held still looks like one segment whatever it is."""
 
-NEARER = 0.005
+NEARER = 0.002
 """By which a distance, as if it were a deviation, counts against a group, so that of what was held still the near
-markers come together: 3 mm at 0.6 m."""
+markers come together: 1 mm at 0.5 m."""
 
 LOOSE = 1.5
 """By how much more a distance may give to a marker of a neighbour that helps a group of one or two to a shape."""
