@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import CASES, HELD, Case, broken, load, shuffled, training
+from kinefit.errors import ObservationError
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
@@ -72,7 +73,11 @@ def whole_take(model: MarkerModel, take: Markers, seed: int = 0, **breaking: flo
     cut = broken(take, seed, **breaking)
     column = np.array([take.names.index(n) if n in take.names else -9 for n in model.labels])
     start = time.process_time()
-    found = identify_take(model, cut.markers)
+    try:
+        found = identify_take(model, cut.markers)
+    except ObservationError as error:
+        print(f"refused after {time.process_time() - start:.1f} s: {error.problem}")
+        return Score(np.nan, np.nan)
     spent = (time.process_time() - start) / len(take)
     named = np.where(found.column >= 0, cut.truth[np.arange(len(take))[:, None], found.column], -2)
     seen = (cut.truth[:, :, None] == column).any(1)
@@ -115,10 +120,10 @@ def told(rows: list[tuple[Case, dict[str, Score]]], area: str) -> None:
     reason = "" if rows else "no recordings"
 
     def least(kind: str) -> float | None:
-        return min((100 * s[kind].right for _, s in rows), default=None)
+        return min((100 * s[kind].right for _, s in rows if np.isfinite(s[kind].right)), default=None)
 
     def most_wrong(kind: str) -> float | None:
-        return max((100 * s[kind].wrong for _, s in rows), default=None)
+        return max((100 * s[kind].wrong for _, s in rows if np.isfinite(s[kind].wrong)), default=None)
 
     moved = [100 * s["all"].right for case, s in rows if case.exercised]
     mean = float(np.mean(moved)) if moved else None

@@ -80,7 +80,7 @@ def run() -> None:
     took = [r for r in counted if not r[5]]
     for tag, some in (("60_to_70", [r for r in took if r[0] == "61 markers"]), ("all", took)):
         figure(f"markers_unknown_{tag}_least", min((r[2] for r in some), default=None), "% right", ">= 95", reason)
-    figure("markers_unknown_wrong", max((r[3] for r in took), default=None), "%", "<= 1", reason)
+    figure("markers_unknown_wrong", max((r[3] for r in took), default=None), "%", "<= 0.2", reason)
     refused = [r[4] for r in rows if r[5]]
     figure("markers_unknown_refused", max(refused, default=None), "s, slowest", "<= 10", reason or "none refused")
 

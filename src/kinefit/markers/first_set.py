@@ -256,7 +256,7 @@ def _toml(
 
     lines = [
         "# A first marker set, written by `kinefit markers set`. Look through it: is every marker on its segment?",
-        "# [m] on a body of average size: x forward, y up, z to the right; places and joints from the middle of the hips.",
+        "# [m] on a body of average size: x forward, y up, z to the right; places, joints from the middle of the hips.",
         f"name = {json.dumps(name)}", "",
     ]  # fmt: skip
     if places:
