@@ -43,6 +43,17 @@ def test_a_swap_is_found_with_its_frames(walk, a, b, first, last):
     assert (found[0].first, found[0].last) == (first, last) and "swapped" in str(found[0])
 
 
+@pytest.mark.parametrize("hidden", [False, True])
+@pytest.mark.parametrize(("a", "b"), [("LFHD", "RFHD"), ("RWRA", "RELB"), ("LKNE", "LTHI")])
+def test_an_exchange_of_one_frame_is_found_even_with_a_hidden_marker(walk, a, b, hidden):
+    take = exchanged(walk, a, b, 120, 120)
+    if hidden:
+        take.positions[120, take.names.index(f"TakeoMonday:{b}")] = np.nan
+    found = wrong(audit_take(take))
+    assert len(found) == 1 and {n.partition(":")[2] for n in found[0].labels} == {a, b}
+    assert (found[0].first, found[0].last) == (120, 120)
+
+
 def test_three_turned_round_are_found_as_exchanges_of_them(walk):
     take = exchanged(exchanged(walk, "RELB", "RFRM", 50, 150), "RFRM", "RWRA", 50, 150)
     found = wrong(audit_take(take))

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import ObservationError
-from kinefit.identification.frame._kernels_evidence import evidence, largest_quaternion, rigid
-from kinefit.identification.frame.identify import identify
+from kinefit.identification.frame._kernels_evidence import evidence, largest_quaternion, least_squares, rigid
+from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.frame.synthetic import mean_length, random_pose, synthetic_body
 from kinefit.identification.frame.tables import deviations, segment_tables
 
@@ -30,6 +30,33 @@ def test_posed_bodies_keep_distances_within_segments(body):
     for markers in body.segments:
         i = np.ix_(list(markers), list(markers))
         assert np.allclose(np.linalg.norm(at[:, None] - at, axis=-1)[i], body.mean[i], atol=1e-9)
+
+
+def test_a_frame_that_runs_out_of_work_names_nothing_wrong(body):
+    wrong = right = 0
+    for seed in range(4):
+        pose = random_pose(body, np.random.default_rng(seed), distortion=0.08, missing=0.2, extra=10)
+        found = identify(body, pose.points, settings=IdentifySettings(work=2e5))
+        again = identify(body, pose.points, settings=IdentifySettings(work=2e5))
+        assert (found.assignment == again.assignment).all()  # work is counted, not timed
+        wrong += int(((found.assignment != pose.truth) & (found.assignment >= 0)).sum())
+        whole = identify(body, pose.points)
+        right += int((whole.assignment == pose.truth).sum()) - int((found.assignment == pose.truth).sum())
+    assert wrong <= 2 and right > 0
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 8])
+@pytest.mark.parametrize("flat", [1.0, 0.01, 0.0])
+def test_least_squares_are_those_of_the_rigid_motion(n, flat):
+    rng = np.random.default_rng(n)
+    for noise in (1e-4, 0.01, 0.3):
+        x, w = rng.standard_normal((n, 3)) * [0.1, 0.1 * flat, 0.1 * flat], rng.uniform(1e4, 1e6, n)
+        q, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+        y = x @ (q * np.sign(np.linalg.det(q))).T + noise * rng.standard_normal((n, 3)) + 1.0
+        H, own = np.empty((3, 3)), np.empty((3, 3))
+        rss = rigid(n, x, y, w, np.empty((3, 3)), np.empty(3), own)
+        assert least_squares(n, x, y, w, H) == pytest.approx(rss, rel=1e-5, abs=1e-5)
+        np.testing.assert_allclose(H, own, rtol=1e-9, atol=1e-9 * own.max())
 
 
 def test_distortion_is_that_of_the_paper(body):

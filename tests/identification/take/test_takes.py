@@ -96,8 +96,12 @@ def test_another_subjects_model_is_told(labelled, model):
     def nothing(_, points):
         return Identification(np.full(len(model), -1), np.zeros(len(model)), 0.0, False, guess=np.full(len(model), -1))
 
-    with pytest.raises(ObservationError, match="does not fit the model of Anna"):
-        identify_take(model, labelled, identify_frame=nothing)
+    asked = []
+    with pytest.raises(ObservationError, match="does not fit the model of Anna: in . frames it finds 0 %.* least of"):
+        identify_take(
+            model, labelled, identify_frame=nothing, progress=lambda what, done, total: asked.append(done)
+        )
+    assert max(asked) <= 6  # refused after the trial
 
 
 @pytest.mark.parametrize("seen", [0, 2])
