@@ -48,7 +48,9 @@ def test_a_swap_is_found_with_its_frames(walk, a, b, first, last):
 def test_an_exchange_of_one_frame_is_found_even_with_a_hidden_marker(walk, a, b, hidden):
     take = exchanged(walk, a, b, 120, 120)
     if hidden:
-        take.positions[120, take.names.index(f"TakeoMonday:{b}")] = np.nan
+        positions = np.array(take.positions)
+        positions[120, take.names.index(f"TakeoMonday:{b}")] = np.nan
+        take = replace(take, positions=positions)
     found = wrong(audit_take(take))
     assert len(found) == 1 and {n.partition(":")[2] for n in found[0].labels} == {a, b}
     assert (found[0].first, found[0].last) == (120, 120)
