@@ -133,6 +133,8 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
     told = run("init", take.parent)
     assert told.exit_code == 0 and "cam01.mp4 alone" in told.stdout and "state height" in told.stdout
     assert "field_of_view = 64.0" in take.read_text() and "[calibration]" not in take.read_text()
+    told = run("check", take)
+    assert told.exit_code == 0 and "nothing to check it against" in told.stdout
 
 
 @pytest.mark.parametrize(
