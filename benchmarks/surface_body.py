@@ -62,14 +62,14 @@ def moving_arm(seed: int, frames: int) -> Motion:
 
 def cameras(size: int) -> Rig:
     """Three cameras beside each other that look at the arm from its side."""
-    out, aim = [], np.array([0.12, -0.27, 0.0])
+    out, aim = [], np.array([0.2, -0.3, 0.0])
     for name, x in (("middle", 0.0), ("left", -0.2), ("right", 0.2)):
-        place = np.array([0.12 + x, -0.2, 1.3])
+        place = np.array([0.2 + x, -0.2, 1.3])
         forward = (aim - place) / np.linalg.norm(aim - place)
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
-        K = np.array([[2.05 * size, 0, size / 2], [0, 2.05 * size, size / 2], [0, 0, 1]])
+        K = np.array([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1]])
         out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", se3.transform(R, -R @ place)))
     return Rig(tuple(out))
 
@@ -82,7 +82,7 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
         code = cv2.VideoWriter_fourcc(*"MJPG")
         video = cv2.VideoWriter(str(folder / f"{camera.name}.avi"), code, motion.rate, camera.size)
         for k in range(len(motion)):
-            grain = 0.002 * 640 / camera.size[0]
+            grain = 0.0026 * 640 / camera.size[0]
             video.write(cv2.cvtColor(textured_picture(scene, k, camera, grain=grain, seed=seed), cv2.COLOR_GRAY2BGR))
         video.release()
     start = {n: float(np.degrees(a)) for n, a in zip(motion.body.tree.coordinates, motion.angles[0])}
