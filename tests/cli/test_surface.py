@@ -69,6 +69,18 @@ def test_photographs_of_states_become_tables_meshes_and_pictures(folder, tmp_pat
     assert len(strains) > 20 and np.abs(strains).max() < 0.02
 
 
+def test_smoothing_is_heard(folder, tmp_path):
+    std = []
+    for smooth in (0, 1):
+        out = tmp_path / str(smooth)
+        views = f"a={folder / 'a' / '0.png'}", f"b={folder / 'b' / '0.png'}"
+        result = call(folder / "calib.toml", *views, "-o", out, "--step", 20, "--smooth", smooth)
+        assert result.exit_code == 0, result.output
+        std.append((out / "points_000.csv").read_text())
+    assert std[0] != std[1]
+    assert call(folder / "calib.toml", *views, "--smooth", -1).exit_code == 2
+
+
 def test_videos_are_tracked(folder, tmp_path):
     out = tmp_path / "out"
     views = f"a={folder / 'a.avi'}", f"b={folder / 'b.avi'}"

@@ -55,6 +55,7 @@ class Wanted:
     incremental: bool
     still: int | None
     field: str | None
+    smooth: float
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all."""
@@ -154,9 +155,9 @@ def with_field(rig: Rig, field: str | None) -> Rig:
     return rig if field is None else Rig(tuple(field_camera(camera, field) for camera in rig))  # type: ignore[arg-type]
 
 
-def spline_of(image: NDArray, field: str | None) -> SplineImage:
-    """An image, or a field of it."""
-    return SplineImage.of(image if field is None else field_of(image, field))  # type: ignore[arg-type]
+def spline_of(image: NDArray, field: str | None, smooth: float) -> SplineImage:
+    """An image, or a field of it, smoothed by [px]."""
+    return SplineImage.of(image if field is None else field_of(image, field), smooth=smooth)  # type: ignore[arg-type]
 
 
 def mask_of(path: Path | None, field: str | None) -> NDArray | None:
@@ -173,7 +174,7 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
     count = len(views.photographs[0])
     if wanted.still is not None and wanted.still >= count:
         raise ObservationError(f"state {wanted.still} of {count}", remedy="The first is 0; --still names another one.")
-    states = _States(views.photographs, wanted.field)
+    states = _States(views.photographs, wanted.field, wanted.smooth)
     first = states[0]
     grid = Grid.of(first[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
@@ -192,8 +193,9 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
 class _States(Sequence[list[SplineImage]]):
     """Images of all cameras in each state, read when they are asked for: the first and the latest are kept."""
 
-    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None) -> None:
-        self._files, self._field, self._kept = photographs, field, dict[int, list[SplineImage]]()
+    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None, smooth: float) -> None:
+        self._files, self._field, self._smooth = photographs, field, smooth
+        self._kept = dict[int, list[SplineImage]]()
 
     def __len__(self) -> int:
         return len(self._files[0])
@@ -201,7 +203,7 @@ class _States(Sequence[list[SplineImage]]):
     def __getitem__(self, k: Any) -> Any:
         if k not in self._kept:
             self._kept = {j: images for j, images in self._kept.items() if j == 0}
-            self._kept[k] = [spline_of(read_picture(files[k]), self._field) for files in self._files]
+            self._kept[k] = [spline_of(read_picture(files[k]), self._field, self._smooth) for files in self._files]
         return self._kept[k]
 
 
@@ -290,7 +292,7 @@ def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -
         tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds)
         told = []
         for k in range(count):
-            images = [spline_of(video.read(k), wanted.field) for video in videos]
+            images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
             try:
                 points = tracker.update(images)
             except TrackingError as error:

@@ -26,18 +26,21 @@ Examples:
 @click.option("--mask", type=click.Path(path_type=Path), help="PNG over the first image, black where no point is.")
 @click.option(
     "--seeds", type=click.Path(path_type=Path),
-    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: SIFT]",
+    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: they are found]",
 )  # fmt: skip
 @click.option("--least", type=click.FloatRange(0, 1), help="Correlation of a match.  [default: 0.8]")
 @click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Strain over this length [mm].")
 @click.option("--incremental", is_flag=True, help="Match and strain each state against the one before, not the first.")
 @click.option("--still", type=click.IntRange(1), help="State of nothing moved: strain to it is the noise floor.")
+@click.option(
+    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="[px] of a Gaussian, for texture sharper than pixels."
+)
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
-    field: str | None, verbose: bool,
+    smooth: float, field: str | None, verbose: bool,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 
@@ -50,7 +53,7 @@ def surface(
 
     check_folder(out)
     rig, paths = read_views(calibration, unit, views)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field)
+    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth)
     with _screen.bars() as progress:
         if paths.videos:
             told = measure_videos(rig, paths, wanted, progress)
