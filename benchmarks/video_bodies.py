@@ -83,7 +83,7 @@ def run() -> None:
         worst: dict[str, list[float]] = {}
         for seed in (41, 42)[: amount(2, 1)]:
             with tempfile.TemporaryDirectory() as place:
-                for name, value in errors(Path(place), kind, seed, frames=amount(40, 5)).items():
+                for name, value in errors(Path(place), kind, seed, frames=amount(24, 5)).items():
                     worst.setdefault(name, []).append(value)
         for name, values in worst.items():
             unit, goal = GOALS[name.partition("_")[0]]

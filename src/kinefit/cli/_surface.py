@@ -25,6 +25,7 @@ from kinefit.exporters.surface_files import (
 )
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.fields import field_camera, field_of
+from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.spline_image import SplineImage
@@ -183,10 +184,37 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
         rig, states, grid, seeds=seeds, window=window, incremental=wanted.incremental, progress=progress,
         least=LEAST_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
+    return _write_all(surfaces, views.photographs[0], wanted, int(np.max(window)))
+
+
+def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: Wanted) -> list[str]:
+    """Measure a flat surface in photographs of one camera and write it; what to say about it.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than two photographs, views with names of cameras, or --seeds.
+    """
+    named = [str(p) for p in photographs if p.suffix.lower() not in _PHOTOGRAPHS or ("=" in p.name and not p.exists())]
+    if named or wanted.seeds is not None or len(photographs) < 2:
+        problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
+        raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
+    states = [spline_of(read_picture(path), wanted.field, wanted.smooth) for path in photographs]
+    grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
+    window = wanted.side(states[0], states[1], grid)
+    surfaces = measure_flat(
+        states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
+        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+    )  # fmt: skip
+    return _write_all(surfaces, photographs, wanted, int(np.max(window)))
+
+
+def _write_all(surfaces: Sequence[Surface], photographs: Sequence[Path], wanted: Wanted, window: int) -> list[str]:
+    """Write all states; lines about them."""
     told = []
     for k, surface in enumerate(surfaces):
         reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
-        told += _write(surface, reference, _grey(views.photographs[0][k], wanted.field), wanted, k, int(np.max(window)))
+        told += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
     return told
 
 
