@@ -115,6 +115,10 @@ def test_two_photographs_of_a_plate_become_a_strain_map(tmp_path):
     for name, value in (("xx", green[0, 0]), ("yy", green[1, 1]), ("xy", green[0, 1])):
         assert abs(np.nanmean(mesh[f"strain_{name}"]) - value) < 3e-4
     np.testing.assert_allclose(mesh["displacement"][:, 2], 0.0)
+    board = 60 + 120 * (np.indices((160, 200)) // 12).sum(axis=0) % 240
+    cv2.imwrite(str(tmp_path / "board.png"), board.astype(np.uint8))
+    told = call(tmp_path / "board.png", tmp_path / "board.png", "--flat", 0.05, "-o", out)
+    assert isinstance(told.exception, ObservationError) and "repeats" in str(told.exception)
     told = call("a=before.png", *files, "--flat", 0.05, "-o", out)
     assert isinstance(told.exception, ObservationError) and "a=before.png" in str(told.exception)
 

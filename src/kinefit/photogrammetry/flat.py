@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.surface import Surface, refuse_repeated
 from kinefit.photogrammetry.unaided import grow_over_time
 
 _EXACT = 1e-6  # [px²] of the places in the first image, which define the points
@@ -48,7 +48,8 @@ def measure_flat(
     Raises
     ------
     ObservationError
-        Fewer than two images, other sizes, a pixel that is not positive; nothing found again.
+        Fewer than two images, other sizes, a pixel that is not positive; nothing found again; texture that
+        repeats.
     """
     if len(states) < 2 or not 0 < pixel < np.inf:
         problem = f"{len(states)} images, a pixel of {pixel} m"
@@ -64,6 +65,7 @@ def measure_flat(
         if not found.found.any():
             remedy = "Light it better, take a larger window, or images of states between."
             raise ObservationError(f"nothing of the first image is found in image {k}", remedy=remedy)
+        refuse_repeated(first, image, found, f"image {k}")
         out.append(_surface(grid, found, pixel))
         if incremental:
             first, here = image, replace(grid, points=found.uv)

@@ -128,7 +128,7 @@ def measure(
         if found[-1].found.sum() < _FEWEST:
             _refuse(first, camera.name)
         if seeds is None:
-            _refuse_repeated(first, image, found[-1], camera.name)
+            refuse_repeated(first, image, found[-1], f"camera {camera.name}")
     surface = from_matches(rig, grid, None, found)
     if constrained if constrained is not None else len(rig) > 2:
         surface = match_rays(rig, images, surface, found, window=window, least=least)
@@ -146,7 +146,7 @@ def _refuse(first: SplineImage, camera: str) -> None:
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
-def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, camera: str) -> None:
+def refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
     """Refuse texture that looks the same again nearby, where nobody said which place is meant.
 
     Windows of 31 px about 20 points are sought about their matches, two windows far. Texture repeats where most are
@@ -159,8 +159,8 @@ def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, ca
     )
     seen = np.isfinite(told.best)
     if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
-        problem = "texture that repeats: most points are found as well elsewhere, so their distance is not known"
-        raise ObservationError(problem, place=f"camera {camera}", remedy="Give seeds by hand: they say where.")
+        problem = "texture that repeats: most points are found as well elsewhere, so where they are is not known"
+        raise ObservationError(problem, place=place, remedy="Give seeds by hand: they say where; or another texture.")
 
 
 def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> Surface:
