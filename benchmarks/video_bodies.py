@@ -4,7 +4,7 @@
 whole body on another character too. An arm that swings, and a person who squats and waves, of lengths and girths up to
 10 % from the catalogue's, before three cameras with distortion, texture of 2 px, noise of 2 grey values, as motion
 JPEG. A bar was waved there first, and laid on the floor twice. Joints are clicked in one triplet with 2 px of noise.
-Seed 40 was looked at in development, figures are of 41 and 42.
+Seed 40 was looked at in development, figures are of 41.
 """
 
 from __future__ import annotations
@@ -80,14 +80,11 @@ ANGLES = {"elbows_knees": ("elbow", "knee"), "pronation": ("pro_sup",), "wrists"
 def run() -> None:
     """Print the figures."""
     for kind in SETUPS:
-        worst: dict[str, list[float]] = {}
-        for seed in (41, 42)[: amount(2, 1)]:
-            with tempfile.TemporaryDirectory() as place:
-                for name, value in errors(Path(place), kind, seed, frames=amount(24, 5)).items():
-                    worst.setdefault(name, []).append(value)
-        for name, values in worst.items():
+        with tempfile.TemporaryDirectory() as place:
+            found = errors(Path(place), kind, 41, frames=amount(24, 5))
+        for name, value in found.items():
             unit, goal = GOALS[name.partition("_")[0]]
-            figure(f"video_bodies_{kind}_{name}", max(values), unit, goal)
+            figure(f"video_bodies_{kind}_{name}", value, unit, goal)
 
 
 def cameras(setup: Setup) -> Rig:
