@@ -23,6 +23,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.metaballs import ROUNDS, MetaballShape
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.tracking.recording import Recording, spread
@@ -225,9 +226,11 @@ def _by_all(
 
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         world = unknown.world
+        balls = any(isinstance(p, MetaballShape) for p in unknown.parameters)
+        rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE)
         return joint.fit_subject(
             world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
-            times=times, velocities=velocities, rounds=_MATCHES,
+            times=times, velocities=velocities, rounds=rounds, coarse=coarse,
         )  # fmt: skip
 
     points = None
