@@ -93,7 +93,8 @@ class Summary:
     @property
     def parts(self) -> float:
         """[m] mean error of face and hands across the line of sight."""
-        return float(np.nanmean([g.parts for g in self.graded]))
+        seen = [g.parts for g in self.graded if np.isfinite(g.parts)]
+        return float(np.mean(seen)) if seen else float("nan")
 
     @property
     def error(self) -> float:
@@ -199,14 +200,15 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
     """P2's own three conclusions (P2 5), each with whether it holds here.
 
     Well tracked is a mean grade of 1.5 or more with none lost: good as often as only acceptable. Face and hands are
-    where they are seen to half the width of a thigh.
+    where they are seen to half the width of a thigh. What no sequence shows does not hold.
     """
     alone, features, both = (summaries[i] for i in INPUTS)
 
     def well(s: Summary) -> bool:
-        return s.counts[0] == 0 and s.mean_grade >= 1.5
+        return bool(s.graded) and s.counts[0] == 0 and s.mean_grade >= 1.5
 
-    waves = alone.of("wave").mean_grade < both.of("wave").mean_grade
+    wave, waved = alone.of("wave"), both.of("wave")
+    waves = bool(waved.graded) and wave.mean_grade < waved.mean_grade
     return {
         "3D alone: bowing is tracked well, waving worse than with face and hands": well(alone.of("bow")) and waves,
         "2D alone: face and hands are tracked, the body is not": features.parts <= GOOD_MEAN and features.mean_grade < 1.0,
