@@ -216,10 +216,12 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
     }
 
 
-def voodoo_method(run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None) -> Motion:
-    """P2 as printed: parts that move freely, tied by bands."""
+def voodoo_method(
+    run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
+) -> Motion:
+    """P2 as printed: parts that move freely, tied by bands; `model` has the true body's tree, default: that body."""
     parts = free_parts(run.truth.body)
-    fits = voodoo(run.seen(inputs), run.truth.body, start, run.rig, settings)
+    fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings)
     return _motion(run, parts, [parts_state(parts, fit.frames) for fit in fits])
 
 

@@ -123,6 +123,7 @@ def moved_down(
                 R[s], t[s] = R[parents[s]], t[parents[s]]
         frames = move(frames, R, t)
         measured, pull, hold = (p._replace(source=_along(p.source, R, t, p.limb)) for p in (measured, pull, hold))
+        pull = pull._replace(target=_along(pull.target, R, t, pull.limb))  # both of its ends go along
         joint = _along(joint, R, t, bands.parent.segments)
     return frames
 

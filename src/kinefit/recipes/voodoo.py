@@ -72,7 +72,7 @@ class Settings:
     band_rule: Literal["each", "points"] = "each"
     floor: tuple[float, float, float, float] | None = None
     clear: float = 0.05
-    down: bool = False
+    down: bool = True
     stay: float = 0.1
     quality: float = 0.005**2
     stop: float | None = None
