@@ -72,7 +72,8 @@ def shoulders(motion: Motion, rig: Rig, masks: SilhouetteVideo) -> Shoulders:
         for x in pose.positions(points):
             z = camera.T_camera_world[2, :3] @ x + camera.T_camera_world[2, 3]
             size.append(z / camera.matrix[0, 0])
-            cv2.circle(near, tuple(int(round(v)) for v in camera.project(x[None])[0]), round(AROUND / size[-1]), 1, -1)
+            u, v = np.rint(camera.project(x[None])[0]).astype(int)
+            cv2.circle(near, (int(u), int(v)), int(AROUND / size[-1]), 1, -1)
         here = near > 0
         edge = (cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0) & here
         out[0, i] = (seen & mask & here).sum() / max(((seen | mask) & here).sum(), 1)
@@ -107,8 +108,8 @@ def run() -> None:
         for name, body in (("morphing", "humanoid_morphing"), ("stiff", stiff())):
             found[name].append(shoulders(tracked(text, body), seen.rig, seen.silhouettes[k]))
         a, b = (found[name][-1] for name in found)
-        print(f"#   {camera} held out, around the shoulders: overlap {a.overlap.mean():.4f}, stiff {b.overlap.mean():.4f}; "
-              f"outlines {a.distance.mean():.1f} mm, stiff {b.distance.mean():.1f} mm", flush=True)  # fmt: skip
+        print(f"#   {camera} held out, around the shoulders, morphing and stiff: overlap {a.overlap.mean():.4f} and "
+              f"{b.overlap.mean():.4f}, outlines {a.distance.mean():.1f} and {b.distance.mean():.1f} mm", flush=True)
     a, b = ([np.array([getattr(s, field) for s in found[name]]) for field in Shoulders._fields] for name in found)
     for name, sign, own, other, unit in ((names[0], 1.0, a[0], b[0], "of 1"), (names[1], -1.0, a[1], b[1], "mm")):
         mean, error = gain(sign * own, sign * other)

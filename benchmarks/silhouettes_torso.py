@@ -1,4 +1,4 @@
-"""A man's torso into a woman's by three weighting functions ω(t), and local morphs on top (P1 3.2, 3.3, figures 5 to 7).
+"""A man's torso into a woman's by three weighting functions ω(t), and local morphs on top (P1 3.2, 3.3, figs. 5 to 7).
 
 Both are Anny's, which gives all its shapes one topology. Prints how far nodes are from where the blend of both surfaces
 and the sum of both kinds of morphs should have them; draws the page's picture.
@@ -103,7 +103,8 @@ def draw(picture: Path, model: AnnyModel) -> None:
     for weight, raised in (*((w, 0.0) for w in WEIGHTS), ("linear", 90.0)):
         shape = with_morphs(man, target, weight, raised > 0.0)
         tiles = [shaded(shape, at(man, t, raised), view, np.full((240, 240, 3), 255), (190, 200, 215)) for t in TIMES]
-        cv2.putText(tiles[0], weight + (", local morphs" if raised else ""), (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)  # fmt: skip
+        name = weight + (", local morphs" if raised else "")
+        cv2.putText(tiles[0], name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (60, 60, 60), 1, cv2.LINE_AA)
         rows.append(np.hstack(tiles))
     cv2.imwrite(str(picture), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])
 

@@ -28,7 +28,8 @@ def placed(turn):
 def seen(T):
     """The contour of the loop's inside, drawn at four times the size."""
     ring = CAMERA.project(se3.apply(T, CURVE.samples(600)))
-    mask = cv2.fillPoly(np.zeros((960, 1280), np.uint8), [np.rint(16 * (4 * ring + 1.5)).astype(np.int32)], 255, shift=4)
+    ring = np.rint(16 * (4 * ring + 1.5)).astype(np.int32)
+    mask = cv2.fillPoly(np.zeros((960, 1280), np.uint8), [ring], 255, shift=4)
     return outline(cv2.resize(mask, (320, 240), interpolation=cv2.INTER_AREA))
 
 

@@ -152,8 +152,8 @@ def test_a_good_fit_stops_at_once_and_the_steps_are_counted():
 
 def test_icp_stops_where_it_gains_no_more():
     x, _ = skin(500, moved(0.1))
-    fits = [next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, Settings(quality=0.0, stop=stop, steps=(3, 30)))))
-            for stop in (1e9, 1e-6, None)]  # fmt: skip
+    kinds = [Settings(quality=0.0, stop=stop, steps=(3, 30)) for stop in (1e9, 1e-6, None)]
+    fits = [next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, kind))) for kind in kinds]
     assert fits[0].steps == 3 < fits[1].steps < fits[2].steps == 30
 
 
@@ -193,7 +193,8 @@ def test_what_hangs_on_a_limb_goes_with_it():
     x, segment = skin(3000, replace(STATE, T_world_root=turn))
     trunk = [PointCloud("s", 0.0, x[segment == 0], segment=BODY.tree.segments[0])]
     settings = Settings(quality=0.0, steps=(0, 40), maximum=400)
-    down, apart = (next(iter(voodoo([trunk], BODY, STATE, RIG, replace(settings, down=d)))).frames for d in (True, False))
+    down, apart = (next(iter(voodoo([trunk], BODY, STATE, RIG, s))).frames
+                   for s in (settings, replace(settings, down=False)))  # fmt: skip
     angle = [np.arccos(np.clip((np.trace(f[:9].reshape(3, 3) @ g[:9].reshape(3, 3).T) - 1) / 2, -1, 1))
              for f, g in zip(down, FRAMES)]  # fmt: skip
     assert angle[0] > 0.05

@@ -208,10 +208,11 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
         return bool(s.graded) and s.counts[0] == 0 and s.mean_grade >= 1.5
 
     wave, waved = alone.of("wave"), both.of("wave")
+    in_2d = features.parts <= GOOD_MEAN and features.mean_grade < 1.0
     waves = bool(waved.graded) and wave.mean_grade < waved.mean_grade
     return {
         "3D alone: bowing is tracked well, waving worse than with face and hands": well(alone.of("bow")) and waves,
-        "2D alone: face and hands are tracked, the body is not": features.parts <= GOOD_MEAN and features.mean_grade < 1.0,
+        "2D alone: face and hands are tracked, the body is not": in_2d,
         "fusion: bowing and waving are both tracked well": well(both.of("bow")) and well(both.of("wave")),
     }
 

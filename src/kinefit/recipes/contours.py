@@ -1,8 +1,8 @@
 """Pose of a closed 3D contour from its contour in an image, as Rosenhahn and Klette print it (P1 2.2).
 
 1. The contour is a Fourier series; its low-pass approximation comes first, then higher frequencies.
-2. Each of its points is paired with the nearest point of the image's contour (ICP), which stands for a ray of projection,
-   or, with the contour's direction there, for a plane (P1 2.1: 3D point to 2D line).
+2. Each of its points is paired with the nearest point of the image's contour (ICP), which stands for a ray of
+   projection, or, with the contour's direction there, for a plane (P1 2.1: 3D point to 2D line).
 3. The twist of the pose follows from the linear constraints of all pairs at once, and Rodrigues' formula makes a motion
    of it; again until nothing moves.
 """

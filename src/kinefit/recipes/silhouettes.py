@@ -77,8 +77,8 @@ def pose_from_contours(
     model : Body, with its skin and its morphs, or what was made of it once.
     state : BodyState to begin with, the last frame's.
     contours : camera -> (4, N) as `contour_points` gives them, in the image of the calibration.
-    passes : of the low-pass filter of the model's surface (`Morphing.low_pass`), one approximation after the other; 0 is
-        the surface itself.
+    passes : of the low-pass filter of the model's surface (`Morphing.low_pass`), one approximation after the other; 0
+        is the surface itself.
     reach : float [px] beyond which no points are paired.
     cycles : int, at most, of each approximation.
     tolerance : float, of a step (metres and radians) that ends the cycles of one.

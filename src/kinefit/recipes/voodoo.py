@@ -22,9 +22,9 @@ from kinefit.recipes import _voodoo_boxes as boxing
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.recipes._voodoo_input import Sight, sight_of
 
-
 _MOST = 0.5  # [m] by which no limb moves within a frame
-WEIGHTS = {"nose_tip": 30.0, **{f"{side}_{point}": 20.0 for side in "lr" for point in ("wrist", "metacarpal_phalanx_3")}}
+_HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")
+WEIGHTS: Mapping[str, float] = {"nose_tip": 30.0, **dict.fromkeys(_HANDS, 20.0)}
 """Of face and hands (P2 5); all else weighs 1."""
 
 

@@ -137,7 +137,7 @@ def _shaded(scene: Scene, view: View) -> NDArray:
 
 
 def _sleeves(body: Body, view: View) -> list[NDArray]:
-    """(H, W) bool a forearm: its pixels above the wrist, where the hand is part of the forearm and both would be bare."""
+    """(H, W) bool a forearm: its pixels above the wrist, where the hand is part of the forearm: both would be bare."""
     tree, out = body.tree, []
     for side in "lr":
         wrist, name = f"{side}_wrist", f"forearm_{side}"
@@ -162,7 +162,8 @@ def _hair_and_collar(body: Body, view: View) -> tuple[NDArray, NDArray]:
     """
     tree = body.tree
     hair, collar = (np.zeros(view.raster.segment.shape, bool) for _ in range(2))
-    if "head" in tree.segments and "neck" not in tree.segments and {"r_mouth", "r_tragion"} <= set(body.landmarks.names):
+    known = {"r_mouth", "r_tragion"} <= set(body.landmarks.names)
+    if "head" in tree.segments and "neck" not in tree.segments and known:
         segment = tree.segment("head")
         mouth, ear = body.points_rest(body.landmarks.select(("r_mouth", "r_tragion"))) - tree.rest[segment]
         own = view.raster.segment == segment

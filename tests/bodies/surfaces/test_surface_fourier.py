@@ -183,12 +183,12 @@ name = "vase"
 [[segment]]
 name = "vase"
 joint = { name = "free", type = "free" }
-surface = { fourier = "vase.csv", unit = "mm", grid = [12, 9], closed = [true, false], orders = [2, 4], nodes = [24, 10] }
+surface = { fourier = "vase.csv", unit = "mm", grid = [12, 9], closed = [true, false], orders = [2, 4], nodes = [24, 9]}
 """
     (tmp_path / "vase.toml").write_text(text)
     mesh = load_body(tmp_path / "vase.toml").surfaces[0]
     series = FourierSurface.of(grid, closed=(True, False), orders=(2, 4))
-    np.testing.assert_allclose(mesh.vertices, series.triangles((24, 10))[0], atol=1e-9)
+    np.testing.assert_allclose(mesh.vertices, series.triangles((24, 9))[0], atol=1e-9)
     (tmp_path / "vase.toml").write_text(text.replace("[12, 9]", "[12, 8]"))
     with pytest.raises(BodyError, match="108 lines of 3 numbers for a grid of 12 x 8"):
         load_body(tmp_path / "vase.toml")

@@ -32,9 +32,9 @@ class BallRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
 
-    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or a Fourier series: the path of
-    a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or metaballs,
-    from one end of the limb to the other.
+    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or a Fourier series: the path
+    of a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or
+    metaballs, from one end of the limb to the other.
     """
 
     end: Vector | None = None
@@ -72,7 +72,8 @@ def surfaces_of(
         is_cylinder = record.end is not None and record.radii is not None
         is_series = record.fourier is not None and record.grid is not None
         if is_cylinder + (record.mesh is not None) + is_series + bool(record.balls) != 1:
-            remedy = "Give `end` and `radii` of a cylinder, `mesh`, the path of an OBJ file, `fourier` and `grid`, or `balls`."
+            remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, "
+            remedy += "or `fourier` and `grid`, or `balls`."
             raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
         if record.mesh is not None:
             path = Path(source).parent / record.mesh

@@ -24,7 +24,7 @@ def fourier_surface(
     mirror: bool = False,
     place: str | None = None,
 ) -> MeshSurface:
-    """Surface of a segment from a text file of points x, y, z in the segment's frame, a row of the grid after the other.
+    """Surface of a segment from a file of points x,y,z in the segment's frame, a row of the grid after the other.
 
     Parameters
     ----------

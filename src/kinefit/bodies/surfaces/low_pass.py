@@ -1,4 +1,4 @@
-"""Low-pass approximations of a triangle mesh: what a Fourier series without high frequencies is to a surface (P1 2.3)."""
+"""Low-pass approximations of a triangle mesh: what a Fourier series without high ones is to a surface (P1 2.3)."""
 
 from __future__ import annotations
 
