@@ -35,6 +35,7 @@ _LEARN = 2.0  # [s] in which the light may change
 _STIR = 1.0  # [s] for which a movement is remembered
 _MOVED = 10  # [grey levels] by which a pixel differs between pictures where something moved: above a webcam's noise
 _NOBODY = 0.6  # in favour of seeing no hand: less than a hand where it was, more than a patch elsewhere that is still
+_BOWED = 16.0  # square of the face's half size within which it is sought where it is not: bows between two pictures
 _BESIDE = 0.8  # [heights of the face] from its middle to its corners, and to the chin's neck
 _REACH = 4.5  # [heights of the face] an arm's length and half the shoulders' width
 _KEPT = 0.3  # of the first colour stays for good: what is learnt cannot drift away altogether
@@ -172,9 +173,11 @@ class SkinTracker:
         assert face is not None
         v, u = np.nonzero(mask)
         pixels = np.stack([u, v], axis=-1).astype(float)
-        own = pixels[_squares(pixels, face.centre, face.covariance + np.eye(2) * (0.1 * self._height) ** 2) < 4.0]
-        if len(own) > self._least:
-            self._see(FACE, _Patch.of(own, 0.0, -1, False))
+        far = _squares(pixels, face.centre, face.covariance + np.eye(2) * (0.1 * self._height) ** 2)
+        for reach in (4.0, _BOWED):
+            if (far < reach).sum() > self._least:
+                self._see(FACE, _Patch.of(pixels[far < reach], 0.0, -1, False))
+                return
 
     def _hand_near(self, patch: _Patch) -> bool:
         """Whether a hand was on its way to a patch beside the face: else that is the face's own, brow or neck."""
