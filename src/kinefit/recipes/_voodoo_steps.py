@@ -117,7 +117,8 @@ def moved_down(
     for k in range(level.max() + 1):
         pairs = joined(measured, pull, hold._replace(target=joint))
         of = level[pairs.limb] == k
-        R, t = absolute_orientation(*(column[of] for column in pairs), count=count, stay=stay)
+        own_pairs = Pairs(*(column[of] for column in pairs))
+        R, t = absolute_orientation(*own_pairs, count=count, stay=stay)
         for s in range(1, count):
             if level[s] > k:
                 R[s], t[s] = R[parents[s]], t[parents[s]]
