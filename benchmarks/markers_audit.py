@@ -114,6 +114,7 @@ def run() -> None:
         value = float(any(set(f.labels) == pair for f in found) and all(set(f.labels) == pair for f in found))
         title = f"audit_real_{name.rpartition('/')[2].partition('.')[0]}"
         figure(title, value if markers else None, "found", "== 1", why)
+    one_frame()
     flip, subject4 = take(FLIP), take(SUBJECT4)
     found = audit_take(flip, model=learn_model(subject4)) if flip and subject4 else []
     for f in found:
@@ -127,6 +128,31 @@ def run() -> None:
         held_still = {f.name for f in training_gate(poor, learn_model(poor)) if f.kind == "still"}
         figure("gate_walk_wrists_waist_neck", len(held_still & {"hand_r", "hand_l", "pelvis", "head"}), "of 4", "== 4")
     calibration()
+
+
+def one_frame() -> None:
+    """Two labels exchanged for one frame, near each other, with both seen or one hidden: four of each in every take."""
+    rng = np.random.default_rng(3)
+    tried = hits = 0
+    for name in CLEAN[: amount(None, 2)]:
+        markers = take(name)
+        if markers is None:
+            continue
+        column = [markers.names.index(n) for n in learn_model(markers).labels]
+        x = markers.positions[:, column]
+        for hidden in (False, True) * 4:
+            f = int(rng.integers(5, len(markers) - 5))
+            seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
+            a = int(rng.choice(seen))
+            b = int(seen[rng.choice(np.argsort(np.linalg.norm(x[f, seen] - x[f, a], axis=-1))[1:7])])
+            positions = np.array(markers.positions)
+            positions[f, column[a]], positions[f, column[b]] = x[f, b], x[f, a] if not hidden else np.nan
+            found = audit_take(replace(markers, positions=positions, residual=None))
+            pair = {markers.names[column[a]], markers.names[column[b]]}
+            hits += any(set(g.labels) == pair and abs(g.first - f) + abs(g.last - f) <= 2 for g in found)
+            tried += 1
+    why = "" if tried else "no recordings: set KINEFIT_DATA"
+    figure("audit_one_frame_exchanges", 100 * hits / tried if tried else None, "% found", ">= 98", why)
 
 
 def calibration() -> None:

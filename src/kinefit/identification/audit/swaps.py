@@ -115,7 +115,7 @@ def crossings(
 def glitches(
     positions: NDArray, longest: int = 2, least: float = 0.02, better: float = 0.35
 ) -> list[tuple[int, int, int, int]]:
-    """Exchanges of a frame or two (a, b, first, last): one label is where the other passes, and the other there or hidden.
+    """Exchanges of a frame or two (a, b, first, last): one label is where the other passes; the other there, or hidden.
 
     Where each passes is told by the frames just before and after, in which both are seen; see `crossings` for `least`
     and `better`.
