@@ -57,7 +57,7 @@ def whole_take() -> None:
     file = "mocaprecovery/data__85_12.c3d"
     taught, take = load((file, 0.0, 0.45)), load((file, 0.0, 1.0))
     if taught is None or take is None:
-        figure("markers_60s", None, "s", "<= 30", "the recording is absent")
+        figure("markers_60s", None, "s", "<= 20", "the recording is absent")
         return
     x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
     labelled = replace(take, positions=x, residual=None)
@@ -69,7 +69,7 @@ def whole_take() -> None:
     spent, wall = time.process_time() - start, time.perf_counter() - wall
     print(f"# 60 s: {len(points)} frames of {len(labelled.names)} markers in {len(points.names)} columns")
     print(f"# identified in {named:.1f} s, fitted in {spent - named:.1f} s; {wall:.1f} s by the clock on the wall")
-    figure("markers_60s", spent, "s", "<= 30")
+    figure("markers_60s", spent, "s", "<= 20")
 
 
 def both(model: MarkerModel, points: Markers) -> float:
