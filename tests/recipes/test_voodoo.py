@@ -12,6 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.recipes import _voodoo_boxes as boxing
+from kinefit.recipes import _voodoo_motion as motion
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.recipes._voodoo_input import sight_of
 from kinefit.recipes.voodoo import Settings, voodoo
@@ -180,10 +181,10 @@ def test_the_nearest_surface_takes_a_point_of_several_boxes():
 def test_bands_in_proportion_to_points_weigh_as_much_as_those():
     bands, weight = joint_bands(BODY), np.full(90, 2.0)
     measured = steps.Pairs(np.zeros((90, 3)), np.zeros((90, 3)), weight, np.zeros(90, int))
-    own, other = steps.band_weights(bands, measured, 0.5, 40)
+    own, other = motion.band_weights(bands, measured, 0.5, 40)
     total = np.bincount(np.concatenate([bands.parent.segments, bands.child.segments]), np.concatenate([own, other]))
     np.testing.assert_allclose(total, np.where(np.arange(len(total)) == 0, 0.5 * 180.0, 0.5 * 40.0))
-    assert set(np.concatenate(steps.band_weights(bands, measured, 30.0, None))) == {30.0}
+    assert set(np.concatenate(motion.band_weights(bands, measured, 30.0, None))) == {30.0}
 
 
 def test_what_hangs_on_a_limb_goes_with_it():

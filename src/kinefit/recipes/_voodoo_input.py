@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from kinefit.geometry import lines
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.depth import to_points
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.recipes._voodoo_boxes import Boxes, in_body_box
 
 _COLUMNS = 160  # of a depth image that take part, about: those of the time-of-flight camera of P2
 
@@ -44,6 +45,17 @@ class Sight:
     features: PointSet
     lines: NDArray
     lines_weight: NDArray
+
+
+def near_body(
+    sight: Sight, boxes: Boxes, frames: NDArray, reach: float, floor: tuple[float, float, float, float] | None,
+    clear: float,
+) -> Sight:  # fmt: skip
+    """Without free points farther [m] from the body's box, and without those less than `clear` [m] above the floor."""
+    near = in_body_box(sight.free, boxes, frames, reach)
+    if floor is not None:
+        near &= sight.free @ np.array(floor[:3]) > floor[3] + clear
+    return replace(sight, free=sight.free[near], free_weight=sight.free_weight[near])
 
 
 def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str, float]) -> Sight:

@@ -8,7 +8,7 @@ As printed: every limb moves by its own closed form (Horn) to what is nearest to
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,13 +19,13 @@ from kinefit.correspondences.bands import Bands, joint_bands
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Frame
 from kinefit.recipes import _voodoo_boxes as boxing
+from kinefit.recipes import _voodoo_motion as motion
 from kinefit.recipes import _voodoo_steps as steps
-from kinefit.recipes._voodoo_input import Sight, sight_of
+from kinefit.recipes._voodoo_input import Sight, near_body, sight_of
 
 _MOST = 0.5  # [m] by which no limb moves within a frame
 _HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")
-WEIGHTS: Mapping[str, float] = {"nose_tip": 30.0, **dict.fromkeys(_HANDS, 20.0)}
-"""Of face and hands (P2 5); all else weighs 1."""
+_WEIGHTS = {"nose_tip": 30.0, **dict.fromkeys(_HANDS, 20.0)}  # of the face and the hands (P2 5)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Settings:
     Parameters
     ----------
     weights : sensor or feature -> weight
-        A feature's counts before its sensor's; 1 for what is not named (P2 5: ToF 1, face 30, hands 20).
+        A feature's counts before its sensor's; 1 for what is not named.
     body_box, limb_box : float
         Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
     overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
@@ -44,8 +44,7 @@ class Settings:
     bound : float
         Pairs that are farther apart do not count.
     band : float
-        Weight of every band; by `band_rule` "points" that of all bands of a limb together, as a share of that of its
-        measured points (of `minimum` of them, where there are fewer).
+        Weight of each band; by the rule "points" of all bands of a limb, as a share of its points' (of `minimum` ones).
     band_rule : "each" or "points"
     floor : (4,) plane a, b, c, d with a x + b y + c z = d [m], optional
         Free points less than `clear` [m] above it are none of the body's.
@@ -60,7 +59,7 @@ class Settings:
     steps : (int, int) at least and at most.
     """
 
-    weights: Mapping[str, float] = field(default_factory=lambda: dict(WEIGHTS))
+    weights: Mapping[str, float] = field(default_factory=lambda: dict(_WEIGHTS))
     body_box: float = 0.1
     limb_box: float = 0.1
     overlap: boxing.Overlap | Literal["nearest"] = "exclusive"
@@ -110,25 +109,18 @@ def voodoo(
 
 def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> Fit:
     """Steps 1 to 7, until the quality is met, ICP gains no more, or the steps are spent (P2 3.2 and 4.2, fig. 3)."""
-    sight = _in_reach(sight, boxes, frames, s)
+    sight = near_body(sight, boxes, frames, s.body_box + _MOST, s.floor, s.clear)
     (least, most), step, before = s.steps, 0, np.inf
-    measured, ends = _measured(body, frames, sight, boxes, s), steps.band_ends(body, frames, bands)
+    measured, ends = _measured(body, frames, sight, boxes, s), motion.band_ends(body, frames, bands)
     while True:
-        own, other = steps.band_weights(bands, measured, s.band, s.minimum if s.band_rule == "points" else None)
-        now = steps.quality(steps.joined(measured, *steps.band_pairs(bands, ends, own, other)))
+        own, other = motion.band_weights(bands, measured, s.band, s.minimum if s.band_rule == "points" else None)
+        now = steps.quality(steps.joined(measured, *motion.band_pairs(bands, ends, own, other)))
         if step == most or (step >= least and (now <= s.quality or (s.stop is not None and before - now < s.stop))):
             return Fit(frames, now, step)
-        frames = (steps.moved_down if s.down else steps.moved)(body, frames, measured, bands, ends, own, other, s.stay)
-        measured, ends = _measured(body, frames, sight, boxes, s), steps.band_ends(body, frames, bands)
+        moved = motion.moved_down if s.down else motion.moved
+        frames = moved(body, frames, measured, bands, ends, own, other, s.stay)
+        measured, ends = _measured(body, frames, sight, boxes, s), motion.band_ends(body, frames, bands)
         step, before = step + 1, now
-
-
-def _in_reach(sight: Sight, boxes: boxing.Boxes, frames: NDArray, s: Settings) -> Sight:
-    """Without free points that no step will come near to, and without those of the floor."""
-    near = boxing.in_body_box(sight.free, boxes, frames, s.body_box + _MOST)
-    if s.floor is not None:
-        near &= sight.free @ np.array(s.floor[:3]) > s.floor[3] + s.clear
-    return replace(sight, free=sight.free[near], free_weight=sight.free_weight[near])
 
 
 def _measured(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: Settings) -> steps.Pairs:
