@@ -20,6 +20,7 @@ from kinefit.sensors.base import RowsOf
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import onto
+from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.video import track
@@ -132,6 +133,13 @@ def test_what_comes_a_lag_later_is_closed():
     recording = Recording.of_frames(frames(), Rig(()), rate=RATE, sigma={"markers": NOISE}, start=(0, states()[0]))
     motion = track(recording, body(), size=False, settings=STILL, lag=0.1)
     assert off(body(), motion) < 1e-9 and motion.provenance["estimate"] == "fixed lag"
+
+
+def test_a_run_with_checkpoints_keeps_chains_closed(tmp_path):
+    recording = Recording.of_frames(frames(), Rig(()), rate=RATE, sigma={"markers": NOISE}, start=(0, states()[0]))
+    with Checkpoint(tmp_path / "so-far", "key") as checkpoint:
+        motion = track(recording, body(), size=False, settings=STILL, checkpoint=checkpoint)
+    assert off(body(), motion) < 1e-9
 
 
 def test_nearest_points_keep_chains_closed():

@@ -11,7 +11,7 @@ ones are equations for `solvers.closed`, or rows of `STIFF` where a quadratic co
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -158,17 +158,29 @@ def every_closure(body: Body, state: BodyState) -> list[DofRows]:
     return [closure_rows(body, state)] if body.closures else []
 
 
-def hard_equations(body: Body) -> Callable[[BodyState], tuple[NDArray, NDArray]] | None:
+@dataclass(frozen=True, eq=False)
+class HardEquations:
+    """What holds exactly.
+
+    Parameters
+    ----------
+    body : Body
+    hard : (m,) bool, of the body's equations those that do
+    """
+
+    body: Body
+    hard: NDArray
+
+    def __call__(self, state: BodyState) -> tuple[NDArray, NDArray]:
+        """(h,) [m, rad] values and (h, n) Jacobian at a state."""
+        closed = closed_at(self.body, state)
+        return closed.value[self.hard], closed.jacobian[self.hard]
+
+
+def hard_equations(body: Body) -> HardEquations | None:
     """State -> values and Jacobian of what holds exactly; None where nothing does."""
     hard = np.hypot(_table(body).sigma, _loose(body)) == 0.0 if body.closures else np.zeros(0, bool)
-    if not hard.any():
-        return None
-
-    def equations(state: BodyState) -> tuple[NDArray, NDArray]:
-        closed = closed_at(body, state)
-        return closed.value[hard], closed.jacobian[hard]
-
-    return equations
+    return HardEquations(body, hard) if hard.any() else None
 
 
 @lru_cache(maxsize=64)
