@@ -1,7 +1,8 @@
 """Calibration with a bar: drawn rooms of other lenses and places by seed, 0.1 px noise; a drawn recording.
 
 Nothing is given but the pixels of the two targets, in random order, and the length. The
-settings were chosen on other rooms; seeds 100 to 139 took no part. The length is exact, and said to be.
+settings were chosen on other rooms; seeds 100 to 219 took no part: the share of errors within the stated intervals is
+of all of them, as that of one room scatters by 7 %, all else of the first forty. The length is exact, and said to be.
 """
 
 from __future__ import annotations
@@ -21,19 +22,21 @@ from kinefit.geometry.se3 import log_so3
 from kinefit.geometry.triangulation import triangulate
 from kinefit.simulation.bar import bar_rig, draw_bar, see_bar, wave_bar
 
-_NOISE, _LENGTH, _PLACES = 0.1, 0.9, 300
+_NOISE, _LENGTH, _PLACES, _ROOMS = 0.1, 0.9, 300, 40
 
 
 def run() -> None:
     """Print the figures."""
     scales, baselines, noise, inside = [], [], [], []
-    for seed in range(100, 100 + amount(40, 2)):
+    for seed in range(100, 100 + amount(3 * _ROOMS, 2)):
         rig, ends = bar_rig(2 + seed % 4, seed=seed), wave_bar(_LENGTH, _PLACES, seed=seed)
         found = calibrate_bar(see_bar(rig, ends, noise=_NOISE, seed=seed), _LENGTH, length_sigma=1e-6)
-        scale, baseline = _scale(found, rig, seed), _baseline(found, rig)
-        scales, baselines, noise = [*scales, scale], [*baselines, baseline], [*noise, found.sigma_px]
         z = _deviations(found, rig)
         inside.append(np.abs(z) < 1.96)
+        if seed >= 100 + _ROOMS:
+            continue
+        scale, baseline = _scale(found, rig, seed), _baseline(found, rig)
+        scales, baselines, noise = [*scales, scale], [*baselines, baseline], [*noise, found.sigma_px]
         print(
             f"  seed {seed}, {len(rig)} cameras: noise {found.sigma_px:.4f} px, scale {1e6 * scale:+.0f}e-6, "
             f"distances of cameras within {1e6 * baseline:.0f}e-6, deviations' rms {np.sqrt(np.mean(z**2)):.2f}",
@@ -44,6 +47,8 @@ def run() -> None:
     figure("bar_scale_worst", 1e4 * float(np.max(np.abs(scales))), "e-4", "<= 1")
     figure("bar_camera_distances_worst", 1e4 * float(np.max(baselines)), "e-4", "<= 10")
     share = 100 * float(np.mean(np.concatenate(inside)))
+    error = 100 * float(np.std([one.mean() for one in inside]) / np.sqrt(len(inside)))
+    print(f"  {share:.1f} % of all parameters' errors within the 95 % intervals, standard error {error:.1f} %")
     figure("bar_std_coverage_low", share, "%", ">= 93")
     figure("bar_std_coverage_high", share, "%", "<= 97")
     _drawn()

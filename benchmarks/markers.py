@@ -6,7 +6,9 @@ from benchmarks.figures import run_parts
 
 PARTS = {
     "markers_synthetic": "the paper's synthetic test, for its method and for `identify`",
+    "markers_sapm": "the paper's method on real takes, beside `identify`",
     "markers_real": "who is who in real takes, frame by frame and whole",
+    "markers_unknown": "label sets that the catalogue does not know",
     "markers_audit": "models of subjects, and labels that somebody else gave",
     "markers_fit": "bodies and angles beside Plug-in-Gait's and OpenSim's",
     "markers_speed": "time of large sets, and of a whole take from points to angles",

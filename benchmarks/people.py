@@ -8,6 +8,7 @@ PARTS = {
     "people_real": "two people in four real videos, by the built-in detector",
     "people_detectors": "one detector and two, on the real trial",
     "people_turned": "a camera whose calibration is turned, on the real trial",
+    "people_one_camera": "one person before one camera, against markers",
     "people_depth": "one person before real depth cameras",
     "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
 }

@@ -3,7 +3,7 @@
 The body is the catalogue's arm with exact lengths and girths, drawn with 64 corners around and a texture of 2 mm,
 before three cameras of 640x640 px at 1.3 m, noise of 2 grey values, as motion JPEG. `[start]` is off by 4 to 5 degrees
 in every angle. Its shoulder turns with the root, so that the upper arm's turns count as those of the segment in the
-world. Another motion was looked at in development; the figures are of seeds 10 and 11.
+world. Seeds 10 and 11 were looked at in development; the figures are of 12 and 13.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from kinefit.bodies import load_body
+from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
@@ -33,7 +33,7 @@ OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -
 def run() -> None:
     """Print the figures."""
     worst: dict[str, list[float]] = {}
-    for seed in (10, 11)[: amount(2, 1)]:
+    for seed in (12, 13)[: amount(2, 1)]:
         with tempfile.TemporaryDirectory() as place:
             for name, rms in errors(Path(place), seed, frames=amount(40, 6), size=amount(640, 320)).items():
                 worst.setdefault(name, []).append(rms)
@@ -62,14 +62,14 @@ def moving_arm(seed: int, frames: int) -> Motion:
 
 def cameras(size: int) -> Rig:
     """Three cameras beside each other that look at the arm from its side."""
-    out, aim = [], np.array([0.12, -0.27, 0.0])
+    out, aim = [], np.array([0.2, -0.3, 0.0])
     for name, x in (("middle", 0.0), ("left", -0.2), ("right", 0.2)):
-        place = np.array([0.12 + x, -0.2, 1.3])
+        place = np.array([0.2 + x, -0.2, 1.3])
         forward = (aim - place) / np.linalg.norm(aim - place)
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
-        K = np.array([[2.05 * size, 0, size / 2], [0, 2.05 * size, size / 2], [0, 0, 1]])
+        K = np.array([[1.6 * size, 0, size / 2], [0, 1.6 * size, size / 2], [0, 0, 1]])
         out.append(Camera(name, (size, size), K, np.zeros(4), "radtan", se3.transform(R, -R @ place)))
     return Rig(tuple(out))
 
@@ -82,7 +82,7 @@ def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
         code = cv2.VideoWriter_fourcc(*"MJPG")
         video = cv2.VideoWriter(str(folder / f"{camera.name}.avi"), code, motion.rate, camera.size)
         for k in range(len(motion)):
-            grain = 0.002 * 640 / camera.size[0]
+            grain = 0.0026 * 640 / camera.size[0]
             video.write(cv2.cvtColor(textured_picture(scene, k, camera, grain=grain, seed=seed), cv2.COLOR_GRAY2BGR))
         video.release()
     start = {n: float(np.degrees(a)) for n, a in zip(motion.body.tree.coordinates, motion.angles[0])}
@@ -126,14 +126,15 @@ def errors(folder: Path, seed: int, *, frames: int, size: int) -> dict[str, floa
     return {"upperarm": float(np.sqrt(np.mean(np.square(turned)))), **out}
 
 
-def _turn(a, b, motion: Motion) -> float:  # type: ignore[no-untyped-def]
+def _turn(a: BodyState, b: BodyState, motion: Motion) -> float:
     """[deg] between the upper arms of two states."""
     k = motion.body.tree.segments.index("upperarm_r")
-    R = [_frame(motion, s)[k, :9].reshape(3, 3) for s in (a, b)]
+    R = [frames_of(motion, s)[k, :9].reshape(3, 3) for s in (a, b)]
     return float(np.degrees(np.linalg.norm(se3.log_so3(R[0] @ R[1].T))))
 
 
-def _frame(motion: Motion, state) -> NDArray:  # type: ignore[no-untyped-def]
+def frames_of(motion: Motion, state: BodyState) -> NDArray:
+    """(S, 12) frames of the segments."""
     return motion.body.tree.forward(state.T_world_root, state.angles)[0]
 
 

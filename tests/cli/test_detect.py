@@ -51,7 +51,8 @@ class Networks:
         mask = np.zeros((SIZE, SIZE), np.float32)
         mask[64:192, 64:192] = 1
         middle = np.array([128.0, 128.0])
-        return Pose(np.full((33, 2), 128.0), np.ones(33), np.ones(33), middle, middle - (0, 102.4), 1.0, mask)
+        one, lifted = np.ones(33), np.zeros((33, 3))
+        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, mask, lifted)
 
 
 def write_video(path, frames):

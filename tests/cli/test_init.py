@@ -1,6 +1,7 @@
 """`kinefit init`: from a folder to a take that tracks."""
 
 import json
+import shutil
 import threading
 import urllib.request
 from dataclasses import replace
@@ -108,6 +109,27 @@ def test_what_it_writes_can_be_tracked(folder, tmp_path):
     knees = [motion.body.tree.segment(f"shank_{side}") for side in "rl"]
     off = motion.segment_poses()[:, knees, :3, 3] - truth.segment_poses()[:, knees, :3, 3]
     assert np.median(np.linalg.norm(off, axis=-1)) < 0.03
+
+
+@pytest.mark.slow
+def test_one_video_of_a_telephone_can_be_tracked(tmp_path):
+    """A real walk towards the camera, as it is: nothing is lost, knees bend, feet stand."""
+    from benchmarks.figures import data
+
+    recording = data("video_mono_opencap")
+    if recording is None:
+        pytest.skip("no recording")
+    shutil.copy(recording / "walk_ts" / "video.mp4", tmp_path / "walk.mp4")
+    told = run("init", tmp_path)
+    assert told.exit_code == 0 and "walk.mp4 alone" in told.stdout, told.output
+    told = run("track", tmp_path / "take.toml", "--formats", "motion", "--out", tmp_path / "out")
+    assert told.exit_code == 0 and "field of view of 64°" in told.output, told.output
+    motion = kinefit.read_motion(tmp_path / "out" / "motion.npz")
+    assert motion.lost.mean() < 0.05 and motion.quality.mean() > 0.8
+    knee = motion.angles[:, motion.body.tree.coordinate("knee_angle_r")]
+    assert 0.5 < np.ptp(knee) < 1.6  # [rad] of a walk: 60 degrees, give or take
+    walked = motion.joint_centres[-1, 0] - motion.joint_centres[0, 0]
+    assert 0.8 < np.linalg.norm(walked) < 2.5 and walked[1] < 0.0  # a second and a half, towards the camera
 
 
 def clicked(folder, motion, frame=3, names=None):

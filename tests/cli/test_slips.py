@@ -121,15 +121,20 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
         take.with_name(f"mediapipe_{camera}.npy").unlink()
     take.unlink()
     told = run("init", take.parent)
-    assert told.exit_code == 0 and "cam01 alone: one camera does not tell how far a person is" in told.stdout
-    assert "Write a second camera" in told.stdout
+    assert told.exit_code == 0 and "cam01 alone: the built-in detector tells how far limbs are" in told.stdout
+    video = take.read_text()
+    keypoints = '[[keypoints]]\ncamera = "cam01"\nfile = "mediapipe_cam01.npy"\nformat = "mediapipe"\n'
+    take.write_text(f"{video}\n{keypoints}")
     told = run("track", take, "--out", tmp_path / "out")
     assert told.exit_code == 2 and "two cameras do" in told.stderr and "[[depth]]" in told.stderr
     take.with_name("calibration.toml").unlink()
     take.unlink()
     take.with_name("mediapipe_cam01.npy").unlink()
     told = run("init", take.parent)
-    assert told.exit_code == 2 and "one video and no calibration" in told.stderr and "kinefit detect" in told.stderr
+    assert told.exit_code == 0 and "cam01.mp4 alone" in told.stdout and "state height" in told.stdout
+    assert "field_of_view = 64.0" in take.read_text() and "[calibration]" not in take.read_text()
+    told = run("check", take)
+    assert told.exit_code == 0 and "nothing to check it against" in told.stdout
 
 
 @pytest.mark.parametrize(
@@ -229,7 +234,7 @@ def test_check_of_one_camera_says_that_one_is_too_few(take):
     start, *tables = re.split(r"(?m)^(?=\[\[)", text)
     take.write_text(start + "".join(table for table in tables if "cam01" in table))
     told = run("check", take)
-    assert "One camera does not tell how far a person is; two cameras do" in told.stdout
+    assert "Keypoints of one camera do not tell how far a person is; two cameras do" in told.stdout
 
 
 def test_a_take_of_any_table_is_found_in_its_folder(take):

@@ -69,6 +69,72 @@ def test_photographs_of_states_become_tables_meshes_and_pictures(folder, tmp_pat
     assert len(strains) > 20 and np.abs(strains).max() < 0.02
 
 
+def read_vtk(path):
+    """Points, triangles and scalars of a legacy VTK file, read by the format's own rules."""
+    data, at, out = path.read_bytes(), 0, {}
+
+    def line():
+        nonlocal at
+        end = data.index(b"\n", at)
+        text, at = data[at:end].decode(), end + 1
+        return text
+
+    def numbers(kind, count):
+        nonlocal at
+        values = np.frombuffer(data, kind, count, at)
+        at += values.nbytes
+        return values.astype(float)
+
+    assert line().startswith("# vtk DataFile") and line() and line() == "BINARY" and line() == "DATASET POLYDATA"
+    name = None
+    while at < len(data):
+        words = line().split()
+        if words[:1] == ["POINTS"]:
+            out["points"] = numbers(">f8", 3 * int(words[1])).reshape(-1, 3)
+        elif words[:1] == ["POLYGONS"]:
+            out["faces"] = numbers(">i4", int(words[2])).reshape(-1, 4)[:, 1:].astype(int)
+        elif words[:1] == ["SCALARS"]:
+            name = words[1]
+        elif words[:1] == ["LOOKUP_TABLE"]:
+            out[name] = numbers(">f8", len(out["points"]))
+        elif words[:1] == ["VECTORS"]:
+            out[words[1]] = numbers(">f8", 3 * len(out["points"])).reshape(-1, 3)
+    return out
+
+
+def test_two_photographs_of_a_plate_become_a_strain_map(tmp_path):
+    stretch = np.array([[1.004, 0.001], [0.0, 0.998]])
+    for name, image in zip(("before", "after"), scenes.pair((200, 160), deform=stretch, noise=1.0, grain=2.0)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.clip(np.rint(image.grey), 0, 255).astype(np.uint8))
+    files, out = (tmp_path / "before.png", tmp_path / "after.png"), tmp_path / "out"
+    result = call(*files, "--flat", 0.05, "--gauge", 4, "--window", 21, "-o", out)
+    assert result.exit_code == 0 and "strain over" in result.output, result.output
+    mesh = read_vtk(out / "surface_001.vtk")
+    assert len(mesh["faces"]) > 500 and mesh["faces"].max() == len(mesh["points"]) - 1
+    green = 0.5 * (stretch.T @ stretch - np.eye(2))
+    for name, value in (("xx", green[0, 0]), ("yy", green[1, 1]), ("xy", green[0, 1])):
+        assert abs(np.nanmean(mesh[f"strain_{name}"]) - value) < 3e-4
+    np.testing.assert_allclose(mesh["displacement"][:, 2], 0.0)
+    board = 60 + 120 * (np.indices((160, 200)) // 12).sum(axis=0) % 240
+    cv2.imwrite(str(tmp_path / "board.png"), board.astype(np.uint8))
+    told = call(tmp_path / "board.png", tmp_path / "board.png", "--flat", 0.05, "-o", out)
+    assert isinstance(told.exception, ObservationError) and "repeats" in str(told.exception)
+    told = call("a=before.png", *files, "--flat", 0.05, "-o", out)
+    assert isinstance(told.exception, ObservationError) and "a=before.png" in str(told.exception)
+
+
+def test_smoothing_is_heard(folder, tmp_path):
+    std = []
+    for smooth in (0, 1):
+        out = tmp_path / str(smooth)
+        views = f"a={folder / 'a' / '0.png'}", f"b={folder / 'b' / '0.png'}"
+        result = call(folder / "calib.toml", *views, "-o", out, "--step", 20, "--smooth", smooth)
+        assert result.exit_code == 0, result.output
+        std.append((out / "points_000.csv").read_text())
+    assert std[0] != std[1]
+    assert call(folder / "calib.toml", *views, "--smooth", -1).exit_code == 2
+
+
 def test_videos_are_tracked(folder, tmp_path):
     out = tmp_path / "out"
     views = f"a={folder / 'a.avi'}", f"b={folder / 'b.avi'}"

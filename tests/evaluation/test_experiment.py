@@ -40,7 +40,7 @@ def off(metres, frames):
     [
         (0.0, slice(None), 2), (0.055, slice(None), 2), (0.065, slice(None), 1),  # the mean, 60 mm
         (0.16, slice(0, 2), 2), (0.16, slice(0, 3), 1),  # a point over 150 mm in 5 % of 40 frames, and in more
-        (0.26, slice(0, 4), 1), (0.26, slice(0, 5), 0),  # over 250 mm in 10 %, and in more
+        (0.26, slice(0, 20), 1), (0.26, slice(0, 21), 0),  # over 250 mm for a while, and in most of the frames
         (0.26, slice(37, 39), 2), (0.26, slice(38, 40), 0),  # found again before the end, or not
     ],
 )  # fmt: skip
@@ -91,9 +91,9 @@ def test_a_sequence_holds_what_both_cameras_saw(run):
     gap = np.array([f.uv - colour.project(run.truth.body.positions(run.truth.state(k), points))
                     for k, f in enumerate(run.features)])  # fmt: skip
     seen = np.isfinite(gap[..., 0])
-    assert seen.mean() > 0.9 and 1.0 < np.nanstd(gap) < 3.0
+    assert seen.mean() > 0.8 and np.nanmedian(np.abs(gap)) < 4.0  # found by the colour of the skin
     assert [len(frames) for frames in (run.seen("3d")[0], run.seen("2d")[0], run.seen("fusion")[0])] == [1, 1, 2]
-    x = run.truth.body.positions(run.truth.state(0), points)[1]
+    x = run.truth.body.positions(run.truth.state(0), run.truth.body.landmarks.select(("l_wrist",)))[0]
     u, v = np.round(depth.project(x)).astype(int)
     z = (depth.T_camera_world[:3, :3] @ x + depth.T_camera_world[:3, 3])[2]
     window = np.asarray(run.depth[0].depth)[v - 2 : v + 3, u - 2 : u + 3]
@@ -132,15 +132,19 @@ def test_no_arm_is_stretched_in_a_bow():
     assert np.isnan(stretched_share(bow, bow.truth))
 
 
-def summary(inputs, grades, error, stretched=1.0):
-    return Summary(inputs, tuple(Graded("m", Grade(g, error, error), stretched) for g in grades))
+def summary(inputs, grades, parts=0.03):
+    return Summary(inputs, tuple(Graded(m, Grade(g, 0.05, 0.1), parts, 1.0) for m, g in grades))
 
 
-def test_conclusions_hold_where_grade_and_error_are_better():
-    alone = {"3d": summary("3d", [1, 2], 0.05), "2d": summary("2d", [0, 0], 0.2)}
-    assert all(conclusions(alone | {"fusion": summary("fusion", [2, 2], 0.03)}).values())
-    worse = conclusions(alone | {"fusion": summary("fusion", [2, 2], 0.06, stretched=0.5)})
-    assert list(worse.values()) == [False, True, False]
+def test_the_papers_three_conclusions():
+    alone = {"3d": summary("3d", [("bow", 2), ("wave", 0)]), "2d": summary("2d", [("bow", 0), ("wave", 1)])}
+    both = {"fusion": summary("fusion", [("bow", 2), ("wave", 2), ("kick", 0)])}
+    assert all(conclusions(alone | both).values())
+    as_good = conclusions(alone | {"fusion": summary("fusion", [("bow", 2), ("wave", 0)])})
+    assert list(as_good.values()) == [False, True, False]
+    off = conclusions(alone | both | {"2d": summary("2d", [("bow", 0), ("wave", 1)], parts=0.2)})
+    assert list(off.values()) == [True, False, True]
+    assert both["fusion"].named.counts == (0, 0, 2) and both["fusion"].of("kick").counts == (1, 0, 0)
 
 
 def test_the_published_method_follows_arms_stretched_at_the_sensor(run):
@@ -152,4 +156,4 @@ def test_the_published_method_follows_arms_stretched_at_the_sensor(run):
 def test_the_command_prints_the_table():
     told = CliRunner().invoke(main, ["evaluate", "--count", "1", "--method", "voodoo", "-v"])
     assert told.exit_code == 0, told.output
-    assert "mean grade" in told.stdout and "fusion is better than 3D alone" in told.stdout and "point" in told.stdout
+    assert "mean grade" in told.stdout and "fusion: bowing and waving" in told.stdout and "point" in told.stdout

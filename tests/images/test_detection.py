@@ -115,9 +115,25 @@ def test_keypoints_are_in_the_frame_of_the_calibration(draw, models):
     assert keypoints.times[0] == 0.5
 
 
+def test_lifted_landmarks_turn_with_the_picture(draw, models):
+    """Of the network they are along the crop's axes, of the record along the picture's, then the calibration's."""
+    found = detect([draw((100, 120, 30))] * 3, models)
+    turned = Roi(np.zeros(2), 100.0, np.pi / 2).to_upright(np.array([[0.1, 0.2, 0.3]]))
+    assert np.allclose(turned, [[-0.2, 0.1, 0.3]])  # the crop's up is the picture's right: its u runs down the picture
+    assert found.lifted.shape == (3, 1, 33, 3) and np.allclose(np.linalg.norm(found.lifted, axis=-1), np.sqrt(0.14))
+    assert np.allclose(found.lifted[..., 2], 0.3)
+    frame = ImageFrame.rotated((240, 320), 90)
+    there = found.keypoints("left", image_frame=frame)
+    step = frame.to_calibration(found.points[0, 0, :1] + found.lifted[0, 0, :1, :2]) - there.points[0, 0, :1]
+    assert np.allclose(there.lifted[0, 0, 0, :2], step[0]) and np.allclose(there.lifted[..., 2], 0.3)
+
+
 def test_arrays_that_do_not_fit_are_refused():
     with pytest.raises(ObservationError, match="starts of masks"):
         Detections("c", 1.0, (4, 4), np.zeros((2, 1, 33, 2)), np.zeros((2, 1, 33)), np.zeros(0), np.zeros(2))
+    with pytest.raises(ObservationError, match="lifted landmarks"):
+        some = np.zeros((2, 1, 33, 2)), np.zeros((2, 1, 33)), np.zeros(0), np.zeros(3)
+        Detections("c", 1.0, (4, 4), *some, lifted=np.zeros((2, 1, 33, 2)))
 
 
 @given(
@@ -129,7 +145,7 @@ def test_runs_are_those_of_the_mask_drawn_into_the_whole_picture(turn, side, cen
     noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE)).astype(np.float32)
     soft = np.clip(0.5 + 8 * cv2.GaussianBlur(noise, (0, 0), 12), 0, 1)
     soft[[0, 1, -2, -1]] = soft[:, [0, 1, -2, -1]] = 0
-    pose = Pose(*np.zeros((5, 1)), 1.0, soft)
+    pose = Pose(*np.zeros((5, 1)), 1.0, soft, np.zeros((33, 3)))
     runs = mask_runs(pose, roi, (height, width))
     found = Detections(
         "c", 1.0, (width, height), np.zeros((1, 1, 33, 2)), np.zeros((1, 1, 33)), runs, np.array([0, len(runs)])

@@ -1,5 +1,7 @@
 """The file of the built-in detector: written whole, read back, refused when damaged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,8 @@ def found():
     points[:2, 1], confidence[:2, 1] = np.nan, 0
     runs = [[5, 2, 17], [0, 24], [24], [23, 1]]  # of (0, 0), (1, 0), (2, 0), (2, 1)
     starts = np.cumsum([0, 3, 0, 2, 0, 1, 2])
-    return Detections("left", 50.0, (6, 4), points, confidence, np.concatenate(runs), starts, "left.mp4")
+    lifted = np.where(np.isfinite(points[..., :1]), rng.normal(size=(3, 2, 33, 3)), np.nan)
+    return Detections("left", 50.0, (6, 4), points, confidence, np.concatenate(runs), starts, "left.mp4", lifted)
 
 
 def test_what_is_written_is_read(found, tmp_path):
@@ -27,6 +30,10 @@ def test_what_is_written_is_read(found, tmp_path):
     assert (read.camera, read.rate, read.size, read.source) == ("left", 50.0, (6, 4), str(path))
     assert np.allclose(read.points, found.points, equal_nan=True, atol=1e-5)
     assert np.allclose(read.confidence, found.confidence, atol=1e-6)
+    assert np.allclose(read.lifted, found.lifted, equal_nan=True, atol=1e-6)
+    bare = replace(found, lifted=None)
+    write_detections(bare, path, key="the key")
+    assert read_detections(path).lifted is None
     assert read.seen.tolist() == [[True, False], [True, False], [True, True]]
     for f in range(3):
         for p in range(2):

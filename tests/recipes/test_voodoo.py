@@ -132,7 +132,7 @@ def test_a_body_all_of_whose_skin_is_seen_is_found():
     truth = moved(0.3)
     x, segment = skin(4000, truth)
     seen = [PointCloud("scan", 0.0, x[segment == s], segment=name) for s, name in enumerate(BODY.tree.segments)]
-    settings = Settings(factor=1.0, maximum=400, quality=1e-8, steps=60)
+    settings = Settings(factor=1.0, maximum=400, quality=1e-8, steps=(0, 60))
     (fit,) = voodoo([seen], BODY, STATE, RIG, settings)
     frames, _ = BODY.tree.forward(truth.T_world_root, truth.angles)
     for name in ("r_wrist", "l_ankle", "neck", "r_elbow"):
@@ -144,10 +144,62 @@ def test_a_body_all_of_whose_skin_is_seen_is_found():
 
 def test_a_good_fit_stops_at_once_and_the_steps_are_counted():
     x, _ = skin(500)
-    near, spent = (next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, Settings(quality=q, steps=4))))
+    near, spent = (next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, Settings(quality=q, steps=(0, 4)))))
                    for q in (1e-3, 0.0))  # fmt: skip
     assert near.steps == 0 and np.array_equal(near.frames, FRAMES)
     assert spent.steps == 4
+
+
+def test_icp_stops_where_it_gains_no_more():
+    x, _ = skin(500, moved(0.1))
+    kinds = [Settings(quality=0.0, stop=stop, steps=(3, 30)) for stop in (1e9, 1e-6, None)]
+    fits = [next(iter(voodoo([[PointCloud("s", 0.0, x)]], BODY, STATE, RIG, kind))) for kind in kinds]
+    assert fits[0].steps == 3 < fits[1].steps < fits[2].steps == 30
+
+
+def test_the_floor_is_left_out_by_its_plane():
+    """Points below the feet would draw the shanks down; with their plane they count for nothing."""
+    low = FRAMES[:, 10].min() - 0.45
+    u, v = np.meshgrid(np.linspace(-0.3, 0.3, 40), np.linspace(-0.3, 0.3, 40))
+    cloud = [PointCloud("s", 0.0, np.stack([u.ravel(), np.full(u.size, low), v.ravel()], axis=1))]
+    nothing = [PointCloud("s", 0.0, np.zeros((0, 3)))]
+    s = Settings(floor=(0.0, 1.0, 0.0, low), limb_box=0.3, bound=0.3, body_box=0.3)
+    fits = [next(iter(voodoo([seen], BODY, STATE, RIG, settings))).frames
+            for seen, settings in ((cloud, replace(s, floor=None)), (cloud, s), (nothing, s))]  # fmt: skip
+    assert np.abs(fits[0] - fits[2]).max() > 0.02
+    np.testing.assert_array_equal(fits[1], fits[2])
+
+
+def test_the_nearest_surface_takes_a_point_of_several_boxes():
+    x, segment = skin(600)
+    member = steps.nearest_limb(BODY, FRAMES, x, 0.1)
+    assert (member.sum(axis=1) == 1).all()
+    assert member[np.arange(len(x)), segment].mean() > 0.9  # some lie within another limb's surface
+
+
+def test_bands_in_proportion_to_points_weigh_as_much_as_those():
+    bands, weight = joint_bands(BODY), np.full(90, 2.0)
+    measured = steps.Pairs(np.zeros((90, 3)), np.zeros((90, 3)), weight, np.zeros(90, int))
+    own, other = steps.band_weights(bands, measured, 0.5, 40)
+    total = np.bincount(np.concatenate([bands.parent.segments, bands.child.segments]), np.concatenate([own, other]))
+    np.testing.assert_allclose(total, np.where(np.arange(len(total)) == 0, 0.5 * 180.0, 0.5 * 40.0))
+    assert set(np.concatenate(steps.band_weights(bands, measured, 30.0, None))) == {30.0}
+
+
+def test_what_hangs_on_a_limb_goes_with_it():
+    """Only the trunk is seen, turned: all limbs turn with it, and none of the bands is stretched."""
+    turn = np.array(STATE.T_world_root)
+    turn[:3, :3] = [[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]]
+    x, segment = skin(3000, replace(STATE, T_world_root=turn))
+    trunk = [PointCloud("s", 0.0, x[segment == 0], segment=BODY.tree.segments[0])]
+    settings = Settings(quality=0.0, steps=(0, 40), maximum=400)
+    down, apart = (next(iter(voodoo([trunk], BODY, STATE, RIG, s))).frames
+                   for s in (settings, replace(settings, down=False)))  # fmt: skip
+    angle = [np.arccos(np.clip((np.trace(f[:9].reshape(3, 3) @ g[:9].reshape(3, 3).T) - 1) / 2, -1, 1))
+             for f, g in zip(down, FRAMES)]  # fmt: skip
+    assert angle[0] > 0.05
+    np.testing.assert_allclose(angle[1:], angle[0], atol=0.03)
+    assert np.abs(down - apart).max() > 0.01
 
 
 def test_nothing_seen_leaves_the_body_where_it_was():

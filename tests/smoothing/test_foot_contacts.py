@@ -37,3 +37,17 @@ def test_what_rests_is_held_until_it_is_twice_as_fast(speed, held_on):
 
 def test_what_is_only_nearly_slow_never_rests():
     assert not contacts(np.zeros(100), 0.2 * np.arange(100) / RATE).any()
+
+
+def test_one_camera_alone_holds_what_hardly_moves_in_its_image():
+    """Along the camera's ray a sole may seem to wander, at any height; across it moves as it does."""
+    t = np.arange(100) / RATE
+    angles = np.zeros((100, len(BODY.tree.coordinates)))
+    for along, held in ((True, True), (False, False)):
+        roots = np.tile(np.eye(4), (100, 1, 1))
+        roots[:, 2 if along else 0, 3] = 0.5 * t  # half a metre a second
+        found = find_contacts(BODY, roots, angles, RATE, "y", np.array([0.0, -0.9, -50.0]))
+        assert (found.weight > 0).any(axis=1).all() == held
+        assert (found.weight > 0).any() == held
+        rests = found.places[found.weight[:, 0] > 0]
+        assert np.array_equal(rests, np.broadcast_to(rests[:1], rests.shape))

@@ -3,6 +3,9 @@
 import cv2
 import numpy as np
 import pytest
+from benchmarks.regions_cat import truth
+from benchmarks.regions_scene import away
+from benchmarks.silhouettes_cat import take_by_silhouettes
 from click.testing import CliRunner
 from tests.sensors.scenes import posture, ring
 from tests.sensors.test_silhouette import calibration, silhouettes
@@ -202,3 +205,13 @@ def test_a_start_and_a_size_beside_what_says_them_too(rigid, line, message):
     path.write_text(text.replace("[take]\n", f"[take]\n{line}\n"))
     with pytest.raises(TakeError, match=message):
         read_take(path)
+
+
+def test_a_real_toy_is_followed_by_the_silhouette_of_its_colour(data_dir, tmp_path):
+    """P1 2.4 on real images: mesh, first pose and a threshold on hue, through a take file."""
+    folder = data_dir("region_cat")
+    poses = truth(folder, 5)
+    motion = track_take(take_by_silhouettes(folder, tmp_path, poses[0], 5))[0]
+    off = np.array([away(motion.Ts_world_root[i], poses[i]) for i in range(1, 5)])
+    assert off[:, 0].max() < 20.0 and off[:, 1].max() < 10.0  # [mm], [deg]; the truth is good to 5.5 and 2.4
+    assert motion.quality.min() > 0.7

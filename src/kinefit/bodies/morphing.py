@@ -7,6 +7,7 @@ adds to it, which P1 holds constant.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +26,7 @@ from kinefit.bodies.operators import (
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.steering import Steering
 from kinefit.bodies.surfaces import _kernels_skinning as kernels
+from kinefit.bodies.surfaces.low_pass import low_pass
 from kinefit.bodies.surfaces.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, triangles
 from kinefit.errors import BodyError, choices
@@ -112,6 +114,13 @@ class Morphing:
     def moves_joints(self) -> bool:
         """Some joint moves with an angle, so that frames are not those of the tree alone."""
         return bool(self._motions)
+
+    def low_pass(self, passes: int) -> Morphing:
+        """The same with a skin without high frequencies (`surfaces.low_pass`), which a fit may begin with (P1 2.4)."""
+        out, skin = copy(self), self.skin
+        shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
+        out.skin = out.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
+        return out
 
     def _share(self, morph: LocalMorph) -> NDArray:
         """(V, 1) how much of each node belongs to segments that a local morph acts on."""

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
 from kinefit.cli._results import check_file
 from kinefit.cli._screen import Step
@@ -21,6 +23,9 @@ from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.people import identify_people, one_after_the_other
 from kinefit.identification.take.takes import TakeIdentification, TakeSettings
 from kinefit.observations import Markers
+
+if TYPE_CHECKING:
+    from kinefit.markers.first_set import FirstSet
 
 
 def learn_files(
@@ -46,12 +51,12 @@ def learn_files(
     name = name or Path(paths[0]).stem
     if frame is None:
         model = learn_model(markers, name=name, template=marker_set)
-        return model, training_gate(markers, model)
+        return model, training_gate(markers, model, marker_set=load_marker_set(marker_set) if marker_set else None)
     known = load_marker_set(marker_set) if marker_set else find_marker_set(markers.names)
     if known is None:
         raise ObservationError(
             "no marker set of the catalogue knows the labels", file=str(paths[0]),
-            remedy="Name one (--set), or learn from a take in which all joints move.",
+            remedy="Name one (--set; `kinefit markers set` writes one), or learn from a take in which all joints move.",
         )
     if not -1 <= frame < len(markers):
         problem = f"no frame {frame}: there are {len(markers)}"
@@ -59,7 +64,27 @@ def learn_files(
     chosen = int(np.argmax(np.isfinite(markers.positions[..., 0]).sum(1))) if frame < 0 else frame
     model = model_from_frame(markers.positions[chosen], markers.names, known, name=name)
     shown = replace(markers, positions=markers.positions[chosen : chosen + 1], residual=None)
-    return model, training_gate(shown, model)
+    return model, training_gate(shown, model, marker_set=known)
+
+
+def write_first_set(
+    paths: Sequence[str | PathLike[str]], out: str | PathLike[str], *, name: str | None = None, unit: str | None = None
+) -> FirstSet:
+    """A first marker set of labelled takes of one subject, written to a file (.toml): see `first_set`.
+
+    Raises
+    ------
+    KinefitError
+        A file cannot be read or written, or shows too little.
+    """
+    from kinefit.exporters.atomic import write_text
+    from kinefit.markers.first_set import first_set
+    from kinefit.readers.markers import read_markers
+
+    markers = one_after_the_other([read_markers(path, unit=unit) for path in paths])
+    found = first_set(markers, body=load_body("humanoid"), name=name or Path(out).stem.upper())
+    write_text(Path(out), found.text)
+    return found
 
 
 def identify_file(

@@ -44,13 +44,14 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     nobody = np.flatnonzero(motion.quality <= 0)
     if len(nobody):
         say(f"nobody seen: frames {frame_ranges(nobody)}")
-    gone = lost_segments(motion)
-    never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
-    if never:
-        say(f"nothing supports: {', '.join(never)} (no frame)")
-    for name, frames in gone.items():
-        if name not in never:
-            say(f"lost: {name} in frames {frame_ranges(frames)}")
+    bare = without_markers(motion)
+    for told, gone in (("no markers", bare), ("lost", lost_segments(motion))):
+        never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
+        if never:
+            say(f"{'nothing supports' if told == 'lost' else told + ' on'}: {', '.join(never)} (no frame)")
+        for name, frames in gone.items():
+            if name not in never:
+                say(f"{told}: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
     say("bone lengths [cm]: " + ", ".join(lengths))
     if points:
@@ -73,10 +74,29 @@ def frame_ranges(frames: NDArray) -> str:
 
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:
-    """Segments that are lost, and in which frames somebody was tracked all the same."""
+    """Segments that are lost, and in which frames somebody was tracked all the same; not those that bore no markers."""
     gone = motion.lost & (motion.quality > 0)[:, None]
+    for name, frames in without_markers(motion).items():
+        gone[frames, motion.body.tree.segment(name)] = False
     lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
     return {name: frames for name, frames in lost.items() if len(frames)}
+
+
+def without_markers(motion: Motion) -> dict[str, NDArray]:
+    """Segments that markers alone would tell, in frames of which none is seen: they hang on their neighbours.
+
+    Empty where other sensors looked too.
+    """
+    told = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
+    if not told or len(told) < len(motion.residuals):
+        return {}
+    seen = np.zeros((len(motion), len(motion.body.tree.segments)), bool)
+    for r in told:
+        for s in np.unique(r.segments):
+            seen[:, s] |= np.isfinite(r.norms[:, r.segments == s]).any(axis=1)
+    bare = motion.lost & ~seen & (motion.quality > 0)[:, None]
+    found = {name: np.flatnonzero(bare[:, s]) for s, name in enumerate(motion.body.tree.segments)}
+    return {name: frames for name, frames in found.items() if len(frames)}
 
 
 def bone_lengths(motion: Motion) -> dict[str, str]:

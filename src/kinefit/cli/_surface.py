@@ -25,6 +25,7 @@ from kinefit.exporters.surface_files import (
 )
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.fields import field_camera, field_of
+from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.spline_image import SplineImage
@@ -55,6 +56,7 @@ class Wanted:
     incremental: bool
     still: int | None
     field: str | None
+    smooth: float
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all."""
@@ -154,9 +156,9 @@ def with_field(rig: Rig, field: str | None) -> Rig:
     return rig if field is None else Rig(tuple(field_camera(camera, field) for camera in rig))  # type: ignore[arg-type]
 
 
-def spline_of(image: NDArray, field: str | None) -> SplineImage:
-    """An image, or a field of it."""
-    return SplineImage.of(image if field is None else field_of(image, field))  # type: ignore[arg-type]
+def spline_of(image: NDArray, field: str | None, smooth: float) -> SplineImage:
+    """An image, or a field of it, smoothed by [px]."""
+    return SplineImage.of(image if field is None else field_of(image, field), smooth=smooth)  # type: ignore[arg-type]
 
 
 def mask_of(path: Path | None, field: str | None) -> NDArray | None:
@@ -173,7 +175,7 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
     count = len(views.photographs[0])
     if wanted.still is not None and wanted.still >= count:
         raise ObservationError(f"state {wanted.still} of {count}", remedy="The first is 0; --still names another one.")
-    states = _States(views.photographs, wanted.field)
+    states = _States(views.photographs, wanted.field, wanted.smooth)
     first = states[0]
     grid = Grid.of(first[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
@@ -182,18 +184,46 @@ def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progre
         rig, states, grid, seeds=seeds, window=window, incremental=wanted.incremental, progress=progress,
         least=LEAST_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
+    return _write_all(surfaces, views.photographs[0], wanted, int(np.max(window)))
+
+
+def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: Wanted) -> list[str]:
+    """Measure a flat surface in photographs of one camera and write it; what to say about it.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than two photographs, views with names of cameras, or --seeds.
+    """
+    named = [str(p) for p in photographs if p.suffix.lower() not in _PHOTOGRAPHS or ("=" in p.name and not p.exists())]
+    if named or wanted.seeds is not None or len(photographs) < 2:
+        problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
+        raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
+    states = [spline_of(read_picture(path), wanted.field, wanted.smooth) for path in photographs]
+    grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
+    window = wanted.side(states[0], states[1], grid)
+    surfaces = measure_flat(
+        states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
+        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+    )  # fmt: skip
+    return _write_all(surfaces, photographs, wanted, int(np.max(window)))
+
+
+def _write_all(surfaces: Sequence[Surface], photographs: Sequence[Path], wanted: Wanted, window: int) -> list[str]:
+    """Write all states; lines about them."""
     told = []
     for k, surface in enumerate(surfaces):
         reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
-        told += _write(surface, reference, _grey(views.photographs[0][k], wanted.field), wanted, k, int(np.max(window)))
+        told += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
     return told
 
 
 class _States(Sequence[list[SplineImage]]):
     """Images of all cameras in each state, read when they are asked for: the first and the latest are kept."""
 
-    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None) -> None:
-        self._files, self._field, self._kept = photographs, field, dict[int, list[SplineImage]]()
+    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None, smooth: float) -> None:
+        self._files, self._field, self._smooth = photographs, field, smooth
+        self._kept = dict[int, list[SplineImage]]()
 
     def __len__(self) -> int:
         return len(self._files[0])
@@ -201,7 +231,7 @@ class _States(Sequence[list[SplineImage]]):
     def __getitem__(self, k: Any) -> Any:
         if k not in self._kept:
             self._kept = {j: images for j, images in self._kept.items() if j == 0}
-            self._kept[k] = [spline_of(read_picture(files[k]), self._field) for files in self._files]
+            self._kept[k] = [spline_of(read_picture(files[k]), self._field, self._smooth) for files in self._files]
         return self._kept[k]
 
 
@@ -290,7 +320,7 @@ def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -
         tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds)
         told = []
         for k in range(count):
-            images = [spline_of(video.read(k), wanted.field) for video in videos]
+            images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
             try:
                 points = tracker.update(images)
             except TrackingError as error:

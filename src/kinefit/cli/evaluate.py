@@ -38,7 +38,7 @@ def evaluate(
     """Track simulated sequences of known motion and grade each 0 (lost), 1 (acceptable) or 2 (good).
 
     2: the joints are off by at most 60 mm on average, none by more than 150 mm in over 5 % of the frames. 0: one is
-    off by more than 250 mm in over 10 % of the frames, or at the end.
+    off by more than 250 mm at the end, or in most of the frames: lost and not recovered.
     """
     from kinefit.evaluation.sequences import sequences
     from kinefit.evaluation.voodoo import METHODS, conclusions, found_start
@@ -53,6 +53,11 @@ def evaluate(
         )
     for line in _table(list(summaries.values())):
         _screen.say(line)
+    if any(s.named.graded for s in summaries.values()):
+        _screen.say()
+        _screen.say("the six movements that the paper names:")
+        for line in _table([s.named for s in summaries.values()]):
+            _screen.say(line)
     _screen.say()
     for text, holds in conclusions(summaries).items():
         _screen.say(f"{'yes' if holds else 'NO ':3}  {text}")

@@ -20,6 +20,7 @@ MOST_DOUBTS = 12
 _EXAMPLES = """\b
 Examples:
   kinefit markers learn labelled.c3d -o anna.json         what Anna's markers hold to each other
+  kinefit markers set labelled.c3d -o lab.toml            a first marker set for labels that are not known
   kinefit markers identify walk.c3d anna.json             names for the points of an unlabelled take
   kinefit markers fit walk-named.c3d                      body, joint angles, .mot, BVH, GLB
   kinefit markers fit walk.c3d --subject anna.json        both in one
@@ -75,6 +76,39 @@ def learn(
         for f in findings:
             _screen.say(f"  {f}")
     _screen.say(f"\nWritten: {out}")
+
+
+@markers.command("set", epilog="""\b
+Examples:
+  kinefit markers set range_of_motion.c3d -o lab.toml
+  kinefit markers learn range_of_motion.c3d --set lab.toml -o anna.json
+""")  # fmt: skip
+@click.argument("takes", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--out", type=_FILE, help="File of the set.  [default: TAKE.toml]")
+@click.option("--name", help="Of the set.  [default: of the file]")
+@_unit
+@_screen.verbose_option
+def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit: str | None, verbose: bool) -> None:
+    """Write a first marker set for labels that the catalogue does not know.
+
+    TAKES are labelled takes of one subject in which joints move. Labels are paired left and right, those with words
+    that the catalogue knows are laid on the humanoid's landmarks, and every marker goes to the segment that it moves
+    with. Look through the file before you learn with it.
+    """
+    from kinefit.cli._name_markers import write_first_set
+    from kinefit.cli._results import check_file
+
+    out = out or Path(f"{takes[0].stem}.toml")
+    check_file(out)
+    found = write_first_set(takes, out, name=name, unit=unit)
+    for segment, labels in found.segments.items():
+        _screen.say(f"  {segment}: {', '.join(labels)}")
+    if not found.placed:
+        _screen.say("Too few labels have words that the catalogue knows: the groups are what moved together. Give each")
+        _screen.say("the name of its body part and its parent; add [places] and [markers] if a body is to be fitted.")
+    _screen.say(f"{len(found.paired)} pairs of left and right, {len(found.placed)} markers placed on the humanoid")
+    _screen.say(f"\nWritten: {out}")
+    _screen.say(f"Next: look through it, then kinefit markers learn {takes[0].name} --set {out}")
 
 
 @markers.command(epilog="""\b

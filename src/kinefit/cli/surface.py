@@ -13,6 +13,7 @@ Examples:
   kinefit surface calib.toml left=left.png right=right.png            points, mesh, standard deviations
   kinefit surface calib.toml 201=states/201 202=states/202 --gauge 5  folders: states of one surface; strain over 5 mm
   kinefit surface calib.toml a=a.mp4 b=b.mp4 --window 21              videos: the surface is tracked
+  kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm a pixel
 """
 
 
@@ -26,36 +27,45 @@ Examples:
 @click.option("--mask", type=click.Path(path_type=Path), help="PNG over the first image, black where no point is.")
 @click.option(
     "--seeds", type=click.Path(path_type=Path),
-    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: SIFT]",
+    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: they are found]",
 )  # fmt: skip
 @click.option("--least", type=click.FloatRange(0, 1), help="Correlation of a match.  [default: 0.8]")
 @click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Strain over this length [mm].")
 @click.option("--incremental", is_flag=True, help="Match and strain each state against the one before, not the first.")
 @click.option("--still", type=click.IntRange(1), help="State of nothing moved: strain to it is the noise floor.")
+@click.option(
+    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="[px] of a Gaussian, for texture sharper than pixels."
+)
+@click.option(
+    "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
+    help="Photographs of one camera that faces a flat surface; MM are the millimetres that a pixel shows.",
+)  # fmt: skip
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
-    field: str | None, verbose: bool,
+    smooth: float, flat: float | None, field: str | None, verbose: bool,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 
     CALIBRATION is any that `kinefit` reads; each CAMERA=PATH names one of its cameras and its photograph, its folder of
     photographs (states, in the order of the names) or its video. The first camera's first image holds the grid of
     points.
+
+    With --flat no calibration is needed: all arguments are photographs, before and after.
     """
     from kinefit.cli._results import check_folder
-    from kinefit.cli._surface import Wanted, measure_photographs, measure_videos, read_views
+    from kinefit.cli._surface import Wanted, measure_one_camera, measure_photographs, measure_videos, read_views
 
     check_folder(out)
-    rig, paths = read_views(calibration, unit, views)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field)
-    with _screen.bars() as progress:
-        if paths.videos:
-            told = measure_videos(rig, paths, wanted, progress)
-        else:
-            told = measure_photographs(rig, paths, wanted, progress)
+    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth)
+    if flat is not None:
+        told = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
+    else:
+        rig, paths = read_views(calibration, unit, views)
+        with _screen.bars() as progress:
+            told = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
     for line in told:
         _screen.say(line)
     _screen.say(f"\nWritten: {out}")

@@ -1,4 +1,4 @@
-"""Outline to outline: rim points of the body towards the contour of its silhouette (P1 4.1)."""
+"""Outline to outline: rim points of the body towards the contour of its silhouette (P1 2.3)."""
 
 from __future__ import annotations
 

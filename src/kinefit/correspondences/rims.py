@@ -1,4 +1,4 @@
-"""The outline of a body as a camera would see it: rim points of its mesh, by a virtual image (P1 4.1).
+"""The outline of a body as a camera would see it: rim points of its mesh, by a virtual image (P1 2.3).
 
 A rim point lies on an edge between a triangle that looks at the camera and one that does not. The virtual image, depth
 and triangle of every pixel, tells whether it is seen, and what is behind it: nothing, or another part of the body.

@@ -10,11 +10,12 @@ import numpy as np
 
 from kinefit.bodies import Body
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.images.skin import LANDMARKS, SkinTracker, face_box
 from kinefit.motion import Motion
-from kinefit.observations import DepthFrame, Frame, KeypointFrame
+from kinefit.observations import MEDIAPIPE_33, DepthFrame, Frame, KeypointFrame
 from kinefit.simulation._postures import MOVEMENTS
 from kinefit.simulation.movements import Person, movement, people
-from kinefit.simulation.pictures import ColourSensor
+from kinefit.simulation.pictures import ColourSensor, picture
 from kinefit.simulation.placing import beside, in_front
 from kinefit.simulation.scenes import Scene
 from kinefit.simulation.sensors import TOF, DepthSensor, measured_depth
@@ -22,13 +23,12 @@ from kinefit.simulation.sensors import TOF, DepthSensor, measured_depth
 Inputs = Literal["3d", "2d", "fusion"]
 INPUTS: tuple[Inputs, ...] = ("3d", "2d", "fusion")
 
-FEATURES = ("nose_tip", "l_wrist", "r_wrist")
-"""Landmarks that a tracker of skin colour follows: the face and both hands."""
+FEATURES = LANDMARKS
+"""Landmarks that the tracker of skin colour follows: the face and both hands."""
 
 _HEAD_SIZE = (320, 240)  # [px] of one camera of P2's stereo head (P2 3.1)
 _BASELINE = 0.1  # [m] from the depth camera to the colour camera
-_FEATURE_NOISE = 2.0  # [px] of the middle of a blob of skin colour: a fifth of a face's width at 3 m
-_FEATURE_DEPTH = 0.08  # [m] by which the middle of a hand, or a wrist, may lie behind its surface
+_FEATURE_NOISE = 4.0  # [px] of the middle of a patch of skin: a hand's half width at 3 m
 _RATE = 10.0  # [Hz] P2: 10 to 14
 
 
@@ -44,7 +44,8 @@ class Sequence:
     rig : Rig of the depth camera "depth" and the colour camera "colour".
     sensor : DepthSensor
     depth : DepthFrame for each frame.
-    features : KeypointFrame for each frame, of the body's landmarks in `FEATURES`.
+    features : KeypointFrame for each frame, of the body's landmarks in `FEATURES`, as `images.skin` finds them in
+        rendered pictures of the colour camera; the face of the first picture is told.
     """
 
     number: int
@@ -110,26 +111,37 @@ def sequence(
     """One movement of one person as its sensors saw it; see `sequences`."""
     truth = movement(name, person.body, rate=rate, speed=person.speed)
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
-    head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal).camera()
-    colour = beside(head.with_pose(camera.T_camera_world), "colour", _BASELINE)
+    head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
+    colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
     scene = Scene.of(truth, camera if room else None)
-    depth, features = [], []
+    depth = []
     for frame, time in enumerate(truth.times):
         random = np.random.default_rng([seed, number, frame])
         depth.append(DepthFrame("depth", float(time), measured_depth(scene, frame, camera, sensor, random)))
-        features.append(_features(scene, frame, colour, random))
-    return Sequence(number, person, truth, Rig((camera, colour)), sensor, tuple(depth), tuple(features))
+    features = features_of(scene, head, colour, seed=1000 * seed + number)
+    return Sequence(number, person, truth, Rig((camera, colour)), sensor, tuple(depth), features)
 
 
-def _features(scene: Scene, frame: int, camera: Camera, random: np.random.Generator) -> KeypointFrame:
-    """Face and hands in the colour image, where nothing hides them."""
-    points = scene.motion.body.landmarks.select(FEATURES)
-    x = scene.motion.body.positions(scene.motion.state(frame), points)
-    uv, depth = camera.project(x), scene.view(frame, camera).raster.depth
-    z = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-    u, v = np.round(np.nan_to_num(uv, nan=-1.0)).astype(int).T
-    inside = (u >= 0) & (v >= 0) & (u < camera.size[0]) & (v < camera.size[1])
-    seen = np.zeros(len(points), bool)
-    seen[inside] = z[inside] < depth[v[inside], u[inside]] + _FEATURE_DEPTH
-    uv = np.where(seen[:, None], uv + _FEATURE_NOISE * random.standard_normal(uv.shape), np.nan)
-    return KeypointFrame(camera.name, float(scene.motion.times[frame]), FEATURES, uv, seen.astype(float))
+def features_of(scene: Scene, sensor: ColourSensor, camera: Camera, *, seed: int = 0) -> tuple[KeypointFrame, ...]:
+    """Face and hands by the colour of the skin in rendered pictures of a scene; none where the first shows no face."""
+    motion, tracker, out = scene.motion, None, []
+    face = _face(scene, camera)
+    for frame, time in enumerate(motion.times):
+        if face is not None:
+            image = np.ascontiguousarray(picture(scene, frame, camera, sensor, seed=seed)[..., ::-1])
+            tracker = tracker or SkinTracker(image, face, rate=motion.rate)
+            tracker.update(image)
+        none = KeypointFrame(camera.name, float(time), FEATURES, np.full((len(FEATURES), 2), np.nan), np.zeros(3))
+        out.append(none if tracker is None else tracker.frame(camera.name, float(time), FEATURES))
+    return tuple(out)
+
+
+def _face(scene: Scene, camera: Camera) -> tuple[float, float, float, float] | None:
+    """Box [px] of the face in the first picture, as a detector's landmarks give it; None where it looks away."""
+    body, state = scene.motion.body, scene.motion.state(0)
+    points = body.keypoints("MEDIAPIPE_33")
+    uv = np.full((33, 2), np.nan)
+    uv[[MEDIAPIPE_33.index(name) for name in points.names]] = camera.project(body.positions(state, points))
+    nose = body.positions(state, body.landmarks.select(("nose_tip", "r_tragion", "l_tragion")))
+    depth = nose @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    return face_box(uv) if depth[0] < depth[1:].min() and np.isfinite(uv[[2, 5, 7, 8, 9, 10]]).all() else None

@@ -15,10 +15,12 @@ from kinefit.observations import (
     DepthFrame,
     Frame,
     KeypointFrame,
+    LiftedFrame,
     LineFrame,
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
+    sensor_of,
 )
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.background import Background
@@ -27,6 +29,7 @@ from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.image_lines import ImageLineSensor
 from kinefit.sensors.keypoints import NAME as KEYPOINTS
 from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.lifted import LiftedSensor
 from kinefit.sensors.markers import MarkerSensor
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.regions import RegionSensor
@@ -83,7 +86,7 @@ class Sensors:
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
-            ColourFrame: self._region,
+            ColourFrame: self._region, LiftedFrame: self._lifted,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -160,8 +163,7 @@ class Sensors:
         return out
 
     def _of_frame(self, frame: Frame) -> Sensor:
-        kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region "}.get(type(frame), "")
-        name = kind + frame.sensor
+        name = sensor_of(frame)
         if name not in self._sensors:
             self._sensors[name] = self._makers[type(frame)](frame.sensor)
         return self._sensors[name]
@@ -188,6 +190,9 @@ class Sensors:
 
     def _region(self, name: str) -> RegionSensor:
         return RegionSensor(self.rig[name], self.sigma.get(f"region {name}"), self.settings)
+
+    def _lifted(self, name: str) -> LiftedSensor:
+        return LiftedSensor(name, self.sigma.get(f"lifted {name}", self.settings.lifted))
 
     def _silhouette(self, name: str) -> SilhouetteSensor:
         sigma = self.sigma.get(f"silhouette {name}", self.settings.silhouette)

@@ -48,12 +48,13 @@ class _Track:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One person in one picture: column, landmarks (33, 2) [px], confidence (33,), runs of the mask."""
+    """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m]."""
 
     column: int
     points: NDArray
     confidence: NDArray
     runs: NDArray
+    lifted: NDArray
 
 
 @dataclass
@@ -165,7 +166,7 @@ class Follower:
         ends = roi.to_image(np.stack([pose.middle, pose.rim]), SIZE)
         steady = track.steady.follow(ends) if track.points is not None else Steady.at(ends)
         runs = mask_runs(pose, roi, image.shape[:2]) if self.masks else np.zeros(0, np.uint32)
-        sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs)
+        sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted))
         return replace(track, steady=steady, points=points, last=self._frame, shape=(roi, pose.mask)), sighting
 
 
@@ -268,12 +269,14 @@ def detect_people(
     points = np.full((len(frames), len(column), 33, 2), np.nan)
     confidence = np.zeros((len(frames), len(column), 33))
     counts = np.zeros((len(frames), len(column)), int)
+    lifted = np.full((len(frames), len(column), 33, 3), np.nan)
     runs = [np.zeros(0, np.uint32)]
     for f, frame in enumerate(frames):
         for s in sorted((s for s in frame if s.column in column), key=lambda s: s.column):
             at = f, column[s.column]
-            points[at], confidence[at], counts[at] = s.points, s.confidence, len(s.runs)
+            points[at], confidence[at], counts[at], lifted[at] = s.points, s.confidence, len(s.runs), s.lifted
             runs.append(s.runs)
     return Detections(
-        camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), source
+        camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), source,
+        lifted,
     )

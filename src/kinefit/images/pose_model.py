@@ -32,6 +32,9 @@ class Pose:
     score : float, 0..1
         That there is a person.
     mask : (256, 256) float32, probability that a pixel of the crop is the person's.
+    lifted : (33, 3) [m]
+        The points in space from the middle of the hips, along the crop's u and v and away from the camera, of a person
+        of the network's idea of size.
     """
 
     points: NDArray
@@ -41,6 +44,7 @@ class Pose:
     rim: NDArray
     score: float
     mask: NDArray[np.float32]
+    lifted: NDArray
 
 
 class PoseModel:
@@ -58,6 +62,7 @@ class PoseModel:
         outputs = {tuple(int(n) for n in o["shape"]): o["index"] for o in interpreter.get_output_details()}
         self._landmarks, self._score = outputs[1, 195], outputs[1, 1]
         self._mask, self._heat = outputs[1, SIZE, SIZE, 1], outputs[1, _HEAT, _HEAT, 39]
+        self._lifted = outputs[1, 117]
 
     def __call__(self, crop: NDArray[np.uint8]) -> Pose:
         """Pose of the person in an RGB crop (256, 256, 3)."""
@@ -70,6 +75,7 @@ class PoseModel:
         return Pose(
             points[:_POINTS], visibility, presence, points[_POINTS], points[_POINTS + 1],
             float(read(self._score).item()), _sigmoid(read(self._mask)[0, :, :, 0]),
+            read(self._lifted).reshape(39, 3)[:_POINTS].astype(float),
         )
 
 

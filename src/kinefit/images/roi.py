@@ -58,6 +58,11 @@ class Roi:
         A = self.A_image_crop(size)
         return points_crop @ A[:, :2].T + A[:, 2]
 
+    def to_upright(self, points_crop: NDArray) -> NDArray:
+        """Points in space (..., 3), along the crop's u and v and away from the camera, along those of the picture."""
+        c, s = np.cos(self.turn), np.sin(self.turn)
+        return points_crop @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+
     def corners(self) -> NDArray:
         """(4, 2) [px]."""
         return self.to_image(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), 1)

@@ -42,7 +42,7 @@ def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
 def colour_silhouette(
     image: ArrayLike, low: ArrayLike, high: ArrayLike, *, smooth: float = 1.0
 ) -> tuple[NDArray, NDArray]:
-    """Silhouette by a threshold on colour, and its contour by the Laplace operator (P1 4.1).
+    """Silhouette by a threshold on colour, and its contour by the Laplace operator (P1 2.4).
 
     Parameters
     ----------

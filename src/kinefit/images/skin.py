@@ -35,6 +35,8 @@ _LEARN = 2.0  # [s] in which the light may change
 _STIR = 1.0  # [s] for which a movement is remembered
 _MOVED = 10  # [grey levels] by which a pixel differs between pictures where something moved: above a webcam's noise
 _NOBODY = 0.6  # in favour of seeing no hand: less than a hand where it was, more than a patch elsewhere that is still
+_BOWED = 16.0  # square of the face's half size within which it is sought where it is not: bows between two pictures
+_BESIDE = 0.8  # [heights of the face] from its middle to its corners, and to the chin's neck
 _REACH = 4.5  # [heights of the face] an arm's length and half the shoulders' width
 _KEPT = 0.3  # of the first colour stays for good: what is learnt cannot drift away altogether
 
@@ -171,9 +173,16 @@ class SkinTracker:
         assert face is not None
         v, u = np.nonzero(mask)
         pixels = np.stack([u, v], axis=-1).astype(float)
-        own = pixels[_squares(pixels, face.centre, face.covariance + np.eye(2) * (0.1 * self._height) ** 2) < 4.0]
-        if len(own) > self._least:
-            self._see(FACE, _Patch.of(own, 0.0, -1, False))
+        far = _squares(pixels, face.centre, face.covariance + np.eye(2) * (0.1 * self._height) ** 2)
+        for reach in (4.0, _BOWED):
+            if (far < reach).sum() > self._least:
+                self._see(FACE, _Patch.of(pixels[far < reach], 0.0, -1, False))
+                return
+
+    def _hand_near(self, patch: _Patch) -> bool:
+        """Whether a hand was on its way to a patch beside the face: else that is the face's own, brow or neck."""
+        hands = [b for b in self.blobs[LEFT:] if b is not None]
+        return any(np.linalg.norm(b.centre - patch.centre) < _BESIDE * self._height for b in hands)
 
     def _candidates(self, mask: NDArray) -> list[_Patch]:
         """What may be a hand: patches of skin outside of the face; of a long one, both ends."""
@@ -196,7 +205,8 @@ class SkinTracker:
             for part in (p for p in _ends(patch, _HAND * height) if len(p) >= _PIXELS):
                 x, y = part.astype(int).T
                 one = _Patch.of(part, float(self._stir[y, x].mean()), k, crowded)
-                if np.linalg.norm(one.centre - face.centre) < _REACH * height:
+                away = float(np.linalg.norm(one.centre - face.centre))
+                if away < _REACH * height and not (crowded and away < _BESIDE * height and not self._hand_near(one)):
                     out.append(one)
         return out
 

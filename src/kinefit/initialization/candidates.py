@@ -16,11 +16,12 @@ from kinefit.initialization.depth_search import Search
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.losses import SQUARED
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, LiftedFrame, MarkerFrame, PointCloud
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.depth_view import camera_at
 from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.lifted import LiftedSensor
 from kinefit.sensors.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 
@@ -87,6 +88,7 @@ def known_points(
         told += [keypoints.prepare(pixels, scene)] if pixels else []
         marked = [f for f in frames if isinstance(f, MarkerFrame)]
         told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
+        told += [LiftedSensor(f.sensor, 1.0).prepare(f, scene) for f in frames if isinstance(f, LiftedFrame)]
     sets, places = [], [np.zeros((0, 3))]
     for m in (m for m in told if m.settled):  # surfaces give views alone
         hints = m.hints(scene)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.rigid_pairs import rigid_pairs
 from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3
@@ -14,28 +15,6 @@ from kinefit.rows import AnyRows
 from kinefit.solvers.least_squares import levenberg_marquardt
 
 _NUMBERS = {3: "three", 6: "six"}
-
-
-def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
-    """Pairs of points whose distance no angle changes: (point, point, scale group, distance at rest [m]).
-
-    A point at a joint's centre belongs to both segments there.
-    """
-    tree = body.tree
-    hosts: list[dict[int, NDArray]] = []
-    for s, x in zip(points.segments, points.points, strict=True):
-        here = {int(s): x}
-        if np.linalg.norm(x) < 1e-9 and tree.parents[s] >= 0:
-            here[int(tree.parents[s])] = tree.offsets[s]
-        hosts.append(here)
-    out = []
-    for i in range(len(hosts)):
-        for j in range(i + 1, len(hosts)):
-            for s in hosts[i].keys() & hosts[j].keys():
-                length = float(np.linalg.norm(hosts[i][s] - hosts[j][s]))
-                if length > 0.05:
-                    out.append((i, j, int(body.segment_scale[s]), length))
-    return out
 
 
 def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: float | None = None) -> NDArray:

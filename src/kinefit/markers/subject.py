@@ -195,7 +195,7 @@ def _first_size(body: Body, placed: Placement, x: NDArray) -> float:
     if not _SIZES[0] < size < _SIZES[1]:
         raise ObservationError(
             f"the person would be {size:.3g} times the body's size: the unit of the file is wrong",
-            remedy='State the right one: unit = "mm" ...; or check that the labels are those of the marker set.',
+            remedy="State the right one (--unit mm ...); or check that the labels are those of the marker set.",
         )
     return size
 

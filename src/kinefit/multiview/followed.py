@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
+from kinefit.multiview.one_camera import lifted_alone, people_before
 from kinefit.multiview.people import Person, may_be_several, people_of
 from kinefit.observations import Keypoints
 from kinefit.observations.person import FORMS, PersonChoice
@@ -69,7 +69,10 @@ def follow(
     """
     wanted = PersonChoice.of(person)
     if people is None:
-        people = people_of(rig, keypoints) if may_be_several(keypoints) else ()
+        lifted = lifted_alone(keypoints)
+        people = () if not may_be_several(keypoints) else (
+            people_of(rig, keypoints) if lifted is None else people_before(rig, keypoints, lifted)
+        )
     people = tuple(people)
     if wanted.way == "number" and wanted.number > max(len(people), 1):
         there = f"{len(people)} people are" if len(people) > 1 else "one person is"
@@ -78,7 +81,7 @@ def follow(
         return Followed(tuple(keypoints), people)
     number = _number(people, wanted)
     one = people[number]
-    return Followed(tuple(alone(k, chosen) for k, chosen in zip(keypoints, one.chosen)), people, number + 1)
+    return Followed(tuple(k.of_one(chosen) for k, chosen in zip(keypoints, one.chosen)), people, number + 1)
 
 
 def _number(people: Sequence[Person], wanted: PersonChoice) -> int:
@@ -89,16 +92,6 @@ def _number(people: Sequence[Person], wanted: PersonChoice) -> int:
     if wanted.place is not None:
         return int(np.argmin([np.linalg.norm(one.place - wanted.place) for one in people]))
     return wanted.number - 1
-
-
-def alone(record: Keypoints, chosen: NDArray) -> Keypoints:
-    """One person's keypoints of a record; chosen (F,) is who it is in each frame, -1 for nobody."""
-    if record.points.shape[1] == 0:
-        return record
-    frames, there = np.arange(len(record)), (chosen >= 0)[:, None]
-    points = np.where(there[..., None], record.points[frames, np.maximum(chosen, 0)], np.nan)
-    confidence = np.where(there, record.confidence[frames, np.maximum(chosen, 0)], 0.0)
-    return replace(record, points=points[:, None], confidence=confidence[:, None])
 
 
 def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:

@@ -26,7 +26,7 @@ _TALL = 1.7  # [m] ... how far people go from frame to frame, for one of this st
 _FITS = 0.08  # views of one person all lie within this share of the height; two, see association, within half of it
 _SAME = 0.2  # [m] points of two people are further apart than detections of one and the same
 _LASTING = 1.0  # [s] for which somebody must be seen to be a person; half of a take that is shorter than two
-_STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as large as a motion
+STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as large as a motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +65,10 @@ def may_be_several(keypoints: Sequence[Keypoints]) -> bool:
         of_camera[k.camera] = np.maximum(of_camera.get(k.camera, 0), count)
     two = np.sum([np.minimum(count, 2) for count in of_camera.values()], axis=0)
     enough = two >= 2 * views_needed(len(of_camera))
-    return bool(frames) and np.sum(enough) >= _lasting(keypoints[0].rate, frames)
+    return bool(frames) and np.sum(enough) >= lasting(keypoints[0].rate, frames)
 
 
-def _lasting(rate: float, frames: int) -> float:
+def lasting(rate: float, frames: int) -> float:
     """For how many frames somebody must be seen to be a person."""
     return min(_LASTING * rate, 0.5 * frames)
 
@@ -91,7 +91,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
         search.forward(f)
     for f in reversed(range(search.frames)):
         search.backward(f)
-    needed, lasting = search.needed, _lasting(keypoints[0].rate, search.frames)
+    needed, long = search.needed, lasting(keypoints[0].rate, search.frames)
     people = []
     for track in search.tracks:
         views = np.zeros(search.frames, int)
@@ -100,7 +100,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
             views[f] = len(nodes)
             for q, p in nodes:
                 chosen[main[q]][f] = p
-        if np.sum(views >= needed) >= lasting:
+        if np.sum(views >= needed) >= long:
             people.append(search.person(track, chosen, views, main))
     people.sort(key=lambda one: -one.surety)
     for q in set(range(len(keypoints))) - set(main):
@@ -258,7 +258,7 @@ class _Search:
 
     def person(self, track: _Track, chosen: list[NDArray], views: NDArray, main: Sequence[int]) -> Person:
         """What is told of a person."""
-        step = max(round(_STEP * self.rate), 1)
+        step = max(round(STEP * self.rate), 1)
         moved = [track.path[f + step] - x for f, x in track.path.items() if f + step in track.path]
         sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
             self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes

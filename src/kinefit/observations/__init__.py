@@ -6,18 +6,21 @@ one sensor, `frames` what it saw at one time.
 
 from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
+from kinefit.observations.detections import MEDIAPIPE_33, Detections
 from kinefit.observations.features import KeypointVideo, LineVideo
 from kinefit.observations.frames import (
     ColourFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
+    LiftedFrame,
     LineFrame,
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
+    sensor_of,
 )
-from kinefit.observations.recordings import MEDIAPIPE_33, Detections, Keypoints, MarkerEvent, Markers, SkeletonMotion
+from kinefit.observations.recordings import Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.silhouettes import SilhouetteVideo
 from kinefit.observations.surface_points import SurfacePointFrame, SurfacePointVideo
 
@@ -33,6 +36,7 @@ __all__ = [
     "KeypointFrame",
     "KeypointVideo",
     "Keypoints",
+    "LiftedFrame",
     "LineFrame",
     "LineVideo",
     "MarkerEvent",
@@ -44,4 +48,5 @@ __all__ = [
     "SkeletonMotion",
     "SurfacePointFrame",
     "SurfacePointVideo",
+    "sensor_of",
 ]

@@ -292,4 +292,50 @@ class ColourFrame:
         return self.image.shape[1], self.image.shape[0]
 
 
-Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame
+@dataclass(frozen=True, eq=False)
+class LiftedFrame:
+    """Landmarks of one person that a network lifted from one camera's image to space.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the camera in the rig.
+    time : float [s]
+    names : (K,) of the landmarks, the hips among them
+    x : (K, 3) [m]
+        From the middle of the hips, along the calibrated image's u and v and away from the camera, of a person of the
+        network's idea of size; NaN where unseen.
+    uv : (K, 2) [px] the same landmarks in the calibration's image frame; NaN where unseen
+    keypoint_set : str
+        The body's keypoint set that the names belong to.
+    """
+
+    sensor: str
+    time: float
+    names: tuple[str, ...]
+    x: NDArray
+    uv: NDArray
+    keypoint_set: str
+
+    def __post_init__(self) -> None:
+        check_seen(self.sensor, self.time, self.names)
+        what = f"a record of lifted landmarks of {self.sensor}"
+        x, uv = frozen(self.x, float, what), frozen(self.uv, float, what)
+        if x.shape != (len(self.names), 3) or uv.shape != (len(self.names), 2):
+            raise ObservationError(
+                f"lifted landmarks of {self.sensor} have shape {x.shape} and pixels {uv.shape}",
+                remedy=f"Give ({len(self.names)}, 3) and ({len(self.names)}, 2).",
+            )
+        object.__setattr__(self, "x", x)
+        object.__setattr__(self, "uv", uv)
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame | LiftedFrame
+
+
+_KINDS = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region ", LiftedFrame: "lifted "}
+
+
+def sensor_of(frame: object) -> str:
+    """Name of the sensor that a frame is of: the camera's for keypoints, else with what is seen there."""
+    return _KINDS.get(type(frame), "") + str(getattr(frame, "sensor", ""))

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.geometry.camera import ImageFrame
 from kinefit.observations.arrays import check_seen, frozen
-
-_MOST_PIXELS = 200_000_000  # of an image; beyond, a size is damaged
-_FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
-_PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
-MEDIAPIPE_33 = (
-    *_FACE.split(), "mouth_left", "mouth_right",
-    *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
-)  # fmt: skip
-"""Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector gives the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +32,8 @@ class Keypoints:
         Added to frame / rate to get the time of the take.
     source : str
         File or folder it came from, for messages.
+    lifted : (F, P, K, 3) [m], optional
+        The points in space as a network lifted them, see `LiftedFrame`; NaN where unseen.
     """
 
     camera: str
@@ -53,6 +44,7 @@ class Keypoints:
     confidence: NDArray
     time_offset: float = 0.0
     source: str = ""
+    lifted: NDArray | None = None
 
     def __post_init__(self) -> None:
         check_seen(self.camera, self.rate, self.names)
@@ -63,127 +55,41 @@ class Keypoints:
                 file=self.source or None,
                 remedy=f"Give (frames, people, {len(self.names)}, 2) and (frames, people, {len(self.names)}).",
             )
+        lifted = None if self.lifted is None else frozen(self.lifted)
+        if lifted is not None and lifted.shape != (*points.shape[:3], 3):
+            raise ObservationError(
+                f"keypoints of camera {self.camera} have shape {points.shape} with lifted ones {lifted.shape}",
+                file=self.source or None, remedy="Give (frames, people, names, 3).",
+            )  # fmt: skip
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "confidence", confidence)
+        object.__setattr__(self, "lifted", lifted)
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def rows(self, frames: slice, time_offset: float) -> Keypoints:
+        """Some of its frames, with the time of the first."""
+        lifted = None if self.lifted is None else self.lifted[frames]
+        points, confidence = self.points[frames], self.confidence[frames]
+        return replace(self, points=points, confidence=confidence, lifted=lifted, time_offset=time_offset)
+
+    def of_one(self, chosen: NDArray) -> Keypoints:
+        """One person's; chosen (F,) is who it is in each frame, -1 for nobody."""
+        if self.points.shape[1] == 0:
+            return self
+        frames, one, there = np.arange(len(self)), np.maximum(chosen, 0), (chosen >= 0)[:, None]
+        points = np.where(there[..., None], self.points[frames, one], np.nan)
+        confidence = np.where(there, self.confidence[frames, one], 0.0)
+        lifted = None
+        if self.lifted is not None:
+            lifted = np.where(there[..., None], self.lifted[frames, one], np.nan)[:, None]
+        return replace(self, points=points[:, None], confidence=confidence[:, None], lifted=lifted)
 
     @property
     def times(self) -> NDArray:
         """(F,) [s] time of every frame in the take."""
         return np.arange(len(self)) / self.rate + self.time_offset
-
-
-@dataclass(frozen=True, eq=False)
-class Detections:
-    """What kinefit's own detector saw in one video: people, each the same in one column, with their outlines.
-
-    Parameters
-    ----------
-    camera : str
-    rate : float [Hz]
-    size : (width, height) [px] of the video's image.
-    points : (F, P, 33, 2) [px]
-        Landmarks of MEDIAPIPE_33 in the video's image; NaN where a person is not seen. P may be 0.
-    confidence : (F, P, 33)
-        Probability that a landmark is in the image and not hidden; 0 where a person is not seen.
-    mask_runs : (N,)
-        Lengths of the runs of all masks, one mask after the other by frame, then person: down the columns of the
-        image, beginning outside of the person (COCO's uncompressed run-length code).
-    mask_starts : (F * P + 1,)
-        Where each mask begins in `mask_runs`; a mask without runs was not made.
-    source : str
-    """
-
-    camera: str
-    rate: float
-    size: tuple[int, int]
-    points: NDArray
-    confidence: NDArray
-    mask_runs: NDArray
-    mask_starts: NDArray
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        points, confidence = frozen(self.points), frozen(self.confidence)
-        starts, runs = frozen(self.mask_starts, int), frozen(self.mask_runs, np.uint32)
-        cells = points.shape[0] * points.shape[1] if points.ndim == 4 else -1
-        fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3] and len(starts) == cells + 1
-        if not fits or starts[0] != 0 or starts[-1] != len(runs) or np.any(np.diff(starts) < 0):
-            raise ObservationError(
-                f"detections of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}, "
-                f"{len(starts)} starts of masks and {len(runs)} runs", file=self.source or None,
-                remedy="Give (frames, people, 33, 2), (frames, people, 33) and frames * people + 1 starts.",
-            )
-        ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
-        sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
-        if min(self.size) < 1 or pixels > _MOST_PIXELS or np.any(sizes != pixels):
-            raise ObservationError(
-                f"masks of {', '.join(map(str, np.unique(sizes)[:3])) or 'no'} pixels in images of {self.size}",
-                file=self.source or None, remedy="Give runs that sum up to the image's pixels.",
-            )  # fmt: skip
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "confidence", confidence)
-        object.__setattr__(self, "mask_runs", runs)
-        object.__setattr__(self, "mask_starts", starts)
-
-    def within(self, first: int, frames: int) -> Detections:
-        """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
-        after, people = frames - first - len(self), self.points.shape[1]
-        around = ((first, after), (0, 0), (0, 0))
-        return replace(
-            self, points=np.pad(self.points, (*around, (0, 0)), constant_values=np.nan),
-            confidence=np.pad(self.confidence, around),
-            mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
-        )  # fmt: skip
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @property
-    def seen(self) -> NDArray:
-        """(F, P) bool, whether a person is seen in a frame."""
-        return np.isfinite(self.points).all(axis=(2, 3))
-
-    def mask(self, frame: int, person: int) -> NDArray | None:
-        """(height, width) bool, the pixels of a person; None where there is no mask."""
-        cell = range(len(self))[frame] * self.points.shape[1] + range(self.points.shape[1])[person]
-        runs = self.mask_runs[self.mask_starts[cell] : self.mask_starts[cell + 1]]
-        if not len(runs):
-            return None
-        width, height = self.size
-        return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
-
-    def keypoints(
-        self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0
-    ) -> Keypoints:
-        """The landmarks of all people as a detector's keypoints.
-
-        Parameters
-        ----------
-        camera : str, optional
-            Its name in the rig; default: the video's.
-        image_frame : ImageFrame, optional
-            The video's image frame, where it is not the calibration's.
-        time_offset : float [s]
-
-        Raises
-        ------
-        ObservationError
-            Nobody is seen in any frame.
-        """
-        if not self.seen.any():
-            raise ObservationError(
-                f"nobody is seen in any of the {len(self)} frames of camera {camera or self.camera}",
-                file=self.source or None,
-                remedy="The detector wants a person of a tenth of the image's height or more; leave this camera out.",
-            )
-        points = self.points if image_frame is None else image_frame.to_calibration(self.points)
-        return Keypoints(
-            camera or self.camera, "MEDIAPIPE_33", MEDIAPIPE_33, self.rate, points, self.confidence,
-            time_offset=time_offset, source=self.source,
-        )
 
 
 @dataclass(frozen=True)

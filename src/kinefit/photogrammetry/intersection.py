@@ -12,6 +12,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 
 _STEPS = 5  # of Gauss-Newton, from the point of equal weights, which is nearly there
+_DONE = 1e-9  # [m] of a step, after which there is none
+_SINGULAR = 1e-15  # of the cube of its trace: a determinant at which rays are parallel but for rounding
 _ANGLE = np.deg2rad(0.5)  # between rays, below which a distance is 100 times less certain than a direction
 
 _EXACT = 1e-6  # [px] no match is surer: images that are equal have no residuals
@@ -72,8 +74,11 @@ def intersect(rig: Rig, uv: NDArray, covariance: NDArray) -> Intersections:
             JW = np.einsum("nij,nik->njk", J[use], weight[use, c])
             normal[use] += JW @ J[use]
             right[use] += np.einsum("njk,nk->nj", JW, uv[use, c] - at[use])
-        good &= np.linalg.matrix_rank(normal) == 3
-        x[good] += np.linalg.solve(normal[good], right[good][..., None])[..., 0]
+        good &= np.linalg.det(normal) > _SINGULAR * np.trace(normal, axis1=1, axis2=2) ** 3
+        step = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
+        x[good] += step
+        if not len(step) or np.abs(step).max() < _DONE:
+            break
     out = np.full((len(x), 3, 3), np.nan)
     out[good] = np.linalg.inv(normal[good])
     x[~good] = np.nan

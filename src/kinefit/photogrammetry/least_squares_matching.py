@@ -33,6 +33,9 @@ _LARGEST = 151  # [px] of a window
 _HELPFUL = 0.6  # correlation from which a coarser level's match is a better start than none
 
 
+_ROWS = ("uv", "deformation", "gain", "offset", "correlation", "covariance", "noise", "iterations", "status")
+
+
 @dataclass(frozen=True, eq=False)
 class Matches:
     """Windows of one image, found in another.
@@ -95,12 +98,22 @@ class Matches:
         """(N, 6) place and deformation, for the kernels."""
         return np.concatenate([self.uv, self.deformation.reshape(-1, 4)], axis=1)
 
+    def or_else(self, other: Matches) -> Matches:
+        """These, and those of another try at the same points where these were not found."""
+        own = self.found
+
+        def either(a: NDArray, b: NDArray) -> NDArray:
+            return np.where(own.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+        rows = {name: either(value, getattr(other, name)) for name, value in vars(self).items() if name in _ROWS}
+        return replace(self, **rows)
+
     def only(self, good: NDArray[np.bool_]) -> Matches:
         """Those of `good` (N,); the others as not converged."""
         rows = {
             name: np.where(good.reshape(-1, *[1] * (value.ndim - 1)), value, np.nan)
             for name, value in vars(self).items()
-            if name in ("uv", "deformation", "gain", "offset", "correlation", "covariance", "noise")
+            if name in _ROWS and np.issubdtype(value.dtype, np.floating)
         }
         lost = self.found & ~good
         return replace(self, **rows, status=np.where(lost, kernels.DIVERGED, self.status))

@@ -1,4 +1,4 @@
-"""Seeds found without anybody's help: SIFT features that two images share."""
+"""Seeds found without anybody's help: along lines of sight, in boxes, or SIFT features that two images share."""
 
 from __future__ import annotations
 

@@ -12,13 +12,11 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
-from kinefit.photogrammetry.seeds import sift_seeds
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.strain import Strain, grid_step, strain
 from kinefit.photogrammetry.surface import Surface, check_images, from_matches, measure
-
-_UNMOVED = 25  # places of the grid that are tried where they were, if no feature is found again
+from kinefit.photogrammetry.unaided import grow_between, grow_over_time, grow_through
 
 Progress = Callable[[str, int, int], None]
 
@@ -61,30 +59,21 @@ def measure_states(
             progress("states", k, len(states))
         images = states[k]
         check_images(rig, images)
-        own = _found_again(template, images[0], places, window, least)
-        here = replace(places, points=own.uv)
-        source, base = (images[0], here) if incremental else (template, places)
-        others = [_found_again(source, image, base, window, least) for image in images[1:]]
+        own = grow_over_time(template, images[0], places, window=window, least=least)
+        here, others = replace(places, points=own.uv), list[Matches]()
+        for image, camera in zip(images[1:], rig.cameras[1:]):
+            pair = rig.cameras[0], camera
+            if incremental:
+                others.append(grow_between(images[0], image, pair, here, window=window, least=least))
+            else:
+                told = grow_through(template, images[0], image, pair, places, own, window=window, least=least)
+                others.append(told)
         out.append(from_matches(rig, grid, own, others))
         if incremental:
             template, places = images[0], here
     if progress is not None:
         progress("states", len(states), len(states))
     return out
-
-
-def _found_again(
-    first: SplineImage, second: SplineImage, grid: Grid, window: int | ArrayLike, least: float
-) -> Matches:
-    """A grid of one image in another, from features of both; from where it was, if they share none."""
-    seeds = sift_seeds(first, second)
-    if not len(seeds.first):
-        spots = grid.points[grid.inside]
-        if not len(spots):
-            raise ObservationError("the surface is lost", remedy="Take more images between, or leave this one out.")
-        spots = spots[:: max(1, len(spots) // _UNMOVED)]
-        seeds = Seeds.of(spots, spots)
-    return grow(first, second, grid, seeds, window=window, least=least)
 
 
 def surface_strain(reference: Surface, state: Surface, gauge: float, window: int = 0) -> Strain:

@@ -15,8 +15,8 @@ from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
 from kinefit.photogrammetry.multi_image import match_along_rays
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
-from kinefit.photogrammetry.seeds import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.unaided import grow_between
 
 _EXACT = 1e-6  # [px²] of the template's own place, which defines the point
 _FEWEST = 3  # points of a surface
@@ -102,7 +102,8 @@ def measure(
     Parameters
     ----------
     rig, images : C cameras, and the image of each; the first holds the grid
-    seeds : from the first image to each other one, C - 1 of them; default: SIFT features that agree with the cameras
+    seeds : from the first image to each other one, C - 1 of them; default: found along the first camera's rays,
+        or SIFT features that agree with the cameras (`grow_between`)
     window : odd side [px] of all windows, or of each place of the grid
     least : correlation of a match
     constrained : match all images at once, along the cameras' rays (`match_along_rays`), after each was grown alone.
@@ -116,20 +117,18 @@ def measure(
     check_images(rig, images)
     first = images[0]
     halves_of(window, len(grid.points))
-    started = seeds if seeds is not None else [
-        sift_seeds(first, image, (rig.cameras[0], camera)) for image, camera in zip(images[1:], rig.cameras[1:])
-    ]  # fmt: skip
-    if len(started) != len(rig) - 1:
-        raise ObservationError(f"seeds of {len(started)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
+    if seeds is not None and len(seeds) != len(rig) - 1:
+        raise ObservationError(f"seeds of {len(seeds)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
     found = []
-    for camera, image, start in zip(rig.cameras[1:], images[1:], started):
-        if not len(start.first):
-            _refuse(first, camera.name)
-        found.append(grow(first, image, grid, start, window=window, least=least))
+    for k, (camera, image) in enumerate(zip(rig.cameras[1:], images[1:])):
+        if seeds is not None:
+            found.append(grow(first, image, grid, seeds[k], window=window, least=least))
+        else:
+            found.append(grow_between(first, image, (rig.cameras[0], camera), grid, window=window, least=least))
         if found[-1].found.sum() < _FEWEST:
             _refuse(first, camera.name)
         if seeds is None:
-            _refuse_repeated(first, image, found[-1], camera.name)
+            refuse_repeated(first, image, found[-1], f"camera {camera.name}")
     surface = from_matches(rig, grid, None, found)
     if constrained if constrained is not None else len(rig) > 2:
         surface = match_rays(rig, images, surface, found, window=window, least=least)
@@ -147,21 +146,21 @@ def _refuse(first: SplineImage, camera: str) -> None:
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
-def _refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, camera: str) -> None:
+def refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
     """Refuse texture that looks the same again nearby, where nobody said which place is meant.
 
-    Windows of 31 px about 50 points are sought about their matches, two windows far. Texture repeats where most are
+    Windows of 31 px about 20 points are sought about their matches, two windows far. Texture repeats where most are
     found as well elsewhere. Smaller windows would call a random pattern of coarse grains repeated.
     """
     index = np.flatnonzero(found.found)
-    index = index[np.linspace(0, len(index) - 1, min(len(index), 50)).astype(int)]
+    index = index[np.linspace(0, len(index) - 1, min(len(index), 20)).astype(int)]
     told = search_box(
         first, second, found.points[index], found.uv[index], reach=2 * _REPEATED, window=_REPEATED
     )
     seen = np.isfinite(told.best)
     if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
-        problem = "texture that repeats: most points are found as well elsewhere, so their distance is not known"
-        raise ObservationError(problem, place=f"camera {camera}", remedy="Give seeds by hand: they say where.")
+        problem = "texture that repeats: most points are found as well elsewhere, so where they are is not known"
+        raise ObservationError(problem, place=place, remedy="Give seeds by hand: they say where; or another texture.")
 
 
 def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> Surface:

@@ -25,6 +25,8 @@ from kinefit.photogrammetry.surface import check_images, largest_parallax, measu
 from kinefit.photogrammetry.trajectories import Trajectories
 
 _BEYOND = 3.0  # standard deviations by which temporal and spatial matches may differ beyond the stated agreement
+_BESIDE = 3.0  # steps of the grid from a point that was lost to one that was found, for it to be sought again
+_ROUNDS = 20  # of seeking again, in which a motion spreads from point to point
 
 
 @dataclass(frozen=True)
@@ -156,31 +158,68 @@ class SurfaceTracker:
         return np.arange(self._next - count, self._next)
 
     def _followed(self, images: Sequence[SplineImage]) -> tuple[SurfacePoints, NDArray]:
-        """Points of the last frame that are found in this one, and their motion in the images (M, C, 2) [px]."""
+        """Points of the last frame that are found in this one, and their motion in the images (M, C, 2) [px].
+
+        Points that are not found where they are predicted are sought again where their neighbours went.
+        """
         last, settings = self._frames[-1], self.settings
+        predicted = self._velocity.copy()
+        uv, own, velocity, maps, good = self._moved(images, last, predicted)
+        for _ in range(_ROUNDS):
+            lost, there = np.flatnonzero(~good), np.flatnonzero(good)
+            if not (len(lost) and len(there)):
+                break
+            beside = there[_nearest(last.uv[there, 0], last.uv[lost, 0])]
+            near = np.linalg.norm(last.uv[beside, 0] - last.uv[lost, 0], axis=1) <= _BESIDE * settings.step
+            other = np.linalg.norm(velocity[beside] - predicted[lost], axis=2).max(axis=1) > settings.reach / 2
+            again = near & other
+            if not again.any():
+                break
+            lost, shift = lost[again], velocity[beside[again]]
+            predicted[lost] = shift
+            told = self._moved(images, last.only(lost), shift)
+            for values, found in zip((uv, own, velocity, maps, good), told):
+                values[lost] = found
+        kept, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
+        meet = intersect(self.rig, uv, own)
+        agree = meet.parallax <= largest_parallax(meet.parallax)
+        return SurfacePoints(kept.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
+
+    def _moved(
+        self, images: Sequence[SplineImage], last: SurfacePoints, predicted: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray[np.bool_]]:
+        """Where points of the last frame are in this one, predicted to have moved by (M, C, 2) [px].
+
+        Returns
+        -------
+        uv : (M, C, 2) [px]
+        covariance : (M, C, 2, 2) [px²]
+        velocity : (M, C, 2) [px] by temporal matching alone
+        deformation : (M, C - 1, 2, 2)
+        good : (M,) bool, found in every view, where spatial matching agrees
+        """
+        settings = self.settings
         uv, covariance = np.empty_like(last.uv), np.empty((*last.uv.shape, 2))
         good = np.ones(len(last), bool)
         for c, (old, new) in enumerate(zip(self._images, images)):
-            predicted = last.uv[:, c] + self._velocity[:, c]
-            box = search_box(old, new, last.uv[:, c], predicted, reach=settings.reach, window=settings.window)
-            start = np.where(np.isfinite(box.uv), box.uv, predicted)
+            expected = last.uv[:, c] + predicted[:, c]
+            box = search_box(old, new, last.uv[:, c], expected, reach=settings.reach, window=settings.window)
+            start = np.where(np.isfinite(box.uv), box.uv, expected)
             found = match(old, new, last.uv[:, c], start, window=settings.window)
             uv[:, c], covariance[:, c] = found.uv, found.covariance
             good &= found.found & (found.correlation >= settings.least)
-        kept, own = last.only(good), covariance[good]
-        uv = uv[good]
-        velocity, maps = uv - kept.uv, kept.deformation.copy()
-        agree = np.ones(len(uv), bool)
+        velocity, maps, index = uv - last.uv, last.deformation.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
-            told = match(images[0], images[c], uv[:, 0], uv[:, c], deformation=maps[:, c - 1], window=settings.window)
-            gap = np.linalg.norm(told.uv - uv[:, c], axis=1)
-            spread = np.sqrt(np.trace(told.covariance + own[:, c], axis1=1, axis2=2))
-            agree &= told.found & (told.correlation >= settings.least) & (gap <= settings.agreement + _BEYOND * spread)
-            uv[:, c], own[:, c], maps[:, c - 1] = told.uv, told.covariance, told.deformation
-        meet = intersect(self.rig, uv, own)
-        agree &= meet.parallax <= largest_parallax(meet.parallax[agree])
-        now = SurfacePoints(kept.ids, meet.x_world, meet.covariance, uv, maps).only(agree)
-        return now, velocity[agree]
+            told = match(
+                images[0], images[c], uv[index, 0], uv[index, c], deformation=maps[index, c - 1], window=settings.window
+            )
+            gap = np.linalg.norm(told.uv - uv[index, c], axis=1)
+            spread = np.sqrt(np.trace(told.covariance + covariance[index, c], axis1=1, axis2=2))
+            near = gap <= settings.agreement + _BEYOND * spread
+            good[index] &= told.found & (told.correlation >= settings.least) & near
+            uv[index, c], covariance[index, c] = told.uv, told.covariance
+            maps[index, c - 1] = told.deformation
+        return uv, covariance, velocity, maps, good
 
     def _regenerated(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
         """New points where the grid has none, next to those that are there."""

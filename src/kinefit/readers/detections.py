@@ -12,6 +12,7 @@ the video's picture, the centre of the first pixel is (0, 0):
     points (F, P, 33, 2)       float32 [px], landmarks of MEDIAPIPE_33; NaN where a person is not seen
     confidence (F, P, 33)      float32, 0..1; 0 where a person is not seen
     mask_runs (N,)             uint32, run lengths down the columns, beginning outside of the person (COCO's code)
+    lifted (F, P, 33, 3)       float32 [m], optional: landmarks in space, see Detections; NaN where a person is not seen
     mask_starts (F * P + 1,)   where each mask begins in mask_runs, by frame, then person; the same twice: no mask
 """
 
@@ -62,7 +63,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         width, height = (int(n) for n in arrays["size"])
         found = Detections(
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
-            arrays["mask_runs"], arrays["mask_starts"], str(file),
+            arrays["mask_runs"], arrays["mask_starts"], str(file), arrays.get("lifted"),
         )
     except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error

@@ -17,6 +17,7 @@ from kinefit.readers.units import LENGTHS, worth
 
 _TINY = 0.01  # [m] from the origin: no further is who moves in metres that are read as millimetres
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # points of a C3D that are no positions
+_STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
 
 
@@ -63,11 +64,11 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 
 def _metres(unit: str | None, path: Path) -> float:
     if not unit:
-        raise ObservationError("the file tells no unit", file=path, place="units", remedy='State it: unit = "mm".')
+        raise ObservationError("the file tells no unit", file=path, place="units", remedy=_STATE)
     metres = worth(unit, LENGTHS)
     if metres is None:
         told = choices("unit", unit, LENGTHS)
-        raise ObservationError(told, file=path, place="units", remedy='State it: unit = "mm".')
+        raise ObservationError(told, file=path, place="units", remedy=_STATE)
     return metres
 
 

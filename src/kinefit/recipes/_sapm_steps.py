@@ -102,8 +102,17 @@ def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float)
 
 
 def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[tuple[NDArray, NDArray]]:
-    """Second update rule: the pivot with its nearest and its furthest neighbours, then the next. Yields motions."""
+    """Second update rule: the pivot with its nearest and its furthest neighbours, then the next. Yields motions.
+
+    Of a point pair, or where only one neighbour has candidates, each of these with the pivot: its motion is known but
+    for a turn about the pair, and whether it is right the children's matches say (P5 3.2).
+    """
     filled = [j for j in range(1, len(table.columns)) if len(table.columns[j])]
+    if len(filled) == 1:
+        for other in table.columns[filled[0]]:
+            e, R, t = errors(x[table.order[[0, filled[0]]]], at[[table.columns[0][0], other]])
+            if e.mean() < limit:
+                yield R, t
     pairs = [(i, j) for i in filled for j in reversed(filled) if i < j]
     for i, j in pairs:
         for near, far in product(table.columns[i], table.columns[j]):

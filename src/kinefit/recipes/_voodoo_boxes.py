@@ -58,7 +58,10 @@ def in_body_box(x: NDArray, boxes: Boxes, frames: NDArray, enlargement: float) -
     reach = np.einsum("bij,bkj,bk->bik", R, boxes.axes, boxes.half)  # (B, world axis, edge of the box)
     half = np.abs(reach).sum(axis=2)
     low, high = (centre - half).min(axis=0) - enlargement, (centre + half).max(axis=0) + enlargement
-    inside: NDArray = np.all((x >= low) & (x <= high), axis=1)
+    u, v, w = x.T
+    inside: NDArray = (
+        (u >= low[0]) & (u <= high[0]) & (v >= low[1]) & (v <= high[1]) & (w >= low[2]) & (w <= high[2])
+    )
     return inside
 
 

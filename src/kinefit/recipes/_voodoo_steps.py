@@ -11,6 +11,7 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.surfaces.nearest import nearest_lines
 from kinefit.correspondences.bands import Bands
 from kinefit.images.depth import downsample
+from kinefit.solvers.limbs import absolute_orientation, move
 
 
 class Pairs(NamedTuple):
@@ -52,14 +53,84 @@ def points_on_points(body: Body, frames: NDArray, points: PointSet, x: NDArray, 
     return Pairs(places(body, frames, points)[seen], x[seen], weight[seen], points.segments[seen])
 
 
-def band_pairs(body: Body, frames: NDArray, bands: Bands, weight: float) -> Pairs:
+def nearest_limb(body: Body, frames: NDArray, x: NDArray, bound: float) -> NDArray:
+    """(N, S) bool, the limb whose surface is nearest to each point, within the bound [m]."""
+    _, _, owner = nearest_lines(body, frames, np.ascontiguousarray(x.T), bound)
+    member = np.zeros((len(x), len(frames)), bool)
+    member[owner >= 0, owner[owner >= 0]] = True
+    return member
+
+
+def band_ends(body: Body, frames: NDArray, bands: Bands) -> tuple[NDArray, NDArray]:
+    """Both ends (B, 3) [m] of every band, on the parent and on the child."""
+    return places(body, frames, bands.parent), places(body, frames, bands.child)
+
+
+def band_weights(bands: Bands, measured: Pairs, weight: float, least: int | None) -> tuple[NDArray, NDArray]:
+    """Step 6: weights (B,) of the bands at the parent and at the child.
+
+    Where `least` is given, all bands of a limb together weigh `weight` times what is measured of it, at least so many
+    points; else every band weighs `weight`.
+    """
+    if least is None:
+        every = np.full(len(bands), weight)
+        return every, every
+    limbs = int(max(bands.parent.segments.max(), bands.child.segments.max(), measured.limb.max(initial=0))) + 1
+    total = np.maximum(np.bincount(measured.limb, measured.weight, limbs), least)
+    count = np.bincount(bands.parent.segments, minlength=limbs) + np.bincount(bands.child.segments, minlength=limbs)
+    each = weight * total / np.maximum(count, 1)
+    return each[bands.parent.segments], each[bands.child.segments]
+
+
+def band_pairs(bands: Bands, ends: tuple[NDArray, NDArray], own: NDArray, other: NDArray) -> tuple[Pairs, Pairs]:
     """Step 6: both ends of every band with its middle, where it pulls them."""
-    a, b = places(body, frames, bands.parent), places(body, frames, bands.child)
-    middle = 0.5 * (a + b)
-    return Pairs(
-        np.concatenate([a, b]), np.concatenate([middle, middle]), np.full(2 * len(bands), weight),
-        np.concatenate([bands.parent.segments, bands.child.segments]),
-    )  # fmt: skip
+    middle = 0.5 * (ends[0] + ends[1])
+    return (
+        Pairs(ends[0], middle, own, bands.parent.segments),
+        Pairs(ends[1], middle, other, bands.child.segments),
+    )
+
+
+def moved(
+    body: Body, frames: NDArray, measured: Pairs, bands: Bands, ends: tuple[NDArray, NDArray], own: NDArray,
+    other: NDArray, stay: float,
+) -> NDArray:  # fmt: skip
+    """Step 7: frames (S, 12) after each limb's own motion, all found at once in the world."""
+    pairs = joined(measured, *band_pairs(bands, ends, own, other))
+    return move(frames, *absolute_orientation(*pairs, count=len(frames), stay=stay))
+
+
+def moved_down(
+    body: Body, frames: NDArray, measured: Pairs, bands: Bands, ends: tuple[NDArray, NDArray], own: NDArray,
+    other: NDArray, stay: float,
+) -> NDArray:  # fmt: skip
+    """Step 7: frames (S, 12) after each limb's own motion on top of its parent's, from the root on (P2 3.3).
+
+    What hangs on a limb goes with it before its own motion is found, and is pulled to where the parent's joint is now.
+    """
+    parents, count = body.tree.parents, len(frames)
+    level = np.zeros(count, np.int64)
+    for s in range(1, count):
+        level[s] = level[parents[s]] + 1
+    pull, hold = band_pairs(bands, ends, own, other)
+    joint = ends[0]
+    for k in range(level.max() + 1):
+        pairs = joined(measured, pull, hold._replace(target=joint))
+        of = level[pairs.limb] == k
+        own_pairs = Pairs(*(column[of] for column in pairs))
+        R, t = absolute_orientation(*own_pairs, count=count, stay=stay)
+        for s in range(1, count):
+            if level[s] > k:
+                R[s], t[s] = R[parents[s]], t[parents[s]]
+        frames = move(frames, R, t)
+        measured, pull, hold = (p._replace(source=_along(p.source, R, t, p.limb)) for p in (measured, pull, hold))
+        pull = pull._replace(target=_along(pull.target, R, t, pull.limb))  # both of its ends go along
+        joint = _along(joint, R, t, bands.parent.segments)
+    return frames
+
+
+def _along(x: NDArray, R: NDArray, t: NDArray, limb: NDArray) -> NDArray:
+    return np.einsum("nij,nj->ni", R[limb], x) + t[limb]
 
 
 def places(body: Body, frames: NDArray, points: PointSet) -> NDArray:

@@ -64,15 +64,16 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
     size = [len(m) for m in model.segments]
     root = max(range(len(size)), key=lambda s: (size[s], sum(s in (j.parent, j.child) for j in model.joints)))
     found, broken = identify_below(subject, root, -1, np.full(len(model), -1))
-    for s in broken:  # children of broken chains come last, without a pivot
-        found, _ = identify_below(subject, s, -1, found, alone=True)
+    for s in broken:  # those of broken chains come last, without a pivot
+        if (found[subject.markers(s)] < 0).any():
+            found, _ = identify_below(subject, s, -1, found, alone=True)
     return found
 
 
 def identify_below(
     subject: Subject, s: int, parent: int, found: NDArray, alone: bool = False
 ) -> tuple[NDArray, list[int]]:
-    """A segment and all below it, depth first; what was found, and segments of chains that broke (P5 3.2).
+    """A segment and all below it, depth first; what was found, and the segments of chains that broke (P5 3.2).
 
     A match is confirmed by its children's; where one cannot be found, the segment's next match is tried, and the one
     with most points wins.
@@ -84,13 +85,23 @@ def identify_below(
         now, broken = found.copy(), []
         now[subject.markers(s)] = match
         for child in children:
-            now, below = identify_below(subject, child, s, now)
-            broken += below
+            now, lost = identify_below(subject, child, s, now)
+            broken += lost
         if (now >= 0).sum() > most:
             best, best_broken, most = now, broken, int((now >= 0).sum())
         if not broken:
             break
-    return (best, best_broken) if most >= 0 else (found, [s] if not alone else [])
+    return (best, best_broken) if most >= 0 else (found, [] if alone else below(subject, s, parent))
+
+
+def below(subject: Subject, s: int, parent: int) -> list[int]:
+    """A segment and all that hang on it, seen from its parent, nearest first."""
+    found, above = [s], {parent}
+    for a in found:
+        above.add(a)
+        found += [j.parent + j.child - a for j in subject.model.joints if a in (j.parent, j.child)
+                  and j.parent + j.child - a not in above]  # fmt: skip
+    return found
 
 
 def segment_matches(subject: Subject, s: int, parent: int, found: NDArray) -> Iterator[NDArray]:

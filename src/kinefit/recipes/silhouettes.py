@@ -1,7 +1,8 @@
-"""Pose from silhouettes as Rosenhahn and Klette print it (P1 4.1): contour, occluding contour, pairs, rays, again.
+"""Pose from silhouettes as Rosenhahn and Klette print it (P1 2.4): contour, occluding contour, pairs, rays, again.
 
 1. The image's silhouette comes from a threshold on colour and the Laplace operator.
-2. The model's 3D silhouette comes from its projection in a virtual image, anew in every cycle.
+2. The model's 3D silhouette comes from its projection in a virtual image, anew in every cycle; of its low frequencies
+   first, where that is asked for. Skins and bodies that morph are posed as such.
 3. Each point of it is paired with the nearest contour point (ICP), which stands for a ray of projection.
 4. The motor of the pose and the joint angles follow from (M X M̃) × L = 0 for all pairs at once; until nothing moves.
 
@@ -19,18 +20,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import body_mesh
-from kinefit.bodies.surfaces.triangles import BodyMesh
-from kinefit.correspondences.outlines import outline_pairs, outline_rows
+from kinefit.bodies.morphing import MorphedPose, Morphing
+from kinefit.correspondences.morphed import morphed_rows
+from kinefit.correspondences.outlines import outline_pairs
 from kinefit.correspondences.rims import RimFinder
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import colour_silhouette
-from kinefit.rows import Rows
+from kinefit.rows import DofRows, Rows
 from kinefit.solvers.least_squares import gauss_newton
 
 __all__ = ["PaperFit", "contour_points", "pose_from_contours", "track_contours"]
 
+_PIXELS = 2.0  # [px] standard deviation of a contour point
 _ANY_WAY = np.pi  # pairs are the nearest points, whichever way outlines face there
 
 
@@ -58,57 +60,75 @@ def contour_points(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray
 
 
 def pose_from_contours(
-    body: Body,
+    model: Body | Morphing,
     state: BodyState,
     rig: Rig,
     contours: Mapping[str, NDArray],
     *,
-    mesh: BodyMesh | None = None,
-    finder: RimFinder | None = None,
+    passes: Sequence[int] = (0,),
     reach: float = 60.0,
     cycles: int = 30,
     tolerance: float = 1e-4,
 ) -> PaperFit:
-    """Pose and joint angles from the contours in some cameras (P1 4.1).
+    """Pose and joint angles from the contours in some cameras (P1 2.4).
 
     Parameters
     ----------
+    model : Body, with its skin and its morphs, or what was made of it once.
     state : BodyState to begin with, the last frame's.
     contours : camera -> (4, N) as `contour_points` gives them, in the image of the calibration.
-    mesh, finder : made once for the body; default: `body_mesh(body)`.
+    passes : of the low-pass filter of the model's surface (`Morphing.low_pass`), one approximation after the other; 0
+        is the surface itself.
     reach : float [px] beyond which no points are paired.
-    tolerance : float, of a step (metres and radians) that ends the cycles.
+    cycles : int, at most, of each approximation.
+    tolerance : float, of a step (metres and radians) that ends the cycles of one.
 
     Raises
     ------
     ObservationError
         No contour has a point near the occluding contour of the body.
     """
-    mesh = body_mesh(body) if mesh is None else mesh
-    finder = RimFinder(mesh) if finder is None else finder
+    whole = Morphing(model) if isinstance(model, Body) else model
     error, done = np.nan, 0
-    while done < cycles:
-        done += 1
-        vertices = mesh.posed(body.tree.forward(state.T_world_root, state.angles)[0])
-        parts = [_rows(body, state, rig[name], points, vertices, finder, reach) for name, points in contours.items()]
-        rows = Rows.concat(*parts)
-        if not len(rows):
-            raise ObservationError("no contour is near the body", remedy="Start nearer to it, or widen the reach.")
-        step = gauss_newton(body, state, rows, damping=1e-6 * float(np.sum(rows.weight)))
-        error = float(np.sqrt(2.0 * np.mean(rows.residual**2)))
-        state = step.state
-        if step.norm < tolerance:
-            break
+    for times in passes:
+        shape = whole.low_pass(times) if times else whole
+        finder = RimFinder(shape.mesh)
+        for _ in range(cycles):
+            pose, parts = shape.pose(state), []
+            for name, points in contours.items():
+                parts += _rows(pose, rig[name], points, finder, reach)
+            count = sum(len(rows) for rows in parts)
+            if not count:
+                raise ObservationError("no contour is near the body", remedy="Start nearer to it, or widen the reach.")
+            weight = sum(float(np.sum(rows.weight)) for rows in parts)
+            step = gauss_newton(whole.body, state, parts, damping=1e-6 * weight)
+            error = float(np.sqrt(2.0 * sum(float(np.sum(rows.residual**2)) for rows in parts) / count))
+            state, done = step.state, done + 1
+            if step.norm < tolerance:
+                break
     return PaperFit(state, error, done)
 
 
 def _rows(
-    body: Body, state: BodyState, camera: Camera, contour: NDArray, vertices: NDArray, finder: RimFinder, reach: float
-) -> Rows:
-    rim = finder.find(vertices, camera)
+    pose: MorphedPose, camera: Camera, contour: NDArray, finder: RimFinder, reach: float
+) -> list[Rows | DofRows]:
+    """Two rows a pair: a point of the rim should lie on the ray of the contour's point."""
+    rim = finder.find(pose.vertices, camera)
     rim = rim.chosen(~rim.inner)
-    pairs = outline_pairs(rim.outline, np.ascontiguousarray(contour), reach=reach, angle=_ANY_WAY, both=False)
-    return outline_rows(body, state, rim, vertices, camera, contour, pairs, by="rays")
+    i, k = outline_pairs(rim.outline, np.ascontiguousarray(contour), reach=reach, angle=_ANY_WAY, both=False)
+    if not len(i):
+        return []
+    chosen = rim.chosen(i)
+    x, ray = chosen.on(pose.vertices), camera.ray(contour[:2, k].T)
+    first = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
+    depth = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    sigma = np.maximum(depth, 1e-3) * _PIXELS / np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    return [
+        morphed_rows(pose, chosen.vertices, n, np.sum((camera.centre_world - x) * n, axis=1), share=share, sigma=sigma)
+        for n in (first, np.cross(ray, first))
+    ]
 
 
 def track_contours(
@@ -117,12 +137,13 @@ def track_contours(
     rig: Rig,
     images: Iterable[Mapping[str, NDArray]],
     colours: Mapping[str, Sequence[ArrayLike]],
+    *,
+    passes: Sequence[int] = (0,),
 ) -> Iterator[PaperFit]:
     """Frame after frame, each from the last one's pose: images camera -> (H, W, 3), colours camera -> (low, high)."""
-    mesh, state = body_mesh(body), start
-    finder = RimFinder(mesh)
+    model, state = Morphing(body), start
     for seen in images:
         contours = {name: contour_points(image, *colours[name]) for name, image in seen.items()}
-        fit = pose_from_contours(body, state, rig, contours, mesh=mesh, finder=finder)
+        fit = pose_from_contours(model, state, rig, contours, passes=passes)
         state = fit.state
         yield fit

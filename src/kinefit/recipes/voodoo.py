@@ -8,8 +8,8 @@ As printed: every limb moves by its own closed form (Horn) to what is nearest to
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,11 @@ from kinefit.observations import Frame
 from kinefit.recipes import _voodoo_boxes as boxing
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.recipes._voodoo_input import Sight, sight_of
-from kinefit.solvers.limbs import absolute_orientation, move
+
+_MOST = 0.5  # [m] by which no limb moves within a frame
+_HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")
+WEIGHTS: Mapping[str, float] = {"nose_tip": 30.0, **dict.fromkeys(_HANDS, 20.0)}
+"""Of face and hands (P2 5); all else weighs 1."""
 
 
 @dataclass(frozen=True)
@@ -34,31 +38,45 @@ class Settings:
         A feature's counts before its sensor's; 1 for what is not named (P2 5: ToF 1, face 30, hands 20).
     body_box, limb_box : float
         Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
-    overlap : "shared", "exclusive" or "adjacent", for points in the boxes of several limbs.
+    overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
+        The first three are the paper's; "nearest" gives a point to the limb whose surface is nearest.
     factor, minimum, maximum : sampling factor, and points of a limb at least and at most.
     bound : float
         Pairs that are farther apart do not count.
     band : float
-        Weight of a band: about that of the points of half a limb.
+        Weight of every band; by `band_rule` "points" that of all bands of a limb together, as a share of that of its
+        measured points (of `minimum` of them, where there are fewer).
+    band_rule : "each" or "points"
+    floor : (4,) plane a, b, c, d with a x + b y + c z = d [m], optional
+        Free points less than `clear` [m] above it are none of the body's.
+    down : bool
+        Whether a limb's motion is handed to all limbs that hang on it, from the root on, before theirs are found.
     stay : float [m²]
         See `absolute_orientation`: a limb seen by one feature does not spin about it.
     quality : float [m²]
         Mean squared distance that is good enough.
-    steps : int, at most.
+    stop : float [m²], optional
+        ICP's own rule: no further step where the last one lowered the mean squared distance by less (P2 3.2).
+    steps : (int, int) at least and at most.
     """
 
-    weights: Mapping[str, float] = field(default_factory=lambda: {"nose_tip": 30.0, "l_wrist": 20.0, "r_wrist": 20.0})
+    weights: Mapping[str, float] = field(default_factory=lambda: dict(WEIGHTS))
     body_box: float = 0.1
     limb_box: float = 0.1
-    overlap: boxing.Overlap = "exclusive"
+    overlap: boxing.Overlap | Literal["nearest"] = "exclusive"
     factor: float = 1.0
     minimum: int = 40
     maximum: int = 100
     bound: float = 0.15
     band: float = 30.0
+    band_rule: Literal["each", "points"] = "each"
+    floor: tuple[float, float, float, float] | None = None
+    clear: float = 0.05
+    down: bool = True
     stay: float = 0.1
     quality: float = 0.005**2
-    steps: int = 15
+    stop: float | None = None
+    steps: tuple[int, int] = (0, 15)
 
 
 class Fit(NamedTuple):
@@ -91,21 +109,34 @@ def voodoo(
 
 
 def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> Fit:
-    """Steps 1 to 7, until the quality is met or the steps are spent (P2 4.2, fig. 3)."""
-    pairs, step = _pairs(body, frames, sight, boxes, bands, s), 0
-    while step < s.steps and steps.quality(pairs) > s.quality:
-        frames = move(frames, *absolute_orientation(*pairs, count=len(frames), stay=s.stay))
-        pairs, step = _pairs(body, frames, sight, boxes, bands, s), step + 1
-    return Fit(frames, steps.quality(pairs), step)
+    """Steps 1 to 7, until the quality is met, ICP gains no more, or the steps are spent (P2 3.2 and 4.2, fig. 3)."""
+    sight = _in_reach(sight, boxes, frames, s)
+    (least, most), step, before = s.steps, 0, np.inf
+    measured, ends = _measured(body, frames, sight, boxes, s), steps.band_ends(body, frames, bands)
+    while True:
+        own, other = steps.band_weights(bands, measured, s.band, s.minimum if s.band_rule == "points" else None)
+        now = steps.quality(steps.joined(measured, *steps.band_pairs(bands, ends, own, other)))
+        if step == most or (step >= least and (now <= s.quality or (s.stop is not None and before - now < s.stop))):
+            return Fit(frames, now, step)
+        frames = (steps.moved_down if s.down else steps.moved)(body, frames, measured, bands, ends, own, other, s.stay)
+        measured, ends = _measured(body, frames, sight, boxes, s), steps.band_ends(body, frames, bands)
+        step, before = step + 1, now
 
 
-def _pairs(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> steps.Pairs:
-    """Steps 1 to 6: everything that pulls at a limb."""
+def _in_reach(sight: Sight, boxes: boxing.Boxes, frames: NDArray, s: Settings) -> Sight:
+    """Without free points that no step will come near to, and without those of the floor."""
+    near = boxing.in_body_box(sight.free, boxes, frames, s.body_box + _MOST)
+    if s.floor is not None:
+        near &= sight.free @ np.array(s.floor[:3]) > s.floor[3] + s.clear
+    return replace(sight, free=sight.free[near], free_weight=sight.free_weight[near])
+
+
+def _measured(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: Settings) -> steps.Pairs:
+    """Steps 1 to 5: all that sensors saw, with the points of the limbs that it pulls at."""
     return steps.joined(
         _points(body, frames, sight, boxes, s),
         steps.points_on_points(body, frames, sight.points, sight.places, sight.places_weight),
         steps.points_on_lines(body, frames, sight.features, sight.lines, sight.lines_weight),
-        steps.band_pairs(body, frames, bands, s.band),
     )
 
 
@@ -114,7 +145,10 @@ def _points(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: S
     near = boxing.in_body_box(sight.free, boxes, frames, s.body_box)
     x = np.concatenate([sight.free[near], sight.on_body])
     weight = np.concatenate([sight.free_weight[near], sight.on_body_weight])
-    member = boxing.assigned(boxing.depth_in_boxes(x, boxes, frames, s.limb_box), boxes, s.overlap)
+    if s.overlap == "nearest":  # as near to a surface as its box is enlarged lies within its box
+        member = steps.nearest_limb(body, frames, x, min(s.bound, s.limb_box))
+    else:
+        member = boxing.assigned(boxing.depth_in_boxes(x, boxes, frames, s.limb_box), boxes, s.overlap)
     known = np.zeros((len(sight.on_limb), len(frames)), bool)
     known[np.arange(len(known)), sight.limb] = True
     x = np.concatenate([x, sight.on_limb])

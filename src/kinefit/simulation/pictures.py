@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES
@@ -31,6 +32,8 @@ GRAIN = 0.015  # [m] of the grain: a little more than a pixel at three metres, s
 _GRAINS = 64  # cells after which it repeats
 _CONTRAST = {"skin": 0.10}  # share of the colour, one standard deviation; cloth and walls have more
 _CLOTH = 0.25
+_BROW, _CHIN = 2.5, 0.5  # times the height of the mouth above the neck's joint
+_HAIR = (35, 45, 60)
 _LIGHT = (0.6, 1.0)  # light of surfaces turned away from it, and towards it
 
 
@@ -125,12 +128,49 @@ def _shaded(scene: Scene, view: View) -> NDArray:
     towards = np.clip(view.normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
     shade = (_LIGHT[0] + (_LIGHT[1] - _LIGHT[0]) * towards).astype(np.float32)[view.raster.face]
     shade *= 1.0 + contrast[label] * grain(view.x_rest, label)
-    return np.clip(base[label] * shade[..., None], 0.0, 255.0)
+    colour = base[label]
+    for cloth in _sleeves(scene.motion.body, view):
+        colour[cloth] = _CLOTHES["shirt"]
+    hair, collar = _hair_and_collar(scene.motion.body, view)
+    colour[hair], colour[collar] = _HAIR, _CLOTHES["shirt"]
+    return np.clip(colour * shade[..., None], 0.0, 255.0)
+
+
+def _sleeves(body: Body, view: View) -> list[NDArray]:
+    """(H, W) bool a forearm: its pixels above the wrist, where the hand is part of the forearm: both would be bare."""
+    tree, out = body.tree, []
+    for side in "lr":
+        wrist, name = f"{side}_wrist", f"forearm_{side}"
+        if name in tree.segments and wrist in body.landmarks.names and f"hand_{side}" not in tree.segments:
+            segment = tree.segment(name)
+            along = body.points_rest(body.landmarks.select((wrist,)))[0] - tree.rest[segment]
+            own = view.raster.segment == segment
+            own[own] = (view.x_rest[own] - tree.rest[segment]) @ along < along @ along
+            out.append(own)
+    return out
 
 
 def _worn(segment: str) -> str:
     part = segment.removesuffix("_l").removesuffix("_r")
     return _WORN.get(part, "shirt")
+
+
+def _hair_and_collar(body: Body, view: View) -> tuple[NDArray, NDArray]:
+    """(H, W) bool each, a head's pixels above its brow or behind its ears, and those below its chin.
+
+    Where the neck is part of the head: heads with a neck of their own are skin all over.
+    """
+    tree = body.tree
+    hair, collar = (np.zeros(view.raster.segment.shape, bool) for _ in range(2))
+    known = {"r_mouth", "r_tragion"} <= set(body.landmarks.names)
+    if "head" in tree.segments and "neck" not in tree.segments and known:
+        segment = tree.segment("head")
+        mouth, ear = body.points_rest(body.landmarks.select(("r_mouth", "r_tragion"))) - tree.rest[segment]
+        own = view.raster.segment == segment
+        x = view.x_rest[own] - tree.rest[segment]
+        hair[own] = (x[:, 1] > _BROW * mouth[1]) | (x[:, 0] < ear[0])
+        collar[own] = x[:, 1] < _CHIN * mouth[1]
+    return hair & ~collar, collar
 
 
 @cache

@@ -47,39 +47,56 @@ def soles(body: Body) -> PointSet:
     return points.select(tuple(points.names[i] for i in low))
 
 
-def find_contacts(body: Body, roots: NDArray, angles: NDArray, rate: float, up: str) -> Contacts:
+def find_contacts(
+    body: Body, roots: NDArray, angles: NDArray, rate: float, up: str, eye: NDArray | None = None
+) -> Contacts:
     """Contacts of the soles with a level floor in a smoothed motion.
 
     Contacts switch with hysteresis: a point must be slow for a while to rest, and twice as fast to leave.
 
     The floor's height is taken for each point on its own, since its place on the sole is not known to the centimetre:
-    the median of those of its slow frames that are near the lowest.
+    the median of those of its slow frames that are near the lowest. One camera alone tells neither height nor speed
+    towards it: what counts there is that a point hardly moves across its ray, and it rests where it seems to be.
 
     Parameters
     ----------
     roots, angles : (F, 4, 4) [m], (F, D) [rad]
     rate : float [Hz]
     up : vertical axis of the world.
+    eye : (3,) [m] of a camera that is the only sensor
     """
     points, axis = soles(body), np.array(UP_AXES[up])
     x = body.trajectories(roots, angles, points)
-    speed = np.linalg.norm(np.gradient(x, axis=0), axis=2) * rate if len(x) > 1 else np.full(x.shape[:2], np.inf)
+    speed = _speeds(x, rate, eye)
     height = x @ axis
     places, weight = np.zeros(x.shape), np.zeros(x.shape[:2])
     for p in range(len(points)):
         slow = speed[:, p] < _SLOW
         if slow.sum() < _LEAST * rate:
             continue
-        lowest = np.quantile(height[slow, p], 0.1)
-        floor = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
-        near = np.abs(height[:, p] - floor) < _LOW
+        floor, near = None, np.ones(len(x), bool)
+        if eye is None:
+            lowest = np.quantile(height[slow, p], 0.1)
+            floor = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
+            near = np.abs(height[:, p] - floor) < _LOW
         for run in _runs((speed[:, p] < _LETS_GO) & near, 1):
             if np.count_nonzero(slow[run]) < _LEAST * rate:
                 continue
             middle = np.median(x[run, p], axis=0)
-            places[run, p] = middle + (floor - middle @ axis) * axis
+            places[run, p] = middle if floor is None else middle + (floor - middle @ axis) * axis
             weight[run, p] = _GIVES**-2
     return Contacts(points, places, weight)
+
+
+def _speeds(x: NDArray, rate: float, eye: NDArray | None) -> NDArray:
+    """(F, P) [m/s] of points x (F, P, 3); across their rays from an eye (3,), where there is one."""
+    if len(x) < 2:
+        return np.full(x.shape[:2], np.inf)
+    moved = np.gradient(x, axis=0)
+    if eye is not None:
+        ray = (x - eye) / np.linalg.norm(x - eye, axis=2, keepdims=True)
+        moved = moved - np.sum(moved * ray, axis=2, keepdims=True) * ray
+    return np.asarray(np.linalg.norm(moved, axis=2) * rate)
 
 
 def _runs(on: NDArray, least: int) -> list[slice]:

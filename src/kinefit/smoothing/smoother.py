@@ -60,7 +60,7 @@ class SmoothedTake:
 def smooth_results(
     body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings,
     scene_of: SceneOf, *, others: OtherSensors | None = None, contacts: bool = False, up: str = "z",
-    window: int = 600, overlap: int = 60,
+    eye: NDArray | None = None, window: int = 600, overlap: int = 60,
 ) -> SmoothedTake:  # fmt: skip
     """Tracked frames of any sensors, smoothed together.
 
@@ -76,6 +76,7 @@ def smooth_results(
     others : what all sensors but the keypoints measured
     contacts : bool
         Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
+    eye : (3,) [m] of the camera that is the only sensor, for the contacts; see `find_contacts`
     window, overlap : frames of a part that is solved at once, and how many it shares with the next.
     """
     swapped = swapped_channels(channels, results)
@@ -88,7 +89,7 @@ def smooth_results(
         take, swapped = replace(take, uv=uv, confidence=confidence), again
         take, covariances, others_matched = _solve(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
-        found = find_contacts(body, take.roots, take.angles, rate, up)
+        found = find_contacts(body, take.roots, take.angles, rate, up, eye)
         take, _, others_matched = _solve(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)

@@ -23,6 +23,11 @@ _ITERATIONS, _DONE = 30, 1e-6
 _REACH = 0.2  # [m] beyond which no foot of a point is sought
 _GONE = 0.2  # of the body's radius: a ball that is smaller has collapsed
 
+ROUNDS = 30, (1, 5)
+"""Rounds, and `coarse`, with which `fit_subject` finds radii of metaballs: points are matched anew after every step.
+With several steps a round radii follow matches that the poses leave in the next, and end in another minimum: so did
+two of four arms."""
+
 
 @dataclass(frozen=True, eq=False)
 class MetaballShape:

@@ -64,8 +64,8 @@ class TrackedFrames:
 
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
-    lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", name: str = "motion",
-    told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
+    lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", eye: NDArray | None = None,
+    name: str = "motion", told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 
@@ -79,6 +79,7 @@ def motion_of(
     lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
     noise : that is known beforehand, for a lag
     up, name : of the motion
+    eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
     told : what else there is to tell, for `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
@@ -95,7 +96,8 @@ def motion_of(
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
         done = smooth_results(
-            body, channels, results, rate, settings, frames.scene_of, others=others, contacts=contacts, up=up
+            body, channels, results, rate, settings, frames.scene_of, others=others,
+            contacts=contacts or eye is not None, up=up, eye=eye,
         )
         results, take, weight = done.results, done.take, done.weight
         provenance["smoothing"] = done.provenance

@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.errors import ObservationError, choices
-from kinefit.geometry.camera import Rig
+from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES
 from kinefit.multiview.association import choose_people
 from kinefit.multiview.followed import Followed, follow
+from kinefit.multiview.one_camera import lifted_alone
 from kinefit.multiview.people import Person
 from kinefit.observations import (
-    ColourFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
     Keypoints,
-    LineFrame,
+    LiftedFrame,
     MarkerFrame,
     Markers,
-    SilhouetteFrame,
+    sensor_of,
 )
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Sensor
@@ -144,10 +144,18 @@ class Recording:
         sigma = _sigmas(accuracy, len(keypoints))
         one = follow(rig, keypoints, person, people)
         whose = tuple(choose_people(rig, one.keypoints))
+        steps = _lifted_steps(lifted_alone(one.keypoints), one.keypoints, whose)
         return cls(
             keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=whose, followed=one,
-            keypoint_sigma=sigma, **more,
+            keypoint_sigma=sigma, **{"steps": steps, **more},
         )  # fmt: skip
+
+    @property
+    def alone(self) -> Camera | None:
+        """The camera that is the only sensor, its landmarks lifted to space."""
+        lifted = lifted_alone(self.keypoints)
+        others = self.markers or self.depth or self.sensors or self.backgrounds or len(self.rig) > 1
+        return None if lifted is None or others else self.rig[lifted.camera]
 
     @classmethod
     def of_frames(
@@ -183,7 +191,7 @@ class Recording:
         if len(timed) < len(told):  # evenly beyond the ends
             times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
         sigma = dict(sigma or {})
-        there = {*rig.names, *(_name(f) for seen in steps for f in seen)}
+        there = {*rig.names, *(sensor_of(f) for seen in steps for f in seen)}
         for name in sigma:
             if name not in there:
                 remedy = "Leave its standard deviation out, or correct its name."
@@ -208,10 +216,20 @@ class Recording:
         )  # fmt: skip
 
 
-def _name(frame: Any) -> str:
-    """Of the sensor that a frame is of."""
-    kind = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region "}.get(type(frame), "")
-    return kind + str(frame.sensor)
+def _lifted_steps(record: Keypoints | None, keypoints: Sequence[Keypoints], people: Sequence[NDArray]) -> Steps:
+    """What a network lifted of the person who is followed, at each step; nothing of no record."""
+    if record is None or record.lifted is None:
+        return lambda i: ()
+    lifted, chosen = record.lifted, people[keypoints.index(record)]
+
+    def steps(i: int) -> Sequence[Any]:
+        p = int(chosen[i])
+        if p < 0:
+            return ()
+        x, uv = lifted[i, p], record.points[i, p]
+        return (LiftedFrame(record.camera, float(record.times[i]), record.names, x, uv, record.keypoint_set),)
+
+    return steps
 
 
 def _check_names(step: int, seen: Sequence[Any]) -> None:
@@ -225,8 +243,7 @@ def _check_names(step: int, seen: Sequence[Any]) -> None:
 
 def _cut(record: Keypoints, frames: slice) -> Keypoints:
     first = range(len(record))[frames].start
-    offset = record.time_offset + first / record.rate
-    return replace(record, points=record.points[frames], confidence=record.confidence[frames], time_offset=offset)
+    return record.rows(frames, record.time_offset + first / record.rate)
 
 
 def _sigmas(accuracy: float | Sequence[float], count: int) -> tuple[float, ...]:

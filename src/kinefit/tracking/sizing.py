@@ -23,6 +23,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
+from kinefit.subject.metaballs import ROUNDS, MetaballShape
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.tracking.recording import Recording, spread
@@ -30,6 +31,7 @@ from kinefit.tracking.run import run
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
+_TRIED_ALONE = 600  # of one camera's keypoints: lengths are told apart by poses that differ
 _POSES = 8  # and how many of them it is found from: twice as many change no half axis by more than its deviation
 _MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
@@ -90,7 +92,8 @@ def fitted_to_person(
     if cameras == 1 and not (others or recording.start):
         name = recording.keypoints[0].camera
         problem = f"the keypoints are of one camera only, {name}"
-        raise TrackingError(problem, remedy="Tracking needs two cameras or more, or another sensor beside it.")
+        remedy = "Tracking needs two cameras or more, another sensor beside it, or points lifted to space"
+        raise TrackingError(problem, remedy=f"{remedy}: kinefit detect --force finds them in the video.")
     ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
     for what, given in ignored.items():
         if given is not None and (subject is not None or not size):
@@ -190,7 +193,8 @@ def _by_all(
     """
     r, body = person.recording, person.subject.body
     first = 0 if person.start is None else person.start[0]
-    stretch = slice(first, min(first + _TRIED, len(r)))
+    tried, many = (_TRIED_ALONE, _MANY) if r.alone is not None else (_TRIED, _POSES)
+    stretch = slice(first, min(first + tried, len(r)))
     start = None if person.start is None else (0, person.start[1])
     counted = None
     if progress:
@@ -207,7 +211,7 @@ def _by_all(
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
     surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
-    poses = _POSES if surfaces or r.keypoints else _MANY
+    poses = many if surfaces or r.keypoints else _MANY
     chosen = [good[k] for k in spread(len(good), poses)]
     if not chosen:
         return person
@@ -222,9 +226,11 @@ def _by_all(
 
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         world = unknown.world
+        balls = any(isinstance(p, MetaballShape) for p in unknown.parameters)
+        rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE)
         return joint.fit_subject(
             world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
-            times=times, velocities=velocities, rounds=_MATCHES,
+            times=times, velocities=velocities, rounds=rounds, coarse=coarse,
         )  # fmt: skip
 
     points = None

@@ -107,12 +107,13 @@ def recording_of(
         name=take.name, sensors=_surface_sensors(take, seen),
     )  # fmt: skip
     if seen.keypoints:
+        bare = not (videos or marked or recording.sensors)
         pixels = Recording.of_keypoints(
             rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,
-            keypoint_sigma=pixels.keypoint_sigma,
+            keypoint_sigma=pixels.keypoint_sigma, steps=pixels.steps if bare else steps,
         )  # fmt: skip
     return recording, body
 

@@ -54,7 +54,7 @@ def of_points(
     cameras : (2,) [m, rad] how sure it is; default: exact
     """
     sets = {name: std for name, std in recording.marker_sets if name}
-    if not sets:
+    if not sets and recording.alone is None:
         return None
     worn = {name: subject.body.markers(name) for name in sets}  # a fit from markers leaves those that were seen
     places = {name: generic.markers(name).select(points.names) for name, points in worn.items()}

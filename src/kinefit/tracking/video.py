@@ -117,6 +117,7 @@ def track(
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     motion = motion_of(
         frames, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
+        eye=None if recording.alone is None else recording.alone.centre_world,
         lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
         found=person.joint,
     )  # fmt: skip

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, by_length, conformal, levels
 from kinefit.errors import BodyError
@@ -170,3 +171,27 @@ def test_points_are_spread_evenly_along_a_contour():
 def test_bad_input_says_what_is_wrong(make, message):
     with pytest.raises(BodyError, match=message):
         make()
+
+
+def test_a_body_file_names_a_series(tmp_path):
+    u, v = np.meshgrid(np.arange(12) / 12, np.linspace(0, 1, 9), indexing="ij")
+    r = 0.05 + 0.02 * np.sin(np.pi * v) + 0.004 * np.cos(6 * np.pi * u)
+    grid = np.stack([r * np.cos(2 * np.pi * u), 0.3 * v, -r * np.sin(2 * np.pi * u)], axis=-1)
+    np.savetxt(tmp_path / "vase.csv", 1e3 * grid.reshape(-1, 3), delimiter=",")
+    text = """[body]
+name = "vase"
+[[segment]]
+name = "vase"
+joint = { name = "free", type = "free" }
+surface = { fourier = "vase.csv", unit = "mm", grid = [12, 9], closed = [true, false], orders = [2, 4], nodes = [24, 9]}
+"""
+    (tmp_path / "vase.toml").write_text(text)
+    mesh = load_body(tmp_path / "vase.toml").surfaces[0]
+    series = FourierSurface.of(grid, closed=(True, False), orders=(2, 4))
+    np.testing.assert_allclose(mesh.vertices, series.triangles((24, 9))[0], atol=1e-9)
+    (tmp_path / "vase.toml").write_text(text.replace("[12, 9]", "[12, 8]"))
+    with pytest.raises(BodyError, match="108 lines of 3 numbers for a grid of 12 x 8"):
+        load_body(tmp_path / "vase.toml")
+    (tmp_path / "vase.toml").write_text(text.replace("grid = [12, 9], ", ""))
+    with pytest.raises(BodyError, match="one shape"):
+        load_body(tmp_path / "vase.toml")

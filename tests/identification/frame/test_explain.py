@@ -50,7 +50,7 @@ def test_every_point_is_taken_once_and_nothing_gets_dearer(body, seed):
 def test_rivals_are_other_names_that_cost_little_more(body, seed):
     _, frame = seen(body, seed, distortion=0.06, missing=0.2)
     search, chosen = begun(body, frame)
-    best, near = rivals(search, polish(search, apart(search, chosen)))
+    best, near, _ = rivals(search, polish(search, apart(search, chosen)))
     for dearer, rival in near:
         assert not shared(search, rival).any()
         assert dearer == pytest.approx(cost_of(search, rival) - cost_of(search, best), abs=1e-6)

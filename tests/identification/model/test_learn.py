@@ -91,8 +91,19 @@ def test_joints_held_still_do_not_merge_and_do_not_promise():
     assert told == set(held)
     assert not [f for f in training_gate(moving(), loose, marker_set=SET) if f.kind == "still"]
     stiff = moving(10, turn=0.0)
-    merged = training_gate(stiff, learn_model(stiff, template=""))
-    assert any(f.kind == "merged" and "template" in str(f) for f in merged)
+    alone = learn_model(stiff, template="")  # what was held still is one segment by its distances, but none of a body
+    assert max(alone.mean[np.ix_(s, s)].max() for s in alone.segments) <= 0.6
+    assert len([f for f in training_gate(stiff, alone) if f.kind == "still"]) == len(alone.joints)
+
+
+def test_markers_whose_distance_varies_are_of_no_segment_and_a_set_is_asked_for():
+    take = moving(160, noise=0.002)
+    other = replace(take, names=tuple(f"M{i}" for i in range(len(take.names))))
+    model = learn_model(other)
+    assert max(model.deviation[np.ix_(s, s)].max() for s in model.segments) < 0.015
+    told = training_gate(other, model)
+    assert told[0].kind == "unknown" and "kinefit markers set" in told[0].remedy
+    assert not [f for f in training_gate(take, model, marker_set=SET) if f.kind == "unknown"]
 
 
 def test_a_label_that_the_file_has_twice_is_told():

@@ -208,7 +208,7 @@ WRONG = {
     "camera twice": (take_text(more='[[camera]]\nname = "a"'), "camera a: there are two"),
     "empty": ("", "an empty take"),
     "empty with head": ('[take]\nname = "x"', "an empty take"),
-    "no calibration": ('[[camera]]\nname = "a"', "cameras without calibration"),
+    "no calibration": ('[[camera]]\nname = "a"\n[[camera]]\nname = "b"', "cameras without calibration"),
     "unknown set": (take_text(keys='set = "BODY_26"'), "no keypoint set 'BODY_26'; there are: BODY_25B"),
     "set of another detector": (
         take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe 'COCO_17'"

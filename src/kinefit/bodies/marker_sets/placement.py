@@ -65,7 +65,7 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
             "does not tell where its markers sit on a body", file=source, place="markers",
             remedy=f"Add [markers] to a file of your own, or use one of: {', '.join(placed_set_names())}.",
         )  # fmt: skip
-    return _placed(body, record)
+    return placed(body, record)
 
 
 def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> Placement:
@@ -87,12 +87,18 @@ def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike
         shared = whole.select(n for n in whole.points.names if n in known)
         if best is None or len(shared.points) > len(best.points):
             best = shared
+    if (best is None or not len(best.points)) and labels and all(label.startswith("*") for label in labels):
+        raise ObservationError(
+            f"{len(labels)} trajectories without names",
+            remedy="Identify first: `kinefit markers identify TAKE SUBJECT.json`, or `fit --subject SUBJECT.json`.",
+        )
     if best is None or len(best.points) < FEWEST:
         count = 0 if best is None else len(best.points)
         sets = f"set '{marker_set}'" if marker_set else "any marker set"
         raise ObservationError(
             f"only {count} of the labels are known to {sets}: {_listed(labels)}",
-            remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or give a file.",
+            remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "
+            "`kinefit markers set` writes a first one.",
         )
     return best
 
@@ -123,7 +129,8 @@ def _listed(labels: tuple[str, ...]) -> str:
     return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
 
 
-def _placed(body: Body, record: SetRecord) -> Placement:
+def placed(body: Body, record: SetRecord) -> Placement:
+    """A set's record on a body; markers on segments or landmarks that the body does not have are left out."""
     names, segments, at, spread = [], [], [], []
     for label, entry in record.markers.items():
         for name, mirrored in _with_image(label, record):

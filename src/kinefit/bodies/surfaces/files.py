@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
+from kinefit.bodies.surfaces.fourier_files import fourier_surface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.obj import mesh_surface
@@ -31,8 +32,9 @@ class BallRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
 
-    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or metaballs, from one end of
-    the limb to the other.
+    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or a Fourier series: the path
+    of a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or
+    metaballs, from one end of the limb to the other.
     """
 
     end: Vector | None = None
@@ -40,6 +42,11 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     start: Vector = (0.0, 0.0, 0.0)
     side: Vector | None = None
     mesh: str | None = None
+    fourier: str | None = None
+    grid: tuple[int, int] | None = None
+    closed: tuple[bool, bool] = (True, True)
+    orders: tuple[int, int] | None = None
+    nodes: tuple[int, int] | None = None
     unit: str = "m"
     mirror: bool = False
     balls: tuple[BallRecord, ...] = ()
@@ -63,12 +70,21 @@ def surfaces_of(
     out: list[TaperedCylinder | MeshSurface] = []
     for record in [records] if isinstance(records, SurfaceRecord) else records or ():
         is_cylinder = record.end is not None and record.radii is not None
-        if is_cylinder + (record.mesh is not None) + bool(record.balls) != 1:
-            remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, or `balls`."
+        is_series = record.fourier is not None and record.grid is not None
+        if is_cylinder + (record.mesh is not None) + is_series + bool(record.balls) != 1:
+            remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, "
+            remedy += "or `fourier` and `grid`, or `balls`."
             raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
         if record.mesh is not None:
             path = Path(source).parent / record.mesh
             out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
+            continue
+        if is_series:
+            assert record.fourier is not None and record.grid is not None
+            out.append(fourier_surface(
+                Path(source).parent / record.fourier, segment, grid=record.grid, closed=record.closed,
+                orders=record.orders, nodes=record.nodes, unit=record.unit, mirror=record.mirror, place=place,
+            ))  # fmt: skip
             continue
         if record.balls:
             out.append(_metaballs(record, segment, source, place))

@@ -32,6 +32,7 @@ from kinefit.observations import Keypoints
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
+from kinefit.readers.take.one_camera import is_alone
 
 Progress = Callable[[str, int, int], None]
 
@@ -98,6 +99,10 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         The take file itself cannot be read.
     """
     take = take if isinstance(take, Take) else read_take(take)
+    if is_alone(take):
+        text = f"Camera {take.cameras[0].name} is alone and not calibrated: there is nothing to check it against."
+        note = Finding("note", "load", text, remedy=f"Run: {command('track', take.path)}")
+        return Check(take.name, (note,), take, None)
     loaded = load_leniently(take)
     seen = loaded.observations
     if seen is None or seen.rig is None or len({k.camera for k in seen.keypoints}) < 2:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
+from kinefit.bodies.rigid_pairs import rigid_pairs
 from kinefit.calibration.check.findings import Finding
 from kinefit.calibration.check.views import Views
 from kinefit.geometry.camera import Rig
-from kinefit.initialization.from_points import rigid_pairs
 from kinefit.motion import UP_AXES
 from kinefit.readers.guess.views import nearest_axis, up_of_cameras, up_of_person
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, PointSet
+from kinefit.bodies.rigid_pairs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
 from kinefit.calibration.refine.bundle import bundle_adjust
@@ -20,7 +21,6 @@ from kinefit.calibration.refine.sightings import Progress, Sighting
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.initialization.from_points import rigid_pairs
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import CameraPrior, PointPixels
@@ -114,15 +114,12 @@ def steady_person(record: Keypoints) -> Keypoints:
             if score.max() > 0:
                 chosen[f] = int(np.argmax(score))
                 last = centre[f, chosen[f]]
-    there, every, one = chosen >= 0, np.arange(frames), np.maximum(chosen, 0)
-    if not there.any():
+    if not (chosen >= 0).any():
         raise CalibrationError(
             "nobody is seen in any frame", file=record.source or None, place=f"camera {record.camera}",
             remedy="Leave this camera out, or find the keypoints anew.",
         )
-    points = np.where(there[:, None, None], record.points[every, one], np.nan)
-    confidence = np.where(there[:, None], record.confidence[every, one], 0.0)
-    return replace(record, points=points[:, None], confidence=confidence[:, None])
+    return record.of_one(chosen)
 
 
 def common_pixels(channels: Channels) -> NDArray:

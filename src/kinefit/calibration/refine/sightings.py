@@ -66,17 +66,7 @@ class Sighting:
 
 def one_person(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Keypoints]:
     """The keypoints of the person to follow alone."""
-    people = choose_people(rig, keypoints)
-    out = []
-    for record, person in zip(keypoints, people, strict=True):
-        frames, there = np.arange(len(record)), (person >= 0)[:, None]
-        if record.points.shape[1] == 0:
-            out.append(record)
-            continue
-        points = np.where(there[..., None], record.points[frames, np.maximum(person, 0)], np.nan)
-        confidence = np.where(there, record.confidence[frames, np.maximum(person, 0)], 0.0)
-        out.append(replace(record, points=points[:, None], confidence=confidence[:, None]))
-    return out
+    return [record.of_one(person) for record, person in zip(keypoints, choose_people(rig, keypoints), strict=True)]
 
 
 def shifted(record: Keypoints, offset: float) -> Keypoints:
@@ -96,7 +86,7 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
     confidence = np.minimum(record.confidence[a], record.confidence[b])
     points = np.where(inside[:, None, None, None], points, np.nan)
     confidence = np.where(inside[:, None, None] & np.isfinite(points).all(axis=-1), confidence, 0.0)
-    return replace(record, points=points, confidence=confidence)
+    return replace(record, points=points, confidence=confidence, lifted=None)
 
 
 def sight(

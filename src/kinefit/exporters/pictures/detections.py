@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,12 +43,14 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
     """
     if Path(path).suffix != ".npz":
         raise ExportError("a file of detections ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
+    extra: dict[str, Any] = {} if detections.lifted is None else {"lifted": detections.lifted.astype(np.float32)}
     with writing(path) as temporary:
         np.savez_compressed(
             temporary, format=np.array(FORMAT), version=np.array(VERSION), key=np.array(key),
             camera=np.array(detections.camera), rate=np.array(detections.rate), size=np.array(detections.size),
             points=detections.points.astype(np.float32), confidence=detections.confidence.astype(np.float32),
             mask_runs=detections.mask_runs, mask_starts=detections.mask_starts,
+            **extra,
         )
 
 

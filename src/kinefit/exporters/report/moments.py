@@ -14,6 +14,7 @@ from kinefit.motion import Motion, Residuals
 DOUBTFUL = 0.5  # quality below which the measurements support less than half of the body
 WIDE = 0.05  # [m] standard deviation of a joint centre: ±2 σ is as thick as a limb, which may then lie beside itself
 _OFF = 4.0  # robust standard deviations that a frame's residual lies above the take's: by chance once in 30,000
+_LEAST = 0.5  # [px, mm] of a residual that is told: less would be told as 0
 _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
 _MANY = 0.25  # share of outliers that is told as a cause; robust fits of good keypoints leave out less than a tenth
 
@@ -192,7 +193,7 @@ def _off(motion: Motion) -> Iterable[_Found]:
             continue
         usual = float(np.median(level[seen]))
         spread = 1.4826 * float(np.median(np.abs(level[seen] - usual)))
-        bad = seen & (level > usual + _OFF * spread) & (level > 1.5 * usual)
+        bad = seen & (level > usual + _OFF * spread) & (level > max(1.5 * usual, _LEAST))
         for start, stop in _runs(motion, bad):
             part = np.where(bad[start:stop], level[start:stop], 0.0)
             excess = np.minimum(part[part > 0] / max(usual, 1e-9) - 1, 3.0)

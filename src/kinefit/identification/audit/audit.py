@@ -13,7 +13,7 @@ from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
-from kinefit.identification.audit.swaps import best_run, crossings, pair_gain, swap_gains
+from kinefit.identification.audit.swaps import best_run, crossings, glitches, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.observations import Markers
@@ -200,11 +200,17 @@ def _swaps(
     who, near, give = partners(model, labels)
     positions = np.array(positions)
     step = max(1, -(-len(positions) // MOST_FRAMES))
+    found: list[AuditFinding] = []
+    for a, b, first, last in glitches(positions):
+        span = slice(first, last + 1)
+        if pair_gain(positions[span], a, b, mean, deviation).sum() > 0:
+            found.append(_swap(positions[span], (a, b), labels, first, last, len(positions)))
+            positions[span, a], positions[span, b] = positions[span, b].copy(), positions[span, a].copy()
     met, broken = crossings(positions)
     refused: set[tuple[int, int, int, int]] = set()
-    found: list[AuditFinding] = []
+    told = len(found)
     gains = swap_gains(positions[::step], mean, deviation)
-    while len(found) < MOST_SWAPS:
+    while len(found) - told < MOST_SWAPS:
         spans = _candidates(gains, positions, mean, deviation, met, broken, step)
         spans = [c for c in spans if c[1:] not in refused]
         if not spans:

@@ -37,8 +37,8 @@ def swapped_throughout(positions: NDArray, model: MarkerModel, places: Sequence[
         should be, of whatever size; NaN where not known. See `places_of_set`, `places_of_model`.
     """
     found = list(_by_motion(positions, model))
-    for s, should in enumerate(places):
-        found += _by_place(model, s, should)
+    for s in range(len(places)):
+        found += _by_place(model, s, places)
     return found
 
 
@@ -78,9 +78,30 @@ def _joints(model: MarkerModel, s: int, joints: dict[str, NDArray]) -> list[NDAr
     return [joints.get(model.names[j.child], nothing) for j in model.joints if s in (j.parent, j.child)]
 
 
-def _by_place(model: MarkerModel, s: int, should: NDArray) -> Iterator[Found]:
+def _fits_elsewhere(model: MarkerModel, places: Sequence[NDArray], s: int, pair: tuple[int, int]) -> bool:
+    """Whether an exchange leaves the other segments that either label belongs to where they should be."""
+    swapped = np.array(model.reference)
+    swapped[list(pair)] = swapped[list(pair[::-1])]
+    for t, members in enumerate(model.segments):
+        if t == s or not set(pair) & set(members):
+            continue
+        known = np.isfinite(places[t]).all(1)
+        if known.sum() < 3:
+            continue
+        misfit = []
+        for reference in (model.reference, swapped):
+            have = np.vstack([reference[list(members)], *_joint_places(model, t)])
+            scale, R, shift = similarity(places[t][known], have[known], np.eye(3))
+            rest = have[known] - (scale * places[t][known] @ R.T + shift)
+            misfit.append(float(np.sqrt((rest**2).sum(1).mean()) / max(scale, 1e-6)))
+        if misfit[1] > max(misfit[0], MISPLACED):
+            return False
+    return True
+
+
+def _by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> Iterator[Found]:
     """Two labels of a segment that lie each where the other should."""
-    members = model.segments[s]
+    members, should = model.segments[s], places[s]
     have = _own(model, s)
     known = np.isfinite(should).all(1)
     firm = np.flatnonzero(known[: len(members)])
@@ -102,7 +123,7 @@ def _by_place(model: MarkerModel, s: int, should: NDArray) -> Iterator[Found]:
         order[[a, b]] = order[[b, a]]
         trials.append((off(order), a, b))
     left, a, b = min(trials, default=(np.inf, 0, 0))
-    if left < BETTER * now:
+    if left < BETTER * now and _fits_elsewhere(model, places, s, (members[a], members[b])):
         pair = (model.labels[members[a]], model.labels[members[b]])
         text = f"{pair[0]} and {pair[1]} are swapped throughout: {model.names[s]} is {100 * now:.0f} cm off its places"
         yield pair, now, f"{text}, with them exchanged {100 * left:.0f} cm"
@@ -133,8 +154,12 @@ def elsewhere(model: MarkerModel, places: Sequence[NDArray]) -> list[tuple[str, 
 
 def _own(model: MarkerModel, s: int) -> NDArray:
     """(k + j, 3) [m] a segment's markers and the joints that it is part of."""
-    joints = [j.in_parent if s == j.parent else j.in_child for j in model.joints if s in (j.parent, j.child)]
-    return np.vstack([model.reference[list(model.segments[s])], *joints])
+    return np.vstack([model.reference[list(model.segments[s])], *_joint_places(model, s)])
+
+
+def _joint_places(model: MarkerModel, s: int) -> list[NDArray]:
+    """(3,) [m] each of the joints that a segment is part of."""
+    return [j.in_parent if s == j.parent else j.in_child for j in model.joints if s in (j.parent, j.child)]
 
 
 def _by_motion(positions: NDArray, model: MarkerModel) -> Iterator[Found]:

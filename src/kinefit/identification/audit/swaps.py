@@ -110,3 +110,34 @@ def crossings(
         at = np.where(seen[:, None], now, at)
         age = np.where(seen, 0, age + 1)
     return found, broken
+
+
+def glitches(
+    positions: NDArray, longest: int = 2, least: float = 0.02, better: float = 0.35
+) -> list[tuple[int, int, int, int]]:
+    """Exchanges of a frame or two (a, b, first, last): one label is where the other passes, and the other there or hidden.
+
+    Where each passes is told by the frames just before and after, in which both are seen; see `crossings` for `least`
+    and `better`.
+    """
+    found: list[tuple[int, int, int, int]] = []
+    taken = np.zeros(positions.shape[:2], bool)
+    for length in range(1, longest + 1):
+        before, after = positions[: -length - 1], positions[length + 1 :]
+        usual = np.stack([before + (after - before) * (i + 1) / (length + 1) for i in range(length)], axis=1)
+        here = np.stack([positions[i + 1 : len(positions) - length + i] for i in range(length)], axis=1)
+        off = np.linalg.norm(here - usual, axis=-1).min(axis=1)  # (F, K), NaN where not seen throughout
+        for f, a in np.argwhere(off > least).tolist():
+            across = np.linalg.norm(here[f][:, a, None] - usual[f], axis=-1).max(axis=0)
+            across[a] = np.inf
+            if not np.isfinite(across).any():
+                continue
+            b = int(np.nanargmin(across))
+            hidden = not np.isfinite(here[f][:, b]).any()
+            back = np.linalg.norm(here[f][:, b] - usual[f][:, a], axis=-1).max()
+            own = np.linalg.norm(here[f][:, b] - usual[f][:, b], axis=-1).min()
+            rows = slice(f + 1, f + 1 + length)
+            if across[b] < better * off[f, a] and (hidden or back < better * own) and not taken[rows][:, [a, b]].any():
+                taken[rows, a] = taken[rows, b] = True
+                found.append((min(a, b), max(a, b), f + 1, f + length))
+    return found

@@ -106,6 +106,72 @@ def rigid(n, x, y, w, R, t, H):
 
 
 @jit
+def least_squares(n, x, y, w, H):
+    """The least Σ w |y - R x - t|² over proper motions, alone; fills H as `rigid` does.
+
+    |x|² + |y|² - 2λ, λ the largest eigenvalue of Horn's matrix, by Newton's method from above on its characteristic
+    polynomial (Theobald 2005); where two eigenvalues nearly agree, as for points on a line, by `rigid`.
+    """
+    total = 0.0
+    a0 = a1 = a2 = b0 = b1 = b2 = 0.0
+    for i in range(n):
+        v = w[i]
+        total += v
+        a0, a1, a2 = a0 + v * x[i, 0], a1 + v * x[i, 1], a2 + v * x[i, 2]
+        b0, b1, b2 = b0 + v * y[i, 0], b1 + v * y[i, 1], b2 + v * y[i, 2]
+    a0, a1, a2, b0, b1, b2 = a0 / total, a1 / total, a2 / total, b0 / total, b1 / total, b2 / total
+    s00 = s01 = s02 = s10 = s11 = s12 = s20 = s21 = s22 = 0.0
+    xx = yy = zz = xy = xz = yz = square = 0.0
+    for i in range(n):
+        v, x0, x1, x2 = w[i], x[i, 0] - a0, x[i, 1] - a1, x[i, 2] - a2
+        y0, y1, y2 = y[i, 0] - b0, y[i, 1] - b1, y[i, 2] - b2
+        v0, v1, v2 = v * x0, v * x1, v * x2
+        xx, yy, zz, xy, xz, yz = xx + v0 * x0, yy + v1 * x1, zz + v2 * x2, xy + v0 * x1, xz + v0 * x2, yz + v1 * x2
+        s00, s01, s02 = s00 + v0 * y0, s01 + v0 * y1, s02 + v0 * y2
+        s10, s11, s12 = s10 + v1 * y0, s11 + v1 * y1, s12 + v1 * y2
+        s20, s21, s22 = s20 + v2 * y0, s21 + v2 * y1, s22 + v2 * y2
+        square += v * (y0 * y0 + y1 * y1 + y2 * y2)
+    H[0, 0], H[1, 1], H[2, 2] = yy + zz, xx + zz, xx + yy
+    H[0, 1] = H[1, 0] = -xy
+    H[0, 2] = H[2, 0] = -xz
+    H[1, 2] = H[2, 1] = -yz
+    whole = 0.5 * (xx + yy + zz + square)
+    if not whole > 0.0:
+        return 0.0
+    if n == 2:
+        e = math.sqrt(xx + yy + zz) - math.sqrt(square)
+        return e * e
+    # of the matrix divided by `whole`: λ⁴ + c2 λ² + c1 λ + c0, the largest root at most 1
+    s00, s01, s02, s10, s11 = s00 / whole, s01 / whole, s02 / whole, s10 / whole, s11 / whole
+    s12, s20, s21, s22 = s12 / whole, s20 / whole, s21 / whole, s22 / whole
+    sums = s00 * s00 + s01 * s01 + s02 * s02 + s10 * s10 + s11 * s11 + s12 * s12 + s20 * s20 + s21 * s21 + s22 * s22
+    c2 = -2.0 * sums
+    det = s00 * (s11 * s22 - s12 * s21) - s01 * (s10 * s22 - s12 * s20) + s02 * (s10 * s21 - s11 * s20)
+    c1 = -8.0 * det
+    m00, m11 = s00 * s00 + s01 * s01 + s02 * s02, s10 * s10 + s11 * s11 + s12 * s12
+    m22 = s20 * s20 + s21 * s21 + s22 * s22
+    m01, m02 = s00 * s10 + s01 * s11 + s02 * s12, s00 * s20 + s01 * s21 + s02 * s22
+    m12 = s10 * s20 + s11 * s21 + s12 * s22
+    minors = m00 * m11 - m01 * m01 + m00 * m22 - m02 * m02 + m11 * m22 - m12 * m12
+    c0 = sums * sums - 4.0 * minors
+    root, slope = 1.0, 1.0
+    for _ in range(50):
+        slope = (4.0 * root * root + 2.0 * c2) * root + c1
+        if slope < 1e-3:
+            break
+        value = ((root * root + c2) * root + c1) * root + c0
+        step = value / slope
+        root -= step
+        if abs(step) < 1e-14:
+            break
+    if slope < 1e-3:
+        R, t, G = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+        return rigid(n, x, y, w, R, t, G)
+    rss = 2.0 * whole * (1.0 - root)
+    return rss if rss > 0.0 else 0.0
+
+
+@jit
 def evidence(n, x, y, sigma, work):
     """-log of the density of n points of a rigid segment, its place and turn integrated out; and the weighted squares.
 
@@ -113,7 +179,7 @@ def evidence(n, x, y, sigma, work):
     """
     if n == 0:
         return 0.0, 0.0
-    R, t, H, w = work[0:3], work[3], work[4:7], work[7:].reshape(-1)
+    H, w = work[0:3], work[3:].reshape(-1)
     total, cost = 0.0, 0.0
     for i in range(n):
         w[i] = 1 / (sigma[i] * sigma[i])
@@ -121,7 +187,7 @@ def evidence(n, x, y, sigma, work):
         cost += _HALF_LOG + 3 * math.log(sigma[i])
     rss = 0.0
     if n > 1:
-        rss = rigid(n, x, y, w, R, t, H)
+        rss = least_squares(n, x, y, w, H)
         a, b, c = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT
         d, e, f = H[0, 1], H[0, 2], H[1, 2]
         det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)

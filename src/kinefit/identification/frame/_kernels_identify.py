@@ -9,6 +9,8 @@ from kinefit.identification.frame._kernels_evidence import evidence, place_joint
 
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
 MOST_STEPS = 100_000  # of the search in one segment, about 10 ms: reached only where noise is as large as the segment
+LEAST_WORK = 4_000  # a call that begins without any left is granted this much
+CALL, LEAF = 8_000, 5  # a call with what Python does around it, and a point of a rigid fit, in tries of a distance
 MOST_EXCESS = 4.0
 LEAST = 4.0  # what a choice must earn that nothing above holds: accidents are many
 
@@ -52,6 +54,7 @@ def enumerate_segment(
     gain,
     slack,
     fewest,
+    work_left,
     out_index,
     out_cost,
     out_rss,
@@ -64,7 +67,8 @@ def enumerate_segment(
     pivot (3,) where the parent says that x_pivot is, with pivot_sigma (none where <= 0); without one, x_pivot may be
     known to lie `reach` (A,) [m] from `anchors` (A, 3), A <= 2, else anywhere in the volume; gain: what a match earns
     against a miss; slack: costs this much above the best are kept. A choice differs from the model's distances by
-    `gate` deviations at most. Fills out_*; returns how many there are (those beyond the room are dropped).
+    `gate` deviations at most; work_left (1,) float: tries that are left for the frame, here used up; at none the search
+    ends with what it has. Fills out_*; returns how many there are (those beyond the room are dropped).
     """
     k, N = len(x), len(points)
     xs, ys, ss = np.empty((k + 1, 3)), np.empty((k + 1, 3)), np.empty(k + 1)
@@ -95,10 +99,36 @@ def enumerate_segment(
         arm[i] = apart(x[i], x_pivot)
     if has_pivot:
         all_w += 1 / pivot_sigma**2
+    # points that each marker may be by what is known without any choice, and what that costs at least
+    maybe, least, many = np.empty((last + 1, N), np.int64), np.empty((last + 1, N)), np.zeros(last + 1, np.int64)
+    for depth in range(known, last):
+        i = order[depth]
+        for q in range(N):
+            if used[q]:
+                continue
+            lb = 0.0
+            if has_pivot:
+                e2 = (apart(points[q], pivot) - arm[i]) ** 2
+                if e2 > gate * gate * (sigma[i] ** 2 + pivot_sigma**2):
+                    continue
+                lb += e2 / (sigma[i] ** 2 * pivot_sigma**2)
+            ok = True
+            for a in range(len(anchors)):
+                d = apart(points[q], anchors[a])
+                ok = ok and abs(d - reach[a]) <= arm[i] + gate * (anchor_sigma[a] + sigma[i])
+            for j in range(known):
+                o = order[j]
+                e2 = (gaps[q, choice[o]] - D[i, o]) ** 2
+                ok = ok and e2 <= gate * gate * (sigma[i] ** 2 + sigma[o] ** 2)
+                lb += e2 / (sigma[i] ** 2 * sigma[o] ** 2)
+            if ok:
+                maybe[depth, many[depth]], least[depth, many[depth]] = q, lb
+                many[depth] += 1
+    left = max(work_left[0] - CALL - N * (last - known), LEAST_WORK)
     rest = np.zeros(last + 1)  # what the markers still to come may earn
     for j in range(last - 1, known - 1, -1):
         earn = gain - _HALF_LOG - 3 * math.log(sigma[order[j]])
-        rest[j] = rest[j + 1] + (earn if earn > 0 else 0.0)
+        rest[j] = rest[j + 1] + (earn if earn > 0 and many[j] > 0 else 0.0)
     # what is known without any choice
     n = 0
     for j in range(known):
@@ -121,7 +151,7 @@ def enumerate_segment(
     if depth < last:
         nxt[depth] = 0
     steps = 0
-    while depth >= known and known < last and steps < MOST_STEPS:
+    while depth >= known and known < last and steps < MOST_STEPS and left > 0:
         steps += 1
         if depth == last:
             if matched[depth] >= fewest:
@@ -134,6 +164,7 @@ def enumerate_segment(
                 if has_pivot:
                     xs[n], ys[n], ss[n] = x_pivot, pivot, pivot_sigma
                     n += 1
+                left -= LEAF * n
                 cost, rss = evidence(n, xs, ys, ss, work)
                 cost -= base + matched[depth] * gain
                 if loose and (len(anchors) == 0 or n < 3):
@@ -168,32 +199,22 @@ def enumerate_segment(
         if choice[i] >= 0:
             used[choice[i]] = False
         choice[i] = -1
-        q = nxt[depth]
+        place = nxt[depth]
         found = False
-        while q < N and not found:
+        while place < many[depth] and not found:
+            q = maybe[depth, place]
+            left -= 1 + 0.3 * (depth - known)
             if not used[q]:
                 ok = True
-                lb = 0.0
-                if has_pivot:
-                    d = apart(points[q], pivot)
-                    D0 = arm[i]
-                    v = sigma[i] ** 2 + pivot_sigma**2
-                    e2 = (d - D0) ** 2
-                    ok = e2 <= gate * gate * v
-                    lb += e2 / (sigma[i] ** 2 * pivot_sigma**2)
-                for a in range(len(anchors)):
-                    d = apart(points[q], anchors[a])
-                    D0 = arm[i]
-                    ok = ok and abs(d - reach[a]) <= D0 + gate * (anchor_sigma[a] + sigma[i])
-                if ok:
-                    for j in range(depth):
-                        o = order[j]
-                        if choice[o] >= 0:
-                            e2 = (gaps[q, choice[o]] - D[i, o]) ** 2
-                            if e2 > gate * gate * (sigma[i] ** 2 + sigma[o] ** 2):
-                                ok = False
-                                break
-                            lb += e2 / (sigma[i] ** 2 * sigma[o] ** 2)
+                lb = least[depth, place]
+                for j in range(known, depth):
+                    o = order[j]
+                    if choice[o] >= 0:
+                        e2 = (gaps[q, choice[o]] - D[i, o]) ** 2
+                        if e2 > gate * gate * (sigma[i] ** 2 + sigma[o] ** 2):
+                            ok = False
+                            break
+                        lb += e2 / (sigma[i] ** 2 * sigma[o] ** 2)
                 if ok:
                     earn = gain - _HALF_LOG - 3 * math.log(sigma[i])
                     total = bound[depth] + 0.5 * lb / all_w - earn
@@ -201,16 +222,16 @@ def enumerate_segment(
                         found = True
                         bound[depth + 1] = total
                         matched[depth + 1] = matched[depth] + 1
-            q += 1
+            place += 1
         if found:
-            nxt[depth] = q
-            choice[i] = q - 1
-            used[q - 1] = True
+            nxt[depth] = place
+            choice[i] = q
+            used[q] = True
             depth += 1
             if depth < last:
                 nxt[depth] = 0
         elif nxt[depth] <= N:  # the marker is missing
-            nxt[depth] = N + 1
+            nxt[depth] = N + 1  # beyond all points
             if bound[depth] - rest[depth + 1] <= best_crude + slack + 10:
                 bound[depth + 1] = bound[depth]
                 matched[depth + 1] = matched[depth]
@@ -219,6 +240,7 @@ def enumerate_segment(
                     nxt[depth] = 0
         else:
             depth -= 1
+    work_left[0] = left if work_left[0] - CALL > 0 else 0.0
     return count
 
 
@@ -243,16 +265,3 @@ def range_cost(points, theirs, index, low, high, width, out):
                 total += e if e < MOST_EXCESS else MOST_EXCESS
                 count += 1
         out[c] = 3 * total / count if count > 0 else 0.0
-
-
-@jit
-def cheapest_free(new, best, extra, taken):
-    """Least of best + extra (C,) over the choices (C, W bits) that take none of the points `taken`."""
-    low = math.inf
-    for c in range(len(best)):
-        free = True
-        for i in range(len(taken)):
-            free = free and (new[c, i] & taken[i]) == 0
-        if free and best[c] + extra[c] < low:
-            low = best[c] + extra[c]
-    return low

@@ -1,4 +1,7 @@
-"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure."""
+"""The explanation of a whole frame: searches from several segments, at several noise levels, until one is sure.
+
+They end, too, where the frame's work is used up.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,10 @@ from kinefit.identification.frame.search import Frame, Search
 from kinefit.identification.frame.tables import segment_tables
 from kinefit.identification.model.model import MarkerModel
 
-RUNGS = ((0, 80, 40), (3, 300, 100), (2, 750, 250))
-"""How many starts (first: all) get how many nodes for their search, and for each choice of its root. Every start gets a
-few, the best of them more: a good one needs few, and whether it is good shows only by searching."""
+RUNGS = ((0, 80, 40, 0.1), (3, 300, 100, 0.2), (2, 750, 250, 0.4))
+"""How many starts (first: all) get how many nodes for their search, and for each choice of its root, and what share of
+the work that is left. Every start gets a few, the best of them more: a good one needs few, and whether it is good shows
+only by searching."""
 
 LARGEST = 6
 """Segments by which the noise level is judged."""
@@ -93,8 +97,8 @@ class Solution:
 def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float, searches: int = 60) -> Solution:
     """The cheapest explanation of a frame, found by so many searches from several segments and noise levels."""
     race = Race(model, frame)
-    for many, *nodes in RUNGS:
-        race.rung(nodes)
+    for many, budget, quota, share in RUNGS:
+        race.rung((budget, quota, share))
         ranked = sorted(race.reached, key=lambda start: race.reached[start].cost)[:many]
         for root, scale in ranked or _starts(model, frame, finest, coarsest):
             before: Solution | None = None
@@ -102,7 +106,7 @@ def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float, se
                 before = race.run(root, scale, before)
                 best = race.best()
                 searches -= 1
-                if best.settled or searches < 1:
+                if best.settled or searches < 1 or frame.idle:
                     return best
                 if before.noise < FITTING * scale or before.matched < ENOUGH * race.most:
                     break
@@ -125,17 +129,17 @@ class Race:
         self.reached: dict[tuple[int, float], Solution] = {}
         self.done: set[tuple[int, float]] = set()
         self.begun: dict[tuple[float, bytes], Solution] = {}
-        self.nodes: list[int] = []
+        self.means = (0, 0, 1.0)
 
-    def rung(self, nodes: list[int]) -> None:
-        """So many nodes, in all and for each choice of the root, for each search from now on."""
-        self.nodes = nodes
+    def rung(self, means: tuple[int, int, float]) -> None:
+        """Nodes, in all and for each choice of the root, and share of the work left, for each search from now on."""
+        self.means = means
         self.done = {start for start, found in self.reached.items() if not found.search.cut}
 
     def run(self, root: int, scale: float, before: Solution | None) -> Solution:
         """One search and what it led to, or what it makes of what was found at the noise level `before`."""
         tables = segment_tables(self.model, root)
-        search = Search(tables, self.frame, scale, *self.nodes)
+        search = Search(tables, self.frame, scale, *self.means)
         chosen = search.decode(search.node(tables[0], None, -1))
         if search.cut or shared(search, chosen).any():
             found = self.improved(solution(search, apart(search, chosen), len(self.model)))
@@ -154,8 +158,9 @@ class Race:
         if key in self.begun:  # what that led to needs no second time
             return self.begun[key]
         best = min((found.cost for found in self.reached.values()), default=0.0)
-        if first.matched < HOPEFUL * self.most or first.cost > HOPEFUL * best:
+        if self.frame.idle or first.matched < HOPEFUL * self.most or first.cost > HOPEFUL * best:
             return first
+        first.search.allow(self.means[-1])
         chosen = polish(first.search, first.chosen)
         self.begun[key] = solution(first.search, chosen, len(self.model))
         return self.begun[key]
@@ -169,7 +174,8 @@ class Race:
         share = best.matched / self.most
         whole = not best.search.cut or len(roots) >= OFTEN
         sure = share > ENOUGH and (whole or (len(roots) > 1 and share > WHOLE))
-        return replace(best, others=others, settled=sure and best.noise < FITTING * best.search.scale)
+        fits = any(found.noise < FITTING * scale and found.same(best) for (_, scale), found in self.reached.items())
+        return replace(best, others=others, settled=sure and fits)
 
 
 def solution(search: Search, chosen: Explanation, count: int) -> Solution:

@@ -18,6 +18,9 @@ from kinefit.identification.model.model import MarkerModel
 OUTLIERS, OUTLYING = 0.05, 4.0
 """Share of markers beyond the noise, and how far: a usual contamination of a Gaussian."""
 
+SEARCHING = 0.7
+"""Share of a frame's work that the search may take; the rest is for what else comes near what it found."""
+
 STEP, STAYS = 0.1, 2.0
 """[m] usual way of a marker since the last frame (a hand at 5 m/s goes 8 cm at 60 Hz); what a label earns that stays
 where it was, and what it costs if it jumps. It decides between rivals alone."""
@@ -35,6 +38,8 @@ class IdentifySettings:
     gate : deviations by which a distance may differ
     miss : expected share of missing markers, before the frame's count is known
     searches : of one frame, from several segments and noise levels; most need one or two
+    work : tries of a point for a marker that a frame may take: 0.6 to 0.95 s on one core of 3 GHz
+        What was not found by then stays unknown. It is counted, so that the same frame has the same names anywhere.
     """
 
     finest: float = 0.02
@@ -43,6 +48,7 @@ class IdentifySettings:
     gate: float = 4.5
     miss: float = 0.05
     searches: int = 60
+    work: float = 1.3e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +108,11 @@ def identify(
     gaps = np.linalg.norm(at[:, None] - at, axis=-1)
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
-    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate)
-    best = refine(model, explain(model, frame, settings.finest, settings.coarsest, settings.searches))
+    work = np.full(1, SEARCHING * settings.work)
+    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work)
+    best = explain(model, frame, settings.finest, settings.coarsest, settings.searches)
+    work += (1 - SEARCHING) * settings.work
+    best = refine(model, best)
     before = np.full((count, 3), np.nan) if previous is None else np.asarray(previous, float)
     if before.shape != (count, 3):
         raise ObservationError(
@@ -116,7 +125,8 @@ def identify(
 def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
     """Labels that are probable enough against all rivals; where it may all be accident, only what two starts say."""
     count = len(found.labels)
-    chosen, near = (found.chosen, []) if found.clear else rivals(found.search, found.chosen)
+    every = {node.table.index for node, _ in found.chosen}
+    chosen, near, seen = (found.chosen, [], every) if found.clear else rivals(found.search, found.chosen)
     pool = {labels_of(e, count).tobytes(): (dearer, e) for dearer, e in [*near, (0.0, chosen)]}
     labels = np.array([labels_of(e, count) for _, e in pool.values()])
     cost = np.array([dearer for dearer, _ in pool.values()]) + _moved(labels, found.search.frame.points, before)
@@ -126,6 +136,9 @@ def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
     confidence = 1 / (1 + odds)
     if not found.settled:
         confidence *= np.any([other.labels == guess for other in found.others], axis=0)
+    for node, _ in chosen:
+        if node.table.index not in seen:  # there was no work left to look for what comes near
+            confidence[node.table.markers] = np.minimum(confidence[node.table.markers], 0.5)
     found = solution(found.search, chosen, count)
     _complete(found, guess, confidence)
     known = (confidence >= certain) & (guess >= 0)

@@ -79,7 +79,7 @@ def polish(search: Search, found: Explanation) -> Explanation:
     small = [node.table.index for node, _ in found[1:] if len(below[node.table.index]) < largest][::-1]
     for _ in range(SWEEPS):
         before = cost
-        for s in small:
+        for s in () if search.idle else small:
             trial = anew(search, found, below[s])
             now = cost_of(search, trial)
             if now < cost - 1e-6 and not shared(search, trial).any():
@@ -143,11 +143,16 @@ def anew(search: Search, chosen: Explanation, branch: list[int]) -> Explanation:
     return kept + local.decode(local.node(table, *above), above)
 
 
-def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple[float, Explanation]]]:
-    """The cheapest explanation near one, and by how much others are dearer, up to NEAR."""
+def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple[float, Explanation]], set[int]]:
+    """The cheapest explanation near one, by how much others are dearer, up to NEAR, and segments that were looked at.
+
+    These are all, unless the frame's work was used up before.
+    """
+    search.allow(1.0)
     for _ in range(RESTARTS):
         cost, found = cost_of(search, chosen), []
-        for trial in _others(search, chosen):
+        seen: set[int] = set()
+        for trial in _others(search, chosen, seen):
             found.append((cost_of(search, trial), trial))
             if found[-1][0] < cost - 1e-6:
                 break
@@ -155,15 +160,17 @@ def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple
             break
         found[-1] = (cost, chosen)
         cost, chosen = cost_of(search, trial), trial
-    return chosen, [(now - cost, rival) for now, rival in found if now < cost + NEAR]
+    return chosen, [(now - cost, rival) for now, rival in found if now < cost + NEAR], seen
 
 
-def _others(search: Search, chosen: Explanation) -> Iterator[Explanation]:
-    """Explanations in which one segment chooses otherwise, and others make room for that."""
+def _others(search: Search, chosen: Explanation, seen: set[int]) -> Iterator[Explanation]:
+    """Explanations in which one segment chooses otherwise, and others make room for that; adds to `seen`."""
     below, free = branches(search), search.beside(search.bits[-1], WIDE)
     at = {node.table.index: (node, c) for node, c in chosen}
     limit = cost_of(search, chosen) + NEAR
     for node, c in chosen:
+        if search.frame.idle:
+            return
         table, branch = node.table, below[node.table.index]
         above = at.get(table.parent)
         kept = [pair for pair in chosen if pair[0].table.index not in branch]
@@ -181,3 +188,5 @@ def _others(search: Search, chosen: Explanation) -> Iterator[Explanation]:
             trial = disentangle(search, kept + free.follow(here, int(k)), below, fixed, limit)
             if trial is not None:
                 yield trial
+        if not search.frame.idle:
+            seen.add(table.index)

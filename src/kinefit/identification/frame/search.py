@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.identification.frame._kernels_evidence import place_joint
-from kinefit.identification.frame._kernels_identify import cheapest_free, enumerate_segment, range_cost
+from kinefit.identification.frame._kernels_identify import range_cost
+from kinefit.identification.frame._kernels_nodes import cheapest_beside, expand_segment
 from kinefit.identification.frame.tables import SegmentTable
 
 LOOSE = 0.15
@@ -35,6 +36,7 @@ class Frame:
     volume : [m³] of the box they are in
     gain : what a matched marker earns against a missing one, log(1/m³)
     gate : deviations by which a distance may differ
+    work : (1,) tries that are left for all searches of the frame together; they use it up
     """
 
     points: NDArray
@@ -42,6 +44,12 @@ class Frame:
     volume: float
     gain: float
     gate: float
+    work: NDArray = field(default_factory=lambda: np.full(1, np.inf))
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is left to search with: what was found so far has to do."""
+        return bool(self.work[0] <= 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +69,9 @@ class Hold:
     deviation: NDArray = field(default_factory=lambda: np.zeros(0))
 
 
+NOTHING = Hold()
+
+
 @dataclass(eq=False)
 class Node:
     """A segment's choices where its parent says one and the same of it.
@@ -69,6 +80,7 @@ class Node:
     ----------
     index : (C, k) int, points, -1 for none; cost : (C,) own; squares : (C,) weighted residual squares
     new : (C, W) uint64, points that are chosen here (not given by the parent), as bits; all : given ones too
+    union : (W,) of all that any choice takes here
     empty : the choice of no point at all
     below : for each choice the nodes of the children; None where it is not followed
     best : (C,) cost with the best below; inf where not followed
@@ -82,6 +94,7 @@ class Node:
     squares: NDArray
     new: NDArray
     all: NDArray
+    union: NDArray
     hold: Hold
     empty: int
     below: list[list[Node] | None]
@@ -97,9 +110,13 @@ class Search:
     scale : factor on the model's deviations
     budget : nodes; from then on only first choices count, and `cut` tells so
     quota : nodes for each choice of the root
+    share : of the frame's work that is left, that this search may take
     """
 
-    def __init__(self, tables: tuple[SegmentTable, ...], frame: Frame, scale: float, budget: int = 0, quota: int = 0):
+    def __init__(
+        self, tables: tuple[SegmentTable, ...], frame: Frame, scale: float, budget: int = 0, quota: int = 0,
+        share: float = 1.0,
+    ):
         self.tables, self.frame, self.scale = tables, frame, scale
         self.by_index = {t.index: t for t in tables}
         self.sigma = {t.index: t.sigma * scale for t in tables}
@@ -113,6 +130,7 @@ class Search:
         self.promise = {t.index: 0.0 for t in tables}  # least cost so far of a segment and all below
         self.cut, self.slack = False, SLACK
         self.budget, self.each, self.quota = budget, quota, quota
+        self.allow(share)
 
     def beside(self, outside: NDArray, slack: float = SLACK) -> Search:
         """The same search, nothing of it known yet, without the points `outside` (W,) bits."""
@@ -127,10 +145,19 @@ class Search:
         self.budget = self.quota = len(self.memo) + nodes
         self.each = nodes
 
+    def allow(self, share: float) -> None:
+        """This share of the frame's work that is left, from now on."""
+        self.floor = (1 - share) * float(self.frame.work[0]) if share < 1 else 0.0
+
+    @property
+    def idle(self) -> bool:
+        """Whether the search has had its share of the work."""
+        return bool(self.frame.work[0] <= self.floor)
+
     @property
     def spent(self) -> bool:
-        """Whether the search has had its nodes."""
-        return len(self.memo) > min(self.quota, self.budget)
+        """Whether the search has had its nodes, or its share of the work."""
+        return self.idle or len(self.memo) > min(self.quota, self.budget)
 
     def node(self, table: SegmentTable, parent: Node | None, choice: int, allowed: float = np.inf) -> Node:
         """The node of a segment under a choice of its parent's, its choices followed downwards."""
@@ -142,14 +169,13 @@ class Search:
     def seat(self, table: SegmentTable, parent: Node | None, choice: int) -> Node:
         """The node of a segment under a choice of its parent's."""
         given = np.full(len(table.markers), -2, np.int64)
-        hold, taken = Hold(), self.bits[-1]
+        hold, taken = NOTHING, self.bits[-1]
         context: tuple = ()
         if parent is not None:
             points, taken = parent.index[choice], parent.all[choice]
-            common = table.shared >= 0
-            given[common] = points[table.shared[common]]
-            context = tuple(given[common].tolist())
-            if not (given >= 0).any():
+            given[table.common] = points[table.shared[table.common]]
+            context = tuple(given[table.common].tolist())
+            if max(context, default=-1) < 0:
                 hold = self.joint(parent, choice, table)
                 context = (parent.table.index, parent.context, tuple(points.tolist()))
         key = (table.index, context)
@@ -158,7 +184,7 @@ class Search:
             found = self.memo[key] = self.expand(table, context, given, hold, self.bits[-1])
             hope = float(found.cost.min()) + sum(self.promise[child] for child in table.children)
             self.promise[table.index] = min(self.promise[table.index], hope)
-        clash = np.bitwise_or.reduce(found.new, 0) & taken
+        clash = found.union & taken
         if clash.any():  # others may come near the best without these points
             context = (context, tuple(clash.tolist()))
             key = (table.index, context)
@@ -172,7 +198,7 @@ class Search:
         at = np.empty(3)
         x, y, sigma = self.fitted(parent, choice)
         if not len(x):
-            return Hold()
+            return NOTHING
         spread = table.spread * min(self.scale, 1.0)
         if len(x) > 1:
             variance = place_joint(len(x), x, y, sigma, table.joint_there, at)
@@ -192,49 +218,35 @@ class Search:
             sigma = np.append(sigma, node.hold.sigma)
         return x, y, sigma
 
-    def choices(
-        self, table: SegmentTable, given: NDArray, hold: Hold, taken: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """(C, k) points, (C,) costs, (C,) weighted squares of likely choices; the first is to choose none."""
-        k, frame = len(table.markers), self.frame
-        index, cost, squares = np.empty((ROOM, k), np.int64), np.empty(ROOM), np.empty(ROOM)
-        free = hold.sigma <= 0 and not (given >= 0).any()
+    def expand(
+        self, table: SegmentTable, context: tuple, given: NDArray, hold: Hold, taken: NDArray, kept: float | None = None
+    ) -> Node:
+        """Choices of a segment, none followed yet; `kept` is by how much dearer than the best they may be."""
+        frame = self.frame
+        free = hold.sigma <= 0 and bool((given < 0).all())
         joint = table.joint_here if table.joint_here is not None else np.zeros(3)
-        blocked = (self.bits[:-1] & (taken | self.outside)).any(1)
-        blocked[given[given >= 0]] = False
         volume = frame.volume
         if len(hold.reach):
             span = np.linalg.norm(table.x - joint, axis=1).max() + hold.reach.min()
             volume = min(volume, 4 / 3 * np.pi * span**3)
-        count = enumerate_segment(
-            frame.points, frame.gaps, blocked, table.x, table.D, self.sigma[table.index], given, joint,
-            hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
-            frame.gate, frame.gain, self.slack, 2 if free else 1, index, cost, squares,
+        index, cost, squares, new, every, union, empty = expand_segment(
+            frame.points, frame.gaps, self.bits, taken | self.outside, table.x, table.D, self.sigma[table.index], given,
+            joint, hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
+            frame.gate, frame.gain, self.slack, 2 if free else 1, frame.work, ROOM,
+            self.slack if kept is None else kept,
         )  # fmt: skip
-        return index[:count], cost[:count], squares[:count]
-
-    def expand(self, table: SegmentTable, context: tuple, given: NDArray, hold: Hold, taken: NDArray) -> Node:
-        """Choices of a segment, none followed yet."""
-        index, cost, squares = self.choices(table, given, hold, taken)
-        keep = np.flatnonzero(cost <= cost.min() + self.slack)
-        keep = keep[np.argsort(cost[keep])]
-        if 0 not in keep:  # no choice at all
-            keep = np.append(keep, 0)
-        index, cost, squares = index[keep], cost[keep], squares[keep]
-        new = np.where(given == -2, index, -1)
+        self.cut |= frame.idle
         return Node(
-            table, context, index, cost, squares,
-            np.bitwise_or.reduce(self.bits[new], 1), np.bitwise_or.reduce(self.bits[index], 1),
-            hold, int(np.flatnonzero(keep == 0)[0]), [None] * len(cost), np.empty(0),
-        )  # fmt: skip
+            table, context, index, cost, squares, new, every, union, hold, empty, [None] * len(cost), np.empty(0)
+        )
 
     def alone(self, table: SegmentTable) -> tuple[float, int, float]:
         """Of a segment on its own: the least cost, how many markers that has, by how much any other choice is dearer.
 
         Others are those that give a point to another marker; leaving markers out is no other choice.
         """
-        index, cost, _ = self.choices(table, np.full(len(table.markers), -2, np.int64), Hold(), self.bits[-1])
-        best = int(np.argmin(cost))
+        found = self.expand(table, (), np.full(len(table.markers), -2, np.int64), NOTHING, self.bits[-1], np.inf)
+        index, cost, best = found.index, found.cost, 0
         other = ((index != index[best]) & (index >= 0)).any(1) | (index < 0).all(1)
         return float(cost[best]), int((index[best] >= 0).sum()), float(cost[other].min(initial=0.0) - cost[best])
 
@@ -255,10 +267,17 @@ class Search:
             limit = min(allowed, best + self.slack)
             follow = not self.spent or (c == 0 and c != node.empty)
             self.cut |= not follow and bound <= limit
+            if bound > limit and c < node.empty:  # and so are all after it
+                node.below[node.empty] = [self.absent(t) for t in children]
+                node.best[node.empty] = node.cost[node.empty]
+                break
             for t in children if follow and bound <= limit else ():
                 bound -= self.promise[t.index]
                 child = self.node(t, node, c, limit - bound)
-                low = cheapest_free(child.new, child.best, self.between(node, c, child), node.all[c])
+                low = cheapest_beside(
+                    self.frame.points, node.index[c], child.index, t.low, t.high, t.width, self.tells[t.index],
+                    child.new, child.best, node.all[c],
+                )  # fmt: skip
                 bound += low
                 self.promise[t.index] = min(self.promise[t.index], low)
                 below.append(child)
@@ -280,7 +299,9 @@ class Search:
             index, zero = np.full((1, len(table.markers)), -1, np.int64), np.zeros(1)
             bits = self.bits[index[:, 0]]
             below: list[list[Node] | None] = [[self.absent(self.by_index[child]) for child in table.children]]
-            self.memo[key] = Node(table, (), index, zero, zero, bits, bits, Hold(), 0, below, zero.copy(), np.inf)
+            self.memo[key] = Node(
+                table, (), index, zero, zero, bits, bits, bits[0], NOTHING, 0, below, zero.copy(), np.inf
+            )
         return self.memo[key]
 
     def between(self, node: Node, choice: int, child: Node) -> NDArray:

@@ -32,7 +32,7 @@ class SegmentTable:
     markers : (k,) int
     x : (k, 3) [m] reference positions; D : (k, k) [m] their distances
     sigma : (k,) [m] standard deviation of each coordinate
-    shared : for each marker its place in the parent's `markers`, or -1
+    shared : for each marker its place in the parent's `markers`, or -1; common : the markers that have one
     joint_here, joint_there : (3,) [m] in this segment's and the parent's reference; None for the root
     spread : [m] per coordinate
     """
@@ -45,6 +45,7 @@ class SegmentTable:
     D: NDArray
     sigma: NDArray
     shared: NDArray
+    common: NDArray
     joint_here: NDArray | None
     joint_there: NDArray | None
     spread: float
@@ -80,7 +81,7 @@ def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
         found.append(
             SegmentTable(
                 s, parent, tuple(link[0] for link in children), markers, x, D,
-                np.hypot(own, unseen(D) * trained), shared, here, there, spread,
+                np.hypot(own, unseen(D) * trained), shared, np.flatnonzero(shared >= 0), here, there, spread,
                 np.nan_to_num(low), np.nan_to_num(high), np.nan_to_num(width),
             )
         )  # fmt: skip

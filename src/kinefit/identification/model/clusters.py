@@ -16,6 +16,14 @@ GIVE_WITHIN = 0.012
 """[m] deviation of a distance up to which two markers are of one segment: twice what the catalogue's markers give by
 (0.004 m at each end), so that a soft part holds together; joints that turn move theirs by centimetres."""
 
+FIRMEST, LONGEST = 0.015, 0.6
+"""[m] deviation of a distance, and the distance, beyond which two markers are of no segment together: skin gives less,
+and of a body's parts only a tall man's trunk is longer. What was held still looks like one segment whatever it is."""
+
+NEARER = 0.002
+"""By which a distance, as if it were a deviation, counts against a group, so that of what was held still the near
+markers come together: 1 mm at 0.5 m."""
+
 LOOSE = 1.5
 """By how much more a distance may give to a marker of a neighbour that helps a group of one or two to a shape."""
 
@@ -29,35 +37,41 @@ MOST_FRAMES = 300
 """Frames that are looked at here; every marker is fitted without itself."""
 
 
-def learn_segments(positions: NDArray, labels: Sequence[str], deviation: NDArray) -> Skeleton:
+def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, deviation: NDArray) -> Skeleton:
     """Segments and their tree, by what moves together.
 
     Complete linkage over the deviations of distances gives groups; each marker then goes to the group from whose
     rigid motion it strays least, and to a second one too if it hardly strays from that. Groups are joined into a tree
-    by the points that are most nearly constant in both frames.
+    by the points that are most nearly constant in both frames. No two of a segment vary by more than FIRMEST, nor are
+    further apart than LONGEST.
 
     Parameters
     ----------
     positions : (F, M, 3) [m]
-    deviation : (M, M) [m] of distances, NaN for two that are never seen together
+    mean, deviation : (M, M) [m] of distances, NaN for two that are never seen together
     """
     positions = positions[:: -(-len(positions) // MOST_FRAMES)]
-    apart = np.where(np.isfinite(deviation), deviation, np.inf)
-    groups = settle(positions, linkage(apart, GIVE_WITHIN))
+    firm = (deviation <= FIRMEST) & (mean <= LONGEST)
+    np.fill_diagonal(firm, True)
+    apart = np.where(firm, deviation + NEARER * mean, np.inf)
+    groups = settle(positions, linkage(apart, GIVE_WITHIN), firm)
     small = [g for g in groups if len(g) < 3]
     index = sorted(set().union(*small))  # of these, two and two that are nearly of one segment
     groups = [g for g in groups if len(g) >= 3]
     groups += [{index[i] for i in g} for g in linkage(apart[np.ix_(index, index)], LOOSE * GIVE_WITHIN)]
     members = [tuple(sorted(g)) for g in groups]
     wide = [widened(g, apart) for g in groups]
-    shared = share(positions, members, wide)
+    shared = share(positions, members, wide, firm)
     cost = joint_costs(positions, shared, deviation)
     order, parents = rooted(cost, [len(m) for m in members])
     place = {g: i for i, g in enumerate(order)}
     segments = []
     for g in order:
         near = [c for c in order if parents[c] == g] + ([parents[g]] if parents[g] >= 0 else [])
-        segments.append(tuple(sorted(set(members[g]).union(*(shared[g] & set(members[c]) for c in near)))))
+        own = list(members[g])
+        for m in sorted(set().union(*(shared[g] & set(members[c]) for c in near)) - set(own)):
+            own += [m] if firm[m, own].all() else []
+        segments.append(tuple(sorted(own)))
     names = tuple(named([labels[m] for m in members[g]]) for g in order)
     names = tuple(n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names))
     unknown = np.full((len(labels), 3), np.nan)
@@ -84,29 +98,39 @@ def linkage(apart: NDArray, most: float) -> list[set[int]]:
     return groups
 
 
-def settle(positions: NDArray, groups: list[set[int]]) -> list[set[int]]:
-    """Each marker in the group from which it strays least; groups too small for a motion of their own stay."""
+def settle(positions: NDArray, groups: list[set[int]], firm: NDArray) -> list[set[int]]:
+    """Each marker in the group from which it strays least, of those to all of whose markers it is `firm` (M, M).
+
+    Groups too small for a motion of their own stay.
+    """
     for _ in range(3):
         whole = [g for g in groups if len(g) >= 3]
         stray = np.stack([strays(positions, g) for g in whole]) if whole else np.empty((0, positions.shape[1]))
         moved = False
         for number, g in enumerate(whole):
             for m in sorted(g):
-                best = int(np.argmin(stray[:, m]))
-                if best != number and len(g) > 3 and stray[best, m] < 0.7 * stray[number, m]:
+                best = _nearest(stray[:, m], whole, firm[m])
+                if best >= 0 and best != number and len(g) > 3 and stray[best, m] < 0.7 * stray[number, m]:
                     g.discard(m)
                     whole[best].add(m)
                     moved = True
         for g in [g for g in groups if len(g) < 3]:
             for m in sorted(g):
-                if len(whole) and stray[:, m].min() < GIVE_WITHIN / 2:
+                best = _nearest(stray[:, m], whole, firm[m])
+                if best >= 0 and stray[best, m] < GIVE_WITHIN / 2:
                     g.discard(m)
-                    whole[int(np.argmin(stray[:, m]))].add(m)
+                    whole[best].add(m)
                     moved = True
         groups = [g for g in groups if g]
         if not moved:
             break
     return groups
+
+
+def _nearest(stray: NDArray, groups: list[set[int]], firm: NDArray) -> int:
+    """The group that a marker strays least from, of those to which it is firm; -1 for none."""
+    held = [i for i, g in enumerate(groups) if firm[sorted(g)].all()]
+    return min(held, key=lambda i: stray[i], default=-1)
 
 
 def strays(positions: NDArray, group: set[int]) -> NDArray:
@@ -135,7 +159,9 @@ def widened(group: set[int], apart: NDArray) -> set[int]:
     return out
 
 
-def share(positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int]]) -> list[set[int]]:
+def share(
+    positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int]], held: NDArray
+) -> list[set[int]]:
     """Each group with markers of others that hardly stray from it: of each other group the two that do least."""
     out = []
     for g, more in zip(members, wide):
@@ -144,7 +170,8 @@ def share(positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int
             stray = strays(positions, set(g))
             for other in members:
                 if other is not g:
-                    firm = sorted((m for m in other if stray[m] < SHARED_GIVE), key=lambda m: stray[m])
+                    near = (m for m in other if stray[m] < SHARED_GIVE and held[m, list(g)].all())
+                    firm = sorted(near, key=lambda m: stray[m])
                     found |= set(firm[:MOST_SHARED])
         out.append(found)
     return out

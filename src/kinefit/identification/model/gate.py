@@ -37,8 +37,8 @@ class Finding:
 
     Parameters
     ----------
-    kind : "twice" (a label), "still" (a joint), "merged" (segments), "seldom" (a marker), "few" (markers on a segment),
-        "alike" (segments)
+    kind : "unknown" (labels), "twice" (a label), "still" (a joint), "merged" (segments), "seldom" (a marker),
+        "few" (markers on a segment), "alike" (segments)
     name : of the segment or label
     text : what was found
     remedy : what to record or to change
@@ -71,7 +71,17 @@ def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet
         if share < ENOUGH:
             still.append((share, _still(model, joint, full.get(name, RANGE))))
     out = [f for _, f in sorted(still, key=lambda pair: pair[0])]
-    return _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+    unknown = _unknown(model) if marker_set is None else []
+    return unknown + _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+
+
+def _unknown(model: MarkerModel) -> list[Finding]:
+    """Labels that no set knows: their segments are what held its distances in training, body parts or not."""
+    sizes = sorted(zip((len(s) for s in model.segments), model.names), reverse=True)
+    text = f"no set of the catalogue knows the labels; {len(sizes)} segments are from motion alone, the largest with "
+    text += f"{sizes[0][0]} markers ({sizes[0][1]})"
+    remedy = "Write a set: `kinefit markers set TAKE -o set.toml`, put it right, and learn with --set set.toml"
+    return [Finding("unknown", model.name, text, remedy)]
 
 
 def _twice(model: MarkerModel) -> list[Finding]:
@@ -100,7 +110,7 @@ def _merged(model: MarkerModel) -> list[Finding]:
         length = float(model.mean[np.ix_(members, members)].max())
         if length > 0.75:  # [m] trunk, shoulder to hip, of a very tall man (ANSUR II, 99th percentile and more)
             text = f"its {len(members)} markers lie up to {length:.2f} m apart: probably several segments in one"
-            out.append(Finding("merged", name, text, "Give a marker set as template, or record all joints moving"))
+            out.append(Finding("merged", name, text, "Put the marker set right, or record all joints moving"))
     return out
 
 

@@ -65,13 +65,13 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
     if not extent < WIDEST:
         raise ObservationError(
             f"the labels spread over {extent:.4g} m", file=markers.source or None,
-            remedy='One subject at a time, in the right unit: unit = "mm", --unit mm ...',
+            remedy="One subject at a time, in the right unit (--unit mm ...).",
         )
     tables = distances(positions)
     if isinstance(marker_set, MarkerSet):
         skeleton = adopt(skeleton_of(labels, marker_set), tables[1])
     else:
-        skeleton = learn_segments(positions, labels, tables[1])
+        skeleton = learn_segments(positions, labels, tables[0], tables[1])
     return fit_model(positions, labels, skeleton, tables, name, gaps)
 
 
@@ -87,6 +87,9 @@ def usable(markers: Markers, marker_set: MarkerSet | None) -> tuple[NDArray, lis
     left_out = [n for n in left_out if not (marker_set and marker_set.is_computed(n))]
     if len(keep) < 3:
         problem, remedy = f"{len(keep)} labelled markers are ever seen", "A model needs three and more."
+        if all(label.startswith("*") for label in markers.names):
+            problem = f"{len(markers.names)} trajectories without names"
+            remedy = "Identify first: `kinefit markers identify TAKE SUBJECT.json`; a subject is learnt from names."
         raise ObservationError(problem, file=markers.source or None, remedy=remedy)
     rows = np.flatnonzero(seen[:, keep].sum(1) >= 3)
     step = max(1, -(-len(rows) // MOST_FRAMES))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.errors import ObservationError
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
@@ -23,8 +24,8 @@ of them (in one of the trial): a model of another subject finds half at most, an
 than nine in ten."""
 
 
-ANCHOR = IdentifySettings(searches=6)
-"""Of an anchor frame: one that needs more searches is no good anchor, and there are others."""
+ANCHOR = IdentifySettings(searches=6, work=5e7)
+"""Of an anchor frame: one that needs more is no good anchor, and there are others."""
 
 
 @dataclass(frozen=True)
@@ -146,9 +147,8 @@ def identify_take(
         share = float(np.median(work.named))
     if share < FITS:
         raise ObservationError(
-            f"the take does not fit the model of {model.name}: it finds {100 * share:.0f} % of the labels",
-            file=markers.source or None,
-            remedy="Is it the same subject, with the same markers, and the right unit?",
+            f"the take does not fit the model of {model.name}: {_refusal(work, share)}", file=markers.source or None,
+            remedy="Is it the same subject, with the same markers, and the right unit?" + _unknown_set(model),
         )
     work.ask(sorted(set(anchors) - set(first)))
     budget = max(20, int(settings.most * len(markers)))
@@ -162,6 +162,25 @@ def identify_take(
     work.cut_changes()
     work.settle()
     return _result(work, markers.rate, settings)
+
+
+def _refusal(work: Naming, share: float) -> str:
+    """What the frames that were asked found, and which segments they did not."""
+    votes = [label for label in work.votes.label if label < len(work.model)]
+    found = np.bincount(votes, minlength=len(work.model)) / max(len(work.named), 1)
+    lacking = [n for n, s in zip(work.model.names, work.model.segments) if found[list(s)].mean() < 0.5]
+    text = f"in {len(work.named)} frames it finds {100 * share:.0f} % of the labels"
+    return f"{text} at most, least of {', '.join(lacking[:6])}{' ...' if len(lacking) > 6 else ''}" if lacking else text
+
+
+def _unknown_set(model: MarkerModel) -> str:
+    """What to do where the segments come from motion alone."""
+    if find_marker_set(model.labels) is not None:
+        return ""
+    return (
+        " No set of the catalogue knows its labels, so that its segments may be none: write a set (`kinefit markers "
+        "set TAKE -o set.toml`), put it right, and learn with --set set.toml."
+    )
 
 
 def _anchors(counts: NDArray, every: int) -> list[int]:

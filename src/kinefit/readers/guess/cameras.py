@@ -17,6 +17,7 @@ from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, Calibr
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.take.checks import ONE_CAMERA
+from kinefit.readers.take.one_camera import USUAL
 from kinefit.readers.video import Video
 
 UNSTATED = 1.0  # [Hz] of what states no rate, until the user does
@@ -58,11 +59,22 @@ def describe_cameras(
         for source, record, frame in entries:
             keypoint_entries(draft, source, record, frame, images, active=record is first)
     if len(names) == 1:
-        draft.note("cameras", "open", f"{names[0]} alone: {ONE_CAMERA}")
+        lifted = names[0] in opened and not first
+        told = "the built-in detector tells how far limbs are" if lifted else ONE_CAMERA
+        draft.note("cameras", "likely" if lifted else "open", f"{names[0]} alone: {told}")
     if missing := [name for name in rig.names if name not in names]:
         draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: nothing here fits, left out")
     if opened and not first:
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")
+
+
+def describe_one(draft: Draft, video: Path) -> None:
+    """Enter the only camera of a folder without calibration."""
+    with Video(video, rate=UNSTATED) as opened:
+        draft.head["rate"] = draft.tell("rate", _rate({video.stem: opened}, {}), "rate")
+    why = f"degrees across the longer side; {USUAL:g} is usual for telephones; a tenth more, a tenth nearer"
+    draft.cameras[video.stem] = {"video": Told(video), "field_of_view": Told(USUAL, "guess", why)}
+    draft.note("camera", "likely", f"{draft.name(video)} alone: a network tells how far limbs are; state height")
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:

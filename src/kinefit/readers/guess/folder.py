@@ -11,12 +11,11 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, KinefitError, TakeError, command
 from kinefit.readers.guess import files as guess_files
-from kinefit.readers.guess.cameras import describe_cameras
+from kinefit.readers.guess.cameras import describe_cameras, describe_one
 from kinefit.readers.guess.draft import Draft, Note, Told
 from kinefit.readers.guess.files import STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
-from kinefit.readers.take.checks import ONE_CAMERA
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, where the cameras' interiors are known, from the person "
@@ -98,9 +97,8 @@ def _choose_calibration(
         )
     if not found:
         if len(seen) == 1 and seen[0] in guess_files.find_videos(files, draft.folder):
-            problem = f"one video and no calibration: {ONE_CAMERA}"
-            remedy = "Add videos of other cameras. For keypoints of this one alone: " + command("detect", seen[0])
-            raise CalibrationError(problem, file=draft.folder, remedy=remedy)
+            describe_one(draft, seen[0])
+            return None
         alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
 

@@ -33,11 +33,11 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 _MOST = 10**9  # steps of a take
-ONE_CAMERA = "one camera does not tell how far a person is; two cameras do, or one beside depth or markers"
+ONE_CAMERA = "keypoints of one camera do not tell how far a person is; two cameras do, or one beside depth or markers"
 
 
 def check_enough(take: Take) -> None:
-    """Refuse to track a take with a single camera and nothing else, before anything is read or detected.
+    """Refuse to track a take with the keypoints of a single camera that no network lifts, before anything is read.
 
     Raises
     ------
@@ -47,11 +47,12 @@ def check_enough(take: Take) -> None:
     others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
               take.surface_points)  # fmt: skip
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
-    if len(seeing) == 1 and not (any(others) or take.start or take.pose):
+    lifted = not take.keypoints or any(entry.format == "detect" for entry in take.keypoints)
+    if len(seeing) == 1 and not (lifted or any(others) or take.start or take.pose):
         raise TakeError(
             ONE_CAMERA, file=take.path, place=f"camera {next(iter(seeing))}",
-            remedy="Add [[camera]] of a second one, calibrated with the first, or [[depth]]; or tell by [start] where "
-            "the body is.",
+            remedy="Leave its [[keypoints]] out and give it its video: the built-in detector tells depth, too; or add "
+            "[[camera]] of a second one, calibrated with the first, or [[depth]].",
         )  # fmt: skip
 
 
@@ -255,8 +256,17 @@ def _names(take: Take) -> None:
                 choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
                 remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
-    if take.cameras and take.calibration is None:
-        raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')
+    if len(take.cameras) > 1 and take.calibration is None:
+        remedy = 'Add [calibration] with file = "...". One camera alone needs none.'
+        raise TakeError("cameras without calibration", file=take.path, remedy=remedy)
+    for entry in take.cameras:
+        angle, place = entry.field_of_view, f"camera {entry.name}"
+        if angle is not None and take.calibration is not None:
+            problem = "field_of_view beside a calibration"
+            raise TakeError(problem, file=take.path, place=place, remedy="Leave it out: the calibration tells it.")
+        if angle is not None and not 5.0 <= angle <= 150.0:
+            problem = f"field_of_view {angle:g}"
+            raise TakeError(problem, file=take.path, place=place, remedy="Give degrees from 5 to 150.")
     for pair in take.stereo:
         for side in (pair.left, pair.right):
             if not any(entry.name == side and entry.video is not None for entry in take.cameras):

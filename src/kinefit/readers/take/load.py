@@ -32,6 +32,7 @@ from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
+from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_assumed
 from kinefit.readers.take.regions import load_regions
 from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
@@ -134,6 +135,9 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
                 stream = f"video {entry.name}"
                 rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
                 sizes[entry.name] = video.size
+    if is_alone(take):
+        entry = take.cameras[0]
+        rig = Rig((assumed_camera(entry, sizes.get(entry.name, entry.size), take),))
     images = {entry.name: _image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
@@ -170,7 +174,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
         regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces,
-        notes=sensors.notes(rate),
+        notes=(*sensors.notes(rate), *(what_is_assumed(take) if is_alone(take) else ())),
     )
 
 
@@ -279,13 +283,11 @@ def _cut(keypoints: Keypoints, frames: tuple[int, int], used: tuple[int, int] | 
     """Frames at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
     begin = frames[0] - round(keypoints.time_offset * keypoints.rate)
     rows = slice(begin, begin + frames[1] - frames[0])
-    points, confidence = keypoints.points[rows], keypoints.confidence[rows]
-    if used is not None:
-        steps = np.arange(*frames)
-        unused = (steps < used[0]) | (steps >= used[1])
-        points, confidence = np.array(points), np.array(confidence)
-        points[unused], confidence[unused] = np.nan, 0.0
-    return replace(
-        keypoints, points=points, confidence=confidence,
-        time_offset=keypoints.time_offset + begin / keypoints.rate,
-    )
+    cut = keypoints.rows(rows, keypoints.time_offset + begin / keypoints.rate)
+    if used is None:
+        return cut
+    steps = np.arange(*frames)
+    unused = (steps < used[0]) | (steps >= used[1])
+    points, confidence = np.array(cut.points), np.array(cut.confidence)
+    points[unused], confidence[unused] = np.nan, 0.0
+    return replace(cut, points=points, confidence=confidence)

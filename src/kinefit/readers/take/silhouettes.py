@@ -125,7 +125,7 @@ _SPACES = {"hsv": cv2.COLOR_RGB2HSV, "lab": cv2.COLOR_RGB2Lab, "ycrcb": cv2.COLO
 def _coloured(
     entry: SilhouetteEntry, camera: CameraEntry, size: tuple[int, int], frame: ImageFrame, rate: float | None
 ) -> SilhouetteVideo:
-    """What has the body's colour in a camera's video (P1 4.1).
+    """What has the body's colour in a camera's video (P1 2.4).
 
     The mask is smoothed before the Laplace operator; where that changes its sign the mask has half its height, which is
     where an outline is looked for.

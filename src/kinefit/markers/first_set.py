@@ -1,0 +1,275 @@
+"""A first marker set for labels that no set of the catalogue knows: who is left of whom, rigid groups, places."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked
+from kinefit.bodies.body import Body
+from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue
+from kinefit.bodies.marker_sets.labels import bare, plain
+from kinefit.bodies.marker_sets.placement import placed
+from kinefit.errors import KinefitError
+from kinefit.identification.model.learn import learn_model, usable
+from kinefit.markers.fit import fit_markers
+from kinefit.markers.subject import fit_marker_subject
+from kinefit.observations import Markers
+
+PREFIXES = (("Right", "Left"), ("right", "left"), ("R", "L"), ("r", "l"), ("r", "L"), ("R", "l"))
+SUFFIXES = (("_R", "_L"), ("_r", "_l"), (".R", ".L"), (".r", ".l"), ("_Right", "_Left"), ("R", "L"))
+
+FIRM = 2 * LANDMARK_SPREAD
+"""[m] spread of a marker's place up to which a known word places a label: those on wands and clusters say little."""
+
+ENOUGH, PARTS = 8, 3
+"""Labels with a known word, and segments that they are on, from which a body is fitted to them."""
+
+NEARER = 0.03
+"""By which a marker's way to a segment's bone counts, as a spread would: what was held still goes to the nearest."""
+
+SHARED, AROUND = 0.010, 0.12
+"""[m] a marker that strays less than the first from a neighbouring segment, and is nearer than the second to their
+joint, is both segments'."""
+
+
+@dataclass(frozen=True)
+class FirstSet:
+    """A marker set to begin with.
+
+    Parameters
+    ----------
+    text : of its TOML file
+    segments : name -> labels
+    placed : labels whose place on the humanoid a fit told; none where too few labels have a known word
+    paired : (right, left) labels
+    """
+
+    text: str
+    segments: dict[str, tuple[str, ...]]
+    placed: tuple[str, ...]
+    paired: tuple[tuple[str, str], ...]
+
+
+@checked
+def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet:
+    """A marker set of a labelled take in which joints move, to be looked through and put right.
+
+    Labels whose words the catalogue knows ("R.Knee", "knee_R") lie on its landmarks; the body is fitted to them, and
+    every label goes to the segment that it moves with, the left with the right. Where too few are known, groups and
+    joints are those that motion alone tells, without places.
+
+    Parameters
+    ----------
+    markers : labelled, of one subject
+    body : generic humanoid
+
+    Raises
+    ------
+    ObservationError
+        Too few markers are seen.
+    """
+    _, labels, _ = usable(markers, None)
+    labels = [bare(label) for label in labels]
+    pairs = sides(labels)
+    words = known_words(labels, pairs)
+    found = _by_fit(markers, labels, pairs, words, body)
+    if found is None:
+        model = learn_model(markers, template="")
+        parents = {j.child: model.names[j.parent] for j in model.joints}
+        segments = {n: tuple(bare(model.labels[m]) for m in s) for n, s in zip(model.names, model.segments)}
+        links: dict[str, Link] = {n: (parents.get(i), None) for i, n in enumerate(model.names)}
+        return FirstSet(_toml(name, segments, links, {}, {}), segments, (), tuple(pairs.items()))
+    segments, links, places, at = found
+    return FirstSet(_toml(name, segments, links, places, at), segments, tuple(places), tuple(pairs.items()))
+
+
+def sides(labels: Sequence[str]) -> dict[str, str]:
+    """Right labels with the left ones that differ from them by the side alone."""
+    known, out = set(labels), dict[str, str]()
+    for label in labels:
+        for right, left in PREFIXES:
+            image = left + label[len(right) :]
+            if label.startswith(right) and label not in out and image in known and image != label:
+                out[label] = image
+        for right, left in SUFFIXES:
+            image = label[: len(label) - len(right)] + left
+            if label.endswith(right) and label not in out and image in known and image != label:
+                out[label] = image
+    return out
+
+
+def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple[MarkerRecord, bool]]:
+    """Labels whose word a set of the catalogue has on a landmark: its row, and whether that is to be mirrored."""
+    middle, sided = dict[str, MarkerRecord](), dict[str, MarkerRecord]()
+    for record in catalogue().values():
+        for label, entry in record.markers.items():
+            right = [r for r, _ in record.sides if record.mirror(label) and label.startswith(r)]
+            word = label[len(right[0]) :] if right else None
+            if entry.spread <= FIRM:
+                (middle if word is None else sided).setdefault(plain(label if word is None else word), entry)
+    out = dict[str, tuple[MarkerRecord, bool]]()
+    left = {v: k for k, v in pairs.items()}
+    for label in labels:
+        if label not in pairs and label not in left:
+            if plain(label) in middle:
+                out[label] = middle[plain(label)], False
+            continue
+        word = plain(_word(left.get(label, label), pairs))
+        if word in sided:
+            out[label] = sided[word], label in left
+    return out
+
+
+def _word(label: str, pairs: dict[str, str]) -> str:
+    """What a right label and its left one have in common."""
+    other = pairs[label]
+    same = next((i for i in range(min(len(label), len(other))) if label[::-1][i] != other[::-1][i]), 0)
+    start = next((i for i in range(min(len(label), len(other))) if label[i] != other[i]), 0)
+    if start:
+        return label[:start]
+    tail = label[len(label) - same :]
+    return tail[1:] if plain(tail) in ("ight", "eft") else tail
+
+
+Link = tuple[str | None, NDArray | None]
+"""A segment's parent and the joint with it (3,) [m]; none for the root, or where it is not known."""
+
+Found = tuple[dict[str, tuple[str, ...]], dict[str, Link], dict[str, NDArray], dict[str, tuple[str, NDArray]]]
+
+
+def _by_fit(
+    markers: Markers, labels: list[str], pairs: dict[str, str], words: dict[str, tuple[MarkerRecord, bool]], body: Body
+) -> Found | None:
+    """Segments, their parents and joints, places at rest, places on segments; None where no body can be fitted."""
+    rows = {label: replace_side(entry, mirrored) for label, (entry, mirrored) in words.items()}
+    points = placed(body, SetRecord(name="words", markers=rows)).points
+    if len(points) < ENOUGH or len(set(points.segments.tolist())) < PARTS:
+        return None
+    plainly = replace(markers, names=tuple(bare(n) for n in markers.names))
+    try:
+        subject = fit_marker_subject(replace(body, marker_sets={"words": points}), plainly, "words")
+        motion = fit_markers(subject.body, plainly, "words", sigma=subject.sigma)
+    except KinefitError:
+        return None
+    poses = motion.segment_poses()
+    scale = subject.scales[body.segment_scale]
+    tree = body.tree
+    usual = {image for r in catalogue().values() for s in r.segment for image in (s.name, f"{s.name[:-2]}_l")}
+    candidates = np.array([s for s, n in enumerate(tree.segments) if n in usual])
+    ends = {s: [tree.rest[c] - tree.rest[s] for c in np.flatnonzero(tree.parents == s)] for s in candidates.tolist()}
+    at, cost, stray, poses = {}, {}, {}, poses[:, candidates]
+    for label in labels:
+        x = plainly.positions[:, plainly.names.index(label)]
+        own = np.einsum("fsji,fsj->fsi", poses[..., :3, :3], x[:, None] - poses[..., :3, 3])
+        middle = np.nanmedian(own, axis=0)
+        stray[label] = np.sqrt(np.nanmedian(((own - middle) ** 2).sum(-1), axis=0) / 3)
+        at[label] = middle / scale[candidates, None]
+        bone = [_off(at[label][i], ends[s]) for i, s in enumerate(candidates.tolist())]
+        cost[label] = stray[label] + NEARER * np.array(bone)
+    mirror = np.array([_mirrored(tree.segments, candidates, s) for s in candidates.tolist()])
+    home = {label: int(np.argmin(cost[label])) for label in labels}
+    for right, left in pairs.items():
+        if right in cost and left in cost:
+            home[right] = int(np.argmin(cost[right] + cost[left][mirror]))
+            home[left] = int(mirror[home[right]])
+    members = {i: [label for label in labels if home[label] == i] for i in sorted(set(home.values()))}
+    tied = _tied(members, candidates, tree.parents)
+    joints = {c: tree.rest[candidates[max(c, p)]] for c, p in tied.items() if p is not None}
+    for c, p in tied.items():
+        for a, b in ((c, p), (p, c)) if p is not None else ():
+            for label in [k for k in labels if home[k] == a]:
+                near = np.linalg.norm(at[label][a] + tree.rest[candidates[a]] - joints[c]) < AROUND
+                if near and b is not None and stray[label][b] < SHARED:
+                    members[b].append(label)
+    name = {i: tree.segments[candidates[i]] for i in members}
+    segments = {name[i]: tuple(members[i]) for i in tied}
+    linked: dict[str, Link] = {name[i]: (None if p is None else name[p], joints.get(i)) for i, p in tied.items()}
+    places = {label: at[label][home[label]] + tree.rest[candidates[home[label]]] for label in labels}
+    return segments, linked, places, {label: (name[home[label]], at[label][home[label]]) for label in labels}
+
+
+def replace_side(entry: MarkerRecord, mirrored: bool) -> MarkerRecord:
+    """A row of a set, or that of the other side."""
+    if not mirrored:
+        return entry
+    landmark, segment = entry.landmark, entry.segment
+    if landmark is not None and landmark.startswith("r_"):
+        landmark = f"l_{landmark[2:]}"
+    if segment is not None and segment.endswith("_r"):
+        segment = f"{segment[:-2]}_l"
+    x, y, z = entry.offset
+    at = None if entry.at is None else (entry.at[0], entry.at[1], -entry.at[2])
+    return MarkerRecord(landmark=landmark, segment=segment, at=at, offset=(x, y, -z), spread=entry.spread)
+
+
+def _off(at: NDArray, ends: list[NDArray]) -> float:
+    """[m] from a point to the bones of a segment, from its origin to its ends."""
+    out = [float(np.linalg.norm(at))]
+    for end in ends:
+        along = float(np.clip(at @ end / max(end @ end, 1e-9), 0.0, 1.0))
+        out.append(float(np.linalg.norm(at - along * end)))
+    return min(out)
+
+
+def _mirrored(names: Sequence[str], candidates: NDArray, s: int) -> int:
+    """Place among the candidates of the segment of the other side."""
+    name = names[s]
+    other = f"{name[:-2]}_l" if name.endswith("_r") else f"{name[:-2]}_r" if name.endswith("_l") else name
+    return [names[c] for c in candidates].index(other)
+
+
+def _tied(members: dict[int, list[str]], candidates: NDArray, parents: NDArray) -> dict[int, int | None]:
+    """Each group's parent, parents first: the nearest group above it in the body; the root has three markers."""
+    place = {int(candidates[i]): i for i in members}
+    links: dict[int, set[int]] = {i: set() for i in members}
+    for i in members:
+        s = int(parents[candidates[i]])
+        while s >= 0 and s not in place:
+            s = int(parents[s])
+        above = place[s] if s >= 0 else min(members)
+        if above != i:
+            links[i].add(above)
+            links[above].add(i)
+    root = next((i for i in members if len(members[i]) >= 3), min(members))
+    out: dict[int, int | None] = {root: None}
+    todo = [root]
+    while todo:
+        i = todo.pop(0)
+        for k in sorted(links[i] - set(out)):
+            out[k] = i
+            todo.append(k)
+    return out
+
+
+def _toml(
+    name: str, segments: dict[str, tuple[str, ...]], links: dict[str, Link],
+    places: dict[str, NDArray], at: dict[str, tuple[str, NDArray]],
+) -> str:  # fmt: skip
+    """The file."""
+    def row(values: NDArray) -> str:
+        return "[" + ", ".join(f"{v + 0.0:.3f}" for v in values) + "]"
+
+    lines = [
+        "# A first marker set, written by `kinefit markers set`. Look through it: is every marker on its segment?",
+        "# [m] on a body of average size: x forward, y up, z to the right; places, joints from the middle of the hips.",
+        f"name = {json.dumps(name)}", "",
+    ]  # fmt: skip
+    if places:
+        lines += ["[places]", *(f"{json.dumps(k)} = {row(v)}" for k, v in places.items()), "", "[markers]"]
+        for label, (segment, x) in at.items():
+            lines.append(
+                f"{json.dumps(label)} = {{ segment = {json.dumps(segment)}, at = {row(x)}, spread = {FIRM:g} }}"
+            )
+        lines.append("")
+    for segment, labels in segments.items():
+        parent, joint = links[segment]
+        lines += ["[[segment]]", f"name = {json.dumps(segment)}"]
+        lines += [f"parent = {json.dumps(parent)}"] if parent else []
+        lines += [f"joint = {row(joint)}"] if joint is not None else []
+        lines += [f"markers = {json.dumps(list(labels))}", ""]
+    return "\n".join(lines)

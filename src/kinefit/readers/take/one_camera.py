@@ -1,0 +1,57 @@
+"""The camera of a take that has one and no calibration: level, at the world's origin, of the usual field of view."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kinefit.errors import TakeError
+from kinefit.geometry.camera import Camera
+from kinefit.motion import UP_AXES
+from kinefit.readers.take.entries import CameraEntry
+from kinefit.readers.take.file import Take
+
+USUAL = 64.0
+"""[deg] across the longer side of the image where nothing is told: videos of telephones have some 60 to 70."""
+
+
+def is_alone(take: Take) -> bool:
+    """Whether one camera without calibration is all that a take has."""
+    return take.calibration is None and len(take.cameras) == 1 and not take.depth
+
+
+def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:
+    """The camera as the take tells it, or as cameras usually are.
+
+    It looks level, along the axis before the vertical one: y where z is up, x where y is.
+
+    Raises
+    ------
+    TakeError
+        Nothing tells the size of its image.
+    """
+    if size is None:
+        raise TakeError(
+            "nothing tells the size of the image", file=take.path, place=f"camera {entry.name}",
+            remedy="Give the camera its video, or size = [width, height].",
+        )  # fmt: skip
+    width, height = size
+    focal = 0.5 * max(size) / np.tan(np.radians(entry.field_of_view or USUAL) / 2.0)
+    matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    up = np.array(UP_AXES[take.up], float)
+    ahead = np.roll(np.abs(up), -1)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([np.cross(ahead, up), -up, ahead])
+    return Camera(entry.name, size, matrix, T_camera_world=T)
+
+
+def what_is_assumed(take: Take) -> list[str]:
+    """What the report of such a take has to say."""
+    entry = take.cameras[0]
+    told = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
+    out = [
+        f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {told}; where it is a tenth "
+        "wider, the person is a tenth nearer. Error bars do not hold this."
+    ]
+    if take.height is None:
+        out.append("no height is stated: lengths and distances are as unsure as the person's size, about a tenth")
+    return out

@@ -1,0 +1,134 @@
+"""Landmarks that a network lifted from one image to space: how far each lies nearer or farther than the hips.
+
+What the image itself shows of a landmark is the keypoints' to say. Of the landmarks in space only their depth counts
+here, along the ray to the hips and from the middle of the hips, in the size that the network takes a person to have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, PointSet
+from kinefit.bodies.rigid_pairs import rigid_pairs
+from kinefit.geometry.lifting import placed
+from kinefit.observations import LiftedFrame
+from kinefit.rows import AnyRows, PairRows
+from kinefit.sensors.base import Hints, Matched, Measurement, Sensor
+from kinefit.sensors.channels import known_points
+from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.scene import Scene
+
+HIPS = "left_hip", "right_hip"
+"""The landmarks from whose middle a network counts."""
+
+
+class LiftedSensor(Sensor):
+    """A network that lifts the landmarks of one camera's image to space.
+
+    Parameters
+    ----------
+    camera : str, of the rig
+    sigma : float [m] standard deviation of a landmark's depth against that of the hips
+    """
+
+    def __init__(self, camera: str, sigma: float) -> None:
+        self.name, self.camera, self.sigma = f"lifted {camera}", camera, sigma
+
+    def prepare(self, frame: LiftedFrame, scene: Scene) -> LiftedMeasurement:
+        """Those landmarks that the body has.
+
+        Raises
+        ------
+        BodyError, CalibrationError
+            A keypoint set that the body does not have, a camera that the rig does not have.
+        """
+        scene.rig.index(self.camera)
+        known = set(known_points(scene.body, frame.keypoint_set).names)
+        seen = np.isfinite(frame.x).all(axis=1) & np.isfinite(frame.uv).all(axis=1)
+        here = [k for k, name in enumerate(frame.names) if name in known and seen[k]]
+        return LiftedMeasurement(self, frame, tuple(frame.names[k] for k in here), frame.x[here], frame.uv[here])
+
+
+class LiftedMeasurement(Measurement):
+    """Landmarks of one image.
+
+    Parameters
+    ----------
+    of : LiftedSensor
+    frame : LiftedFrame they are of
+    names : (K,)
+    x : (K, 3) [m] from the middle of the hips, along u, v and away from the camera
+    uv : (K, 2) [px]
+    """
+
+    def __init__(self, of: LiftedSensor, frame: LiftedFrame, names: tuple[str, ...], x: NDArray, uv: NDArray) -> None:
+        self.sensor, self.time, self.of, self.keypoint_set = of.name, frame.time, of, frame.keypoint_set
+        self.names, self.x, self.uv = names, x, uv
+
+    def points_of(self, body: Body) -> PointSet:
+        """(K,) the landmarks on a body."""
+        return known_points(body, self.keypoint_set).select(self.names)
+
+    def hips_of(self, body: Body) -> PointSet:
+        """(1,) the middle of the hips, on the root."""
+        hips = known_points(body, self.keypoint_set).select(HIPS)
+        return PointSet(("hips",), np.zeros(1, np.int64), body.points_rest(hips).mean(axis=0)[None] - body.tree.rest[0])
+
+    def size_on(self, body: Body) -> float:
+        """How much larger this body is than the person that the network takes for granted."""
+        points = self.points_of(body)
+        ratios = [length / np.linalg.norm(self.x[i] - self.x[j]) for i, j, _, length in rigid_pairs(body, points)]
+        return float(np.median(ratios)) if ratios else 1.0
+
+    def match(self, scene: Scene, reach: float) -> LiftedMatched:
+        """As they are named."""
+        camera = scene.rig[self.of.camera]
+        ray = scene.positions(self.hips_of(scene.body))[0] - camera.centre_world
+        return LiftedMatched(self, ray / np.linalg.norm(ray), self.size_on(scene.body))
+
+    def hints(self, scene: Scene) -> Hints:
+        """The landmarks in space, at the distance at which they appear as large as they do."""
+        points = self.points_of(scene.body)
+        return Hints(points, placed(scene.rig[self.of.camera], self.x * self.size_on(scene.body), self.uv))
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedMatched(Matched):
+    """Landmarks with the direction in which their depth counts, frozen.
+
+    Parameters
+    ----------
+    measurement : LiftedMeasurement
+    ray : (3,) unit, from the camera to the hips, in the world
+    size : float, by which the network's person is enlarged
+    """
+
+    measurement: LiftedMeasurement
+    ray: NDArray
+    size: float
+    lasts = 0.9
+
+    @property
+    def sensor(self) -> str:  # type: ignore[override]
+        """Name of the sensor."""
+        return self.measurement.sensor
+
+    def rows(self, scene: Scene) -> Sequence[AnyRows]:
+        """A row a landmark: its depth behind the middle of the hips."""
+        m = self.measurement
+        points, hips = m.points_of(scene.body), m.hips_of(scene.body)
+        x, ref = scene.positions(points), scene.positions(hips)
+        count = len(points.names)
+        segments = np.column_stack([points.segments, np.zeros(count, np.int64)])
+        residual = self.size * m.x[:, 2] - (x - ref) @ self.ray
+        weight = np.full(count, 1.0 / m.of.sigma**2)
+        direction = np.broadcast_to(self.ray, x.shape)
+        return [PairRows(segments, x, np.broadcast_to(ref, x.shape), direction, residual, weight)]
+
+    def evidence(self, scene: Scene) -> Evidence:
+        """Nothing for a segment or against it: what they are off by lasts, and says little of any one."""
+        return Evidence(*np.zeros((2, len(scene.body.tree.segments))))

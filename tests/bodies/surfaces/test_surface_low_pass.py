@@ -1,0 +1,39 @@
+"""Low frequencies of a mesh: what stays, and what goes."""
+
+import numpy as np
+
+from kinefit.bodies import load_body
+from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.surfaces.fourier import FourierSurface
+from kinefit.bodies.surfaces.low_pass import low_pass
+
+
+def bumpy(height):
+    """A torus with bumps of high frequency, its triangles, and the torus without them."""
+    u, v = np.meshgrid(np.arange(48) / 48, np.arange(32) / 32, indexing="ij")
+    a, b = 2 * np.pi * u, 2 * np.pi * v
+    r = 0.1 + height * np.cos(12 * a) * np.cos(10 * b)
+    grid = np.stack([(0.3 + r * np.cos(b)) * np.cos(a), r * np.sin(b), (0.3 + r * np.cos(b)) * np.sin(a)], axis=-1)
+    return FourierSurface.of(grid).triangles((48, 32))
+
+
+def test_bumps_go_and_the_shape_stays():
+    (rough, faces), (smooth, _) = bumpy(0.008), bumpy(0.0)
+    before, after = (np.linalg.norm(x - smooth, axis=1).mean() for x in (rough, low_pass(rough, faces, 20)))
+    assert after < 0.5 * before
+    size = [np.ptp(x, axis=0) for x in (smooth, low_pass(smooth, faces, 20))]
+    np.testing.assert_allclose(size[1], size[0], rtol=0.03)  # nothing shrinks
+    np.testing.assert_array_equal(low_pass(rough, faces, 0), rough)
+
+
+def test_a_body_that_morphs_still_does():
+    model = Morphing(load_body("humanoid_morphing"))
+    smooth, state = model.low_pass(5), model.body.usual_state()
+    angles = np.array(state.angles)
+    angles[model.body.tree.coordinate("arm_add_r")] = np.radians(-110.0)
+    raised = type(state)(state.T_world_root, angles)
+    for other in (state, raised):
+        gap = np.linalg.norm(smooth.pose(other).vertices - model.pose(other).vertices, axis=1)
+        assert 1e-4 < gap.mean() < 0.02
+    stiff = Morphing(model.body, operators=()).low_pass(5)
+    assert np.abs(stiff.pose(raised).vertices - smooth.pose(raised).vertices).max() > 0.03

@@ -1,0 +1,111 @@
+"""One camera alone: a take of one video without calibration, whose detections were lifted to space by a network."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinefit.errors import TakeError, TrackingError
+from kinefit.exporters.pictures.detections import write_detections
+from kinefit.observations import MEDIAPIPE_33, Detections
+from kinefit.readers.detections import read_detections
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.readers.take.one_camera import USUAL
+from kinefit.simulation import squat_and_wave
+from kinefit.tracking.take import people_in_view, track_take
+
+SIZE, RATE = (720, 1280), 30.0
+HEAD = f"[take]\nrate = {RATE}\n"
+CAMERA = '[[camera]]\nname = "phone"\nsize = [720, 1280]\n'
+DETECTED = '[[keypoints]]\ncamera = "phone"\nformat = "detect"\nfile = "phone.npz"\n'
+
+
+def truth():
+    """A person of 1.75 m who squats and waves, three metres and a half before the camera, turned by 35 degrees."""
+    motion = squat_and_wave(rate=RATE, up="z")
+    c, s = np.cos(np.radians(125.0)), np.sin(np.radians(125.0))
+    T = np.array([[c, -s, 0, 0.1], [s, c, 0, 3.5], [0, 0, 1, -1.0], [0, 0, 0, 1.0]])
+    return motion, T
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Pixels with 3 px of noise, and landmarks that are off by 6 cm in depth for as long as the take lasts."""
+    folder, rng = tmp_path_factory.mktemp("phone"), np.random.default_rng(1)
+    (folder / "take.toml").write_text(HEAD + CAMERA)
+    (folder / "take.toml").write_text(HEAD + "height = 1.75\n" + CAMERA + DETECTED)
+    motion, T = truth()
+    x = motion.positions(motion.body.keypoints("MEDIAPIPE_33").select(MEDIAPIPE_33)) @ T[:3, :3].T + T[:3, 3]
+    focal = 0.5 * max(SIZE) / np.tan(np.radians(USUAL) / 2)
+    own = np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)  # along u, v and away
+    uv = focal * own[..., :2] / own[..., 2:] + (np.array(SIZE) - 1) / 2 + rng.normal(scale=3.0, size=(*x.shape[:2], 2))
+    hips = own[:, [MEDIAPIPE_33.index(n) for n in ("left_hip", "right_hip")]].mean(axis=1, keepdims=True)
+    lifted = 0.95 * (own - hips)
+    lifted[..., 2] += rng.normal(scale=0.06, size=33)
+    nothing = np.zeros(0, np.uint32), np.zeros(len(x) + 1, int)
+    write_detections(
+        Detections("phone", RATE, SIZE, uv[:, None], np.full((len(x), 1, 33), 0.9), *nothing, lifted=lifted[:, None]),
+        folder / "phone.npz",
+    )  # fmt: skip
+    return folder
+
+
+def test_a_person_is_followed_in_space_by_one_camera(folder):
+    motion, seen = track_take(folder / "take.toml")
+    right, T = truth()
+    x = right.joint_centres @ T[:3, :3].T + T[:3, 3]
+    hips = [right.body.tree.segment(f"thigh_{side}") for side in "lr"]
+    found = motion.joint_centres
+    apart = (found - found[:, hips].mean(axis=1, keepdims=True)) - (x - x[:, hips].mean(axis=1, keepdims=True))
+    assert np.linalg.norm(apart, axis=2).mean() < 0.05
+    assert np.linalg.norm(found[:, 0] - x[:, 0], axis=1).max() < 0.25  # three and a half metres away
+    assert motion.lost.mean() < 0.02 and motion.provenance["smoothing"]["contacts"] > 30
+    inside = np.abs(found - x) < 1.96 * motion.joint_std
+    assert 0.8 < inside.mean() <= 1.0
+    assert motion.joint_std[:, 0, 1].mean() > 2 * motion.joint_std[:, 0, 0].mean()  # y is away from the camera
+    assert {"phone", "lifted phone"} <= set(motion.residuals)
+    assert any("field of view of 64°, the usual one" in note for note in seen.notes)
+
+
+def test_lengths_are_unsure_where_no_height_is_stated(folder):
+    (folder / "short.toml").write_text(HEAD + "frames = [0, 20]\n" + CAMERA + DETECTED)
+    motion, seen = track_take(folder / "short.toml")
+    assert 0.05 < motion.provenance["length_std_m"]["thigh_r-shank_r"] / 0.43 < 0.2
+    assert any("no height is stated" in note for note in seen.notes)
+
+
+def test_who_is_in_view_is_told(folder):
+    view = people_in_view(read_take(folder / "take.toml"))
+    assert view is not None and len(view.people) < 2
+
+
+def test_a_camera_without_calibration_is_level_and_of_a_usual_lens(folder):
+    for up, axis in (("z", 2), ("y", 1)):
+        text = HEAD + f'up = "{up}"\n' + CAMERA + "field_of_view = 90.0\n" + DETECTED
+        (folder / "wide.toml").write_text(text)
+        (camera,) = load_observations(read_take(folder / "wide.toml")).rig
+        assert camera.matrix[0, 0] == pytest.approx(640.0) and camera.size == SIZE
+        assert camera.T_camera_world[1, axis] == -1.0 and np.linalg.det(camera.T_camera_world[:3, :3]) > 0
+
+
+BAD = {
+    "two cameras": (CAMERA + CAMERA.replace("phone", "other"), TakeError, "cameras without calibration"),
+    "too wide": (CAMERA + "field_of_view = 200.0\n" + DETECTED, TakeError, "field_of_view 200"),
+    "other keypoints": (CAMERA + DETECTED.replace('"detect"', '"openpose"'), TakeError, "do not tell how far"),
+    "not lifted": (CAMERA + DETECTED, TrackingError, "kinefit detect --force"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_told(case, folder):
+    text, kind, problem = BAD[case]
+    if case == "not lifted":
+
+
+        write_detections(replace(read_detections(folder / "phone.npz"), lifted=None), folder / "old.npz")
+        text = text.replace("phone.npz", "old.npz")
+    (folder / "bad.toml").write_text(HEAD + text)
+    with pytest.raises(kind) as told:
+        track_take(folder / "bad.toml")
+    assert problem in str(told.value)
