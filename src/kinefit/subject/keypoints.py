@@ -134,8 +134,8 @@ def _fitted(
         excess_of = max(excess_of, 1.0)
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
-    narrow = 1.0 / np.sqrt(excess_of * np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
-    return found, inverse(prior + narrow[:, None] * found.information * narrow)
+    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
+    return found, wider[:, None] * covariance * wider
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:
