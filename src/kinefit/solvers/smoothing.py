@@ -226,7 +226,7 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
     share = prior.posture_share if share is None else share
     _add_posture(C, share - prior.precision, depth)
     W, below, nothing = _workspace(T, n)
-    p, tiny = W.shape[1], 1e-12 * float(s.C[:, np.arange(n), depth].mean())
+    p, tiny = W.shape[1], max(1e-12 * float(s.C[:, np.arange(n), depth].mean()), 1e-12)  # nothing measured: C is 0
     start = start_of(s.entering, n, p, covariance=True)
     while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, start, W, below, nothing):
         tiny *= 10.0
