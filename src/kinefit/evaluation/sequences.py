@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, PointSet
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.skin import LANDMARKS, SkinTracker, face_box
 from kinefit.motion import Motion
 from kinefit.observations import MEDIAPIPE_33, DepthFrame, Frame, KeypointFrame
+from kinefit.sensors.channels import joined
 from kinefit.simulation._postures import MOVEMENTS
 from kinefit.simulation.movements import Person, movement, people
 from kinefit.simulation.pictures import ColourSensor, picture
@@ -26,6 +27,7 @@ INPUTS: tuple[Inputs, ...] = ("3d", "2d", "fusion")
 FEATURES = LANDMARKS
 """Landmarks that the tracker of skin colour follows: the face and both hands."""
 
+_HAND = 4.0 / 3.0  # how far from the elbow the middle of a hand is, in lengths of the forearm
 _HEAD_SIZE = (320, 240)  # [px] of one camera of P2's stereo head (P2 3.1)
 _BASELINE = 0.1  # [m] from the depth camera to the colour camera
 _FEATURE_NOISE = 4.0  # [px] of the middle of a patch of skin: a hand's half width at 3 m
@@ -98,6 +100,14 @@ def sequences(
         yield sequence(names[k], person, sensor=sensor, rate=rate, room=room, seed=seed, number=number)
 
 
+def with_hands(body: Body) -> Body:
+    """A body whose hands are part of its forearms, with the landmarks of their middles."""
+    names = [name for name in FEATURES if name not in body.landmarks.names]
+    wrists = body.landmarks.select(tuple(f"{name[0]}_wrist" for name in names))
+    hands = PointSet(tuple(names), wrists.segments, _HAND * wrists.points)
+    return replace(body, landmarks=joined([body.landmarks, hands])) if names else body
+
+
 def sequence(
     name: str,
     person: Person,
@@ -109,7 +119,7 @@ def sequence(
     number: int = 0,
 ) -> Sequence:
     """One movement of one person as its sensors saw it; see `sequences`."""
-    truth = movement(name, person.body, rate=rate, speed=person.speed)
+    truth = movement(name, with_hands(person.body), rate=rate, speed=person.speed)
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
     head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
     colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
