@@ -112,14 +112,9 @@ def test_what_it_writes_can_be_tracked(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_video_of_a_telephone_can_be_tracked(tmp_path):
+def test_one_video_of_a_telephone_can_be_tracked(tmp_path, data_dir):
     """A real walk towards the camera, as it is: nothing is lost, knees bend, feet stand."""
-    from benchmarks.figures import data
-
-    recording = data("video_mono_opencap")
-    if recording is None:
-        pytest.skip("no recording")
-    shutil.copy(recording / "walk_ts" / "video.mp4", tmp_path / "walk.mp4")
+    shutil.copy(data_dir("video_mono_opencap") / "walk_ts" / "video.mp4", tmp_path / "walk.mp4")
     told = run("init", tmp_path)
     assert told.exit_code == 0 and "walk.mp4 alone" in told.stdout, told.output
     told = run("track", tmp_path / "take.toml", "--formats", "motion", "--out", tmp_path / "out")
