@@ -184,6 +184,16 @@ def test_an_angle_that_nothing_observes_has_its_spread():
     np.testing.assert_allclose(std, TREE.spread, rtol=0.02)
 
 
+def test_a_take_that_shows_nothing_leaves_the_root_unknown():
+    """No frame holds anything: it ends, the posture about as wide as its prior, the root without bounds."""
+    roots, angles = np.tile(np.eye(4), (12, 1, 1)), np.tile(TREE.usual, (12, 1))
+    p = prior(20.0, (0.2, 1.0), 1 / 60)
+    found = posterior(BODY, smooth(BODY, roots, angles, held(np.zeros((12, N))), p))
+    variance = np.einsum("tii->ti", found.frames)
+    assert np.isfinite(variance).all() and (variance[:, :3] > 1e3).all()
+    assert (np.sqrt(variance[:, 6:]) < 5.0 * TREE.spread).all()  # the prior is one of the posture over a second
+
+
 def scene(noise=0.0, frames=30):
     truth = squat_and_wave(BODY, rate=30, duration=frames / 30)
     rig = studio_rig(truth)

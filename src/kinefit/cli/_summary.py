@@ -53,7 +53,8 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
             if name not in never:
                 say(f"{told}: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
-    say("bone lengths [cm]: " + ", ".join(lengths))
+    if lengths:
+        say("bone lengths [cm]: " + ", ".join(lengths))
     if points:
         _print_points(motion)
 
