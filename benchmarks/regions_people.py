@@ -22,13 +22,14 @@ from kinefit.bodies import BodyState
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.correspondences.rims import RimFinder
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
+from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
 from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.recipes.regions import pose_from_regions
 from kinefit.rendering import render_body, scaled
+from kinefit.smoothing.foot_contacts import find_contacts
 
 FRAMES = amount(100, 6)
 GOOD = 0.8  # overlap of a frame from which it counts as tracked, as of silhouettes
@@ -73,6 +74,7 @@ def run() -> None:
     print(f"  camera by camera {np.round(alone.mean(axis=0), 3)}, worst image {alone.min():.3f}; "
           f"lowest quality {motion.quality.min():.2f}")  # fmt: skip
     figure(names[1], float((alone.mean(axis=1) >= GOOD).sum()), "frames", GOALS[names[1]])
+    _with_contacts(folder, motion, rig, masks.silhouettes)
     if quick():
         for name in names[2:]:
             figure(name, None, "", GOALS[name], LEFT_OUT)
@@ -85,6 +87,27 @@ def run() -> None:
     figure(names[2], float(np.mean(held)), "", GOALS[names[2]])
     _beside_keypoints(folder, rig, masks.silhouettes)
     _as_printed(folder, motion, rig, masks.silhouettes)
+
+
+def _with_contacts(folder: Path, motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
+    """What changes where soles are held while they rest, on the beam or on the ground."""
+    held = tracked(take_text(folder), contacts=True)
+    found = find_contacts(held.body, held.Ts_world_root, held.angles, held.rate, held.up)
+    resting = found.weight > 0
+    if not resting.any():
+        print("  contacts: no sole rests")
+        return
+    speed = [np.gradient(m.positions(found.points), axis=0)[resting] * m.rate for m in (motion, held)]
+    still = [1e3 * float(np.median(np.linalg.norm(v, axis=1))) for v in speed]
+    height = (found.places @ np.array(UP_AXES[held.up]))[resting]
+    share = overlaps(held, rig, masks).mean()
+    turned = np.degrees(np.median(np.abs(held.angles - motion.angles).max(axis=0)))
+    print(
+        f"  contacts: soles rest in {int(resting.any(axis=1).sum())} frames of {len(held)}, at heights from "
+        f"{height.min():.2f} to {height.max():.2f} m; while they do they move at {still[1]:.0f} mm/s "
+        f"instead of {still[0]:.0f}; IoU {share:.3f}; angles change by {turned:.1f} degrees at most (median of all)",
+        flush=True,
+    )
 
 
 def _beside_keypoints(folder: Path, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:

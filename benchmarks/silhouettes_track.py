@@ -47,12 +47,12 @@ def take_text(folder: Path, kind: str, cameras: Sequence[str] = CAMERAS, keypoin
     return trial_text(folder, beside, keypoints)
 
 
-def tracked(text: str) -> Motion:
-    """The motion of a take."""
+def tracked(text: str, *, contacts: bool = False) -> Motion:
+    """The motion of a take; with soles held where they rest."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "take.toml"
         path.write_text(text)
-        return track_take(path)[0]
+        return track_take(path, contacts=contacts)[0]
 
 
 def overlaps(motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> NDArray:
