@@ -82,7 +82,7 @@ CASES = (
     _halves("jumps, back", "c3d_to_xyz/01_01.c3d", back=True),
     _halves("freeform", "nimblephysics/data__c3d__nick_freeform_001.c3d"),
     _halves("freeform, back", "nimblephysics/data__c3d__nick_freeform_001.c3d", back=True, chosen=True),
-    _halves("squat", "nimblephysics/data__c3d__squat.c3d"),
+    _halves("squat", "nimblephysics/data__c3d__squat.c3d", chosen=True),
     _halves("squat, back", "nimblephysics/data__c3d__squat.c3d", back=True),
     _halves("walk", "momentum/momentum__examples__process_markers_app__02_01.c3d"),
     _halves("sprint", "nimblephysics/data__c3d__JA1Gait35.c3d", chosen=True),
