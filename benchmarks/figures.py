@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 import os
 import sys
 import time
@@ -15,19 +16,22 @@ from typing import TypeVar
 Amount = TypeVar("Amount")
 
 
+_RELATIONS = {"<=": operator.le, ">=": operator.ge, ">": operator.gt, "==": operator.eq}
+
+
 def figure(name: str, value: float | None, unit: str, goal: str, reason: str = "") -> bool:
     """Print `figure NAME = VALUE UNIT (goal GOAL): met|missed|not measured (reason)`.
 
     Parameters
     ----------
-    goal : str such as "<= 9", ">= 2.5" or "== 500".
+    goal : str such as "<= 9", ">= 2.5", "> 0" or "== 500".
     reason : str, why there is no value.
     """
     relation, bound = goal.split()
     if value is None or not math.isfinite(value):
         print(f"figure {name} = - {unit} (goal {goal}): not measured ({reason or 'no value'})", flush=True)
         return False
-    met = {"<=": value <= float(bound), ">=": value >= float(bound), "==": value == float(bound)}[relation]
+    met = _RELATIONS[relation](value, float(bound))
     print(f"figure {name} = {value:.4g} {unit} (goal {goal}): {'met' if met else 'missed'}", flush=True)
     return met
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, data, figure, quick
 from benchmarks.tracking import Trial, read_trial
 from kinefit import load_body
-from kinefit.multiview.followed import alone
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
@@ -49,7 +48,7 @@ def _held_out(used: list[Trial], judge: Trial) -> float:
     for record, chosen in zip(whole.keypoints, whole.people, strict=True):
         seen = [k for trial in used for k in trial.keypoints if k.camera != record.camera]
         motion = track(Recording.of_keypoints(rig, seen), body)
-        person = alone(record, chosen)
+        person = record.of_one(chosen)
         uv = np.where((person.confidence[:, 0] > _SURE)[..., None], person.points[:, 0], np.nan)
         points = motion.body.keypoints(record.keypoint_set)
         names = tuple(n for n in record.names if n in points.names)

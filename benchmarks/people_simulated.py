@@ -100,7 +100,5 @@ def _speed() -> None:
 
 def _alone(seen: Crowd, one: Followed, k: int) -> Recording:
     """One person's recording, with nobody sought anew."""
-    from kinefit.multiview.followed import alone
-
-    records = [alone(r, chosen) for r, chosen in zip(seen.keypoints, one.people[k].chosen)]
+    records = [r.of_one(chosen) for r, chosen in zip(seen.keypoints, one.people[k].chosen)]
     return Recording.of_keypoints(seen.rig, records, accuracy=4.0, up="y")
