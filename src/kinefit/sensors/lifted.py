@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,27 @@ class LiftedSensor(Sensor):
         return LiftedMeasurement(self, frame, tuple(frame.names[k] for k in here), frame.x[here], frame.uv[here])
 
 
+@dataclass(frozen=True, eq=False)
+class _OnBody:
+    """Landmarks on a body: points (K,), the middle of the hips, and pairs (M,) that stay `length` [m] apart."""
+
+    points: PointSet
+    hips: PointSet
+    first: NDArray
+    second: NDArray
+    length: NDArray
+
+
+@lru_cache(maxsize=64)
+def _on(body: Body, keypoint_set: str, names: tuple[str, ...]) -> _OnBody:
+    known = known_points(body, keypoint_set)
+    points, middle = known.select(names), body.points_rest(known.select(HIPS)).mean(axis=0)
+    pairs = rigid_pairs(body, points)
+    first, second = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
+    hips = PointSet(("hips",), np.zeros(1, np.int64), middle[None] - body.tree.rest[0])
+    return _OnBody(points, hips, first, second, np.array([pair[3] for pair in pairs], float))
+
+
 class LiftedMeasurement(Measurement):
     """Landmarks of one image.
 
@@ -71,18 +93,18 @@ class LiftedMeasurement(Measurement):
 
     def points_of(self, body: Body) -> PointSet:
         """(K,) the landmarks on a body."""
-        return known_points(body, self.keypoint_set).select(self.names)
+        return _on(body, self.keypoint_set, self.names).points
 
     def hips_of(self, body: Body) -> PointSet:
         """(1,) the middle of the hips, on the root."""
-        hips = known_points(body, self.keypoint_set).select(HIPS)
-        return PointSet(("hips",), np.zeros(1, np.int64), body.points_rest(hips).mean(axis=0)[None] - body.tree.rest[0])
+        return _on(body, self.keypoint_set, self.names).hips
 
     def size_on(self, body: Body) -> float:
         """How much larger this body is than the person that the network takes for granted."""
-        points = self.points_of(body)
-        ratios = [length / np.linalg.norm(self.x[i] - self.x[j]) for i, j, _, length in rigid_pairs(body, points)]
-        return float(np.median(ratios)) if ratios else 1.0
+        bones = _on(body, self.keypoint_set, self.names)
+        if not len(bones.length):
+            return 1.0
+        return float(np.median(bones.length / np.linalg.norm(self.x[bones.first] - self.x[bones.second], axis=1)))
 
     def match(self, scene: Scene, reach: float) -> LiftedMatched:
         """As they are named."""
