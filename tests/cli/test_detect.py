@@ -33,7 +33,7 @@ class Networks:
     pictures = 0
     lock = threading.Lock()
 
-    def __init__(self, folder):
+    def __init__(self, folder, threads=1):
         pass
 
     def find_people(self, image):

@@ -25,6 +25,8 @@ class Models:
     ----------
     folder : path
         With the two files.
+    threads : int
+        That each network runs on; the answers are the same.
 
     Raises
     ------
@@ -34,9 +36,9 @@ class Models:
         A file is missing or not a network.
     """
 
-    def __init__(self, folder: str | PathLike[str]) -> None:
-        self.pose = PoseModel(_interpreter(Path(folder) / LANDMARKS))
-        self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR))
+    def __init__(self, folder: str | PathLike[str], threads: int = 1) -> None:
+        self.pose = PoseModel(_interpreter(Path(folder) / LANDMARKS, threads))
+        self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR, threads))
 
     def find_people(self, image: NDArray[np.uint8]) -> list[Person]:
         """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""
@@ -82,12 +84,12 @@ def _runtime() -> Any:
     return Interpreter
 
 
-def _interpreter(path: Path) -> Any:
+def _interpreter(path: Path, threads: int) -> Any:
     runtime = _runtime()
     if not path.is_file():
         raise FileError("no such network", file=path, remedy=_REMEDY)
     try:
-        interpreter = runtime(str(path), num_threads=1)  # cameras run side by side instead
+        interpreter = runtime(str(path), num_threads=threads)
         interpreter.allocate_tensors()
     except (ValueError, RuntimeError) as error:
         raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=_REMEDY) from error

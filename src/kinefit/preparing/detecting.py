@@ -118,8 +118,11 @@ def detect(
             with lock:
                 progress(camera, done, total)
 
+    threads = max(_cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
+
     def work(job: Job) -> None:
-        _look_through(job, folder, number, outlines, f"{keys[job]} {_settings(number, outlines, job.seconds)}", step)
+        key = f"{keys[job]} {_settings(number, outlines, job.seconds)}"
+        _look_through(job, folder, number, outlines, key, step, threads)
 
     _hush(folder)
     with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
@@ -158,14 +161,14 @@ class _Stopped(Exception):
 
 
 def _look_through(
-    job: Job, networks: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None]
+    job: Job, networks: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None], threads: int
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detection import detect_people
     from kinefit.images.models import Models
     from kinefit.readers.video import Video
 
-    models = Models(networks)
+    models = Models(networks, threads)
     with Video(job.video, rate=job.rate) as video:
         first, last = 0, len(video)
         if job.seconds is not None:
