@@ -19,6 +19,13 @@ def _unit(v: NDArray, what: str) -> NDArray:
     return v / norm
 
 
+def perpendiculars(directions: NDArray) -> tuple[NDArray, NDArray]:
+    """Two unit directions (N, 3) each, at right angles to unit directions (N, 3) and to each other."""
+    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return first, np.cross(directions, first)
+
+
 def line_through(a: NDArray, b: NDArray) -> NDArray:
     """Plücker line (..., 6) from point a to point b, both (..., 3) [m]."""
     a, b = np.asarray(a, float), np.asarray(b, float)

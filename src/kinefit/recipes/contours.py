@@ -19,6 +19,7 @@ from kinefit.bodies.surfaces.fourier import FourierCurve
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
+from kinefit.geometry.lines import perpendiculars
 
 __all__ = ["ContourFit", "pose_of_contour"]
 
@@ -132,9 +133,7 @@ def _twist(x: NDArray, centre: NDArray, rays: NDArray, normals: NDArray, *, by: 
     if by == "planes":
         directions, owner = normals, np.arange(len(x))
     else:
-        first = np.cross(rays, np.eye(3)[np.argmin(np.abs(rays), axis=1)])
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        directions = np.concatenate([first, np.cross(rays, first)])
+        directions = np.concatenate(perpendiculars(rays))
         owner = np.tile(np.arange(len(x)), 2)
     middle = x.mean(axis=0)
     w = (1.0 / far)[owner]

@@ -26,6 +26,7 @@ from kinefit.correspondences.outlines import outline_pairs
 from kinefit.correspondences.rims import RimFinder
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.lines import perpendiculars
 from kinefit.images.silhouette import colour_silhouette
 from kinefit.rows import DofRows, Rows
 from kinefit.solvers.least_squares import gauss_newton
@@ -120,14 +121,12 @@ def _rows(
         return []
     chosen = rim.chosen(i)
     x, ray = chosen.on(pose.vertices), camera.ray(contour[:2, k].T)
-    first = np.cross(ray, np.eye(3)[np.argmin(np.abs(ray), axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
     share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
     depth = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     sigma = np.maximum(depth, 1e-3) * _PIXELS / np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
     return [
         morphed_rows(pose, chosen.vertices, n, np.sum((camera.centre_world - x) * n, axis=1), share=share, sigma=sigma)
-        for n in (first, np.cross(ray, first))
+        for n in perpendiculars(ray)
     ]
 
 

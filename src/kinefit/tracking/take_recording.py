@@ -107,9 +107,10 @@ def recording_of(
         name=take.name, sensors=_surface_sensors(take, seen),
     )  # fmt: skip
     if seen.keypoints:
-        bare = not (videos or marked or recording.sensors)
+        bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
+        keypoints = seen.keypoints if bare else [replace(k, lifted=None) for k in seen.keypoints]
         pixels = Recording.of_keypoints(
-            rig, seen.keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person, people=people
+            rig, keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,

@@ -209,6 +209,10 @@ WRONG = {
     "empty": ("", "an empty take"),
     "empty with head": ('[take]\nname = "x"', "an empty take"),
     "no calibration": ('[[camera]]\nname = "a"\n[[camera]]\nname = "b"', "cameras without calibration"),
+    "one camera of no known place beside a sensor of the world": (
+        '[[camera]]\nname = "a"\nsize = [640, 480]\n[[depth]]\nname = "tof"\nfile = "seen"\n'
+        "intrinsics = [500.0, 500.0, 320.0, 240.0]", "cameras without calibration",
+    ),
     "unknown set": (take_text(keys='set = "BODY_26"'), "no keypoint set 'BODY_26'; there are: BODY_25B"),
     "set of another detector": (
         take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe 'COCO_17'"

@@ -5,11 +5,12 @@ from __future__ import annotations
 from os import PathLike
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.fourier import FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.bodies.surfaces.obj import UNITS
-from kinefit.errors import BodyError, choices
+from kinefit.bodies.surfaces.obj import surface_of_file
+from kinefit.errors import BodyError
 
 
 def fourier_surface(
@@ -41,9 +42,8 @@ def fourier_surface(
     BodyError
         A file that cannot be read or has another number of points; an unknown unit; a series or a mesh that cannot be.
     """
-    try:
-        if unit not in UNITS:
-            raise BodyError(choices("unit", unit, UNITS), remedy="Give one of these.")
+
+    def read() -> tuple[NDArray, NDArray]:
         try:
             points = np.loadtxt(path, delimiter=",", ndmin=2)
         except (OSError, ValueError) as error:
@@ -51,9 +51,6 @@ def fourier_surface(
         if points.shape != (grid[0] * grid[1], 3):
             problem = f"{points.shape[0]} lines of {points.shape[1]} numbers for a grid of {grid[0]} x {grid[1]}"
             raise BodyError(problem, remedy="Write x,y,z of every point, and the grid's two counts.")
-        series = FourierSurface.of(UNITS[unit] * points.reshape(*grid, 3), closed=closed, orders=orders)
-        surface = MeshSurface(segment, *series.triangles(nodes or grid))
-    except BodyError as error:
-        where = ", ".join(text for text in (place, error.place) if text)
-        raise BodyError(error.problem, file=path, place=where or None, remedy=error.remedy) from error
-    return surface.mirrored() if mirror else surface
+        return FourierSurface.of(points.reshape(*grid, 3), closed=closed, orders=orders).triangles(nodes or grid)
+
+    return surface_of_file(path, segment, read, unit=unit, mirror=mirror, place=place)

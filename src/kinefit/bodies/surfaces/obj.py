@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 
@@ -74,10 +75,23 @@ def mesh_surface(
     BodyError
         See `read_obj` and `MeshSurface`; an unknown unit; a mesh that is longer than 10 m: taken for metres?
     """
+    return surface_of_file(path, segment, lambda: read_obj(path), unit=unit, mirror=mirror, place=place)
+
+
+def surface_of_file(
+    path: str | PathLike[str], segment: int, read: Callable[[], tuple[NDArray, NDArray]], *, unit: str, mirror: bool,
+    place: str | None,
+) -> MeshSurface:  # fmt: skip
+    """Surface of a segment from vertices and triangles that a file gives in its unit; arguments as of `mesh_surface`.
+
+    Parameters
+    ----------
+    read : gives vertices (V, 3) in the file's unit, and triangles (T, 3).
+    """
     if unit not in UNITS:
         raise BodyError(choices("unit", unit, UNITS), file=path, place=place, remedy="Give one of these.")
     try:
-        vertices, faces = read_obj(path)
+        vertices, faces = read()
         vertices = vertices * UNITS[unit]
         length = float(np.ptp(vertices, axis=0).max())
         if length > LONGEST:

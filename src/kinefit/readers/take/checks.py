@@ -256,7 +256,8 @@ def _names(take: Take) -> None:
                 choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
                 remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
-    if len(take.cameras) > 1 and take.calibration is None:
+    beside = (take.markers, take.depth, take.stereo, take.surface_points)  # of a world in which its place is not known
+    if take.cameras and take.calibration is None and (len(take.cameras) > 1 or any(beside)):
         remedy = 'Add [calibration] with file = "...". One camera alone needs none.'
         raise TakeError("cameras without calibration", file=take.path, remedy=remedy)
     for entry in take.cameras:

@@ -15,8 +15,8 @@ USUAL = 64.0
 
 
 def is_alone(take: Take) -> bool:
-    """Whether one camera without calibration is all that a take has."""
-    return take.calibration is None and len(take.cameras) == 1 and not take.depth
+    """Whether a take has one camera, and no calibration; `check_take` lets no sensor of another world beside it."""
+    return take.calibration is None and len(take.cameras) == 1
 
 
 def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:
