@@ -54,7 +54,7 @@ def run() -> None:
     """Print every figure."""
     root, missing = data("video_mono_opencap"), "no recording"
     try:
-        detecting._networks(None, print)
+        detecting.networks(None, print)
     except (AssetError, ObservationError) as error:
         root, missing = None, error.problem
     if root is None:

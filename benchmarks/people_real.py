@@ -36,7 +36,7 @@ def run() -> None:
     """Print every figure."""
     two, one = data("video_two_people_4cam"), data("video_balancing_4cam")
     try:
-        detecting._networks(None, print)
+        detecting.networks(None, print)
         missing = "left out of the quick form: eight videos are looked through" if quick() else ""
     except (AssetError, ObservationError) as error:
         missing = error.problem

@@ -28,7 +28,7 @@ LEVELS = [
     {"calibration"},
     {"simulation", "recipes"},
     {"evaluation"},
-    {"batch"},
+    {"batch", "live"},
     {"cli", "__main__"},
 ]
 BESIDE = {
@@ -39,7 +39,7 @@ BESIDE = {
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {
-    "exporters": {"recipes", "batch", "cli", "preparing"},
+    "exporters": {"recipes", "batch", "live", "cli", "preparing"},
     "viewers": {"recipes", "batch", "cli"},
     "assets": {"cli", "preparing"},
 }

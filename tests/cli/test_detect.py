@@ -82,7 +82,7 @@ def take(take, white_video):
 @pytest.fixture(autouse=True)
 def networks(monkeypatch, tmp_path):
     monkeypatch.setattr("kinefit.images.models.Models", Networks)
-    monkeypatch.setattr(detecting, "_networks", lambda progress, tell: tmp_path)
+    monkeypatch.setattr(detecting, "networks", lambda progress, tell: tmp_path)
     monkeypatch.setattr(Networks, "pictures", 0)
     return Networks
 
@@ -257,7 +257,7 @@ def test_the_missing_extra_is_told_before_anything_is_fetched(monkeypatch):
     monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
     monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: pytest.fail("fetched"))
     with pytest.raises(ObservationError, match=r"pip install 'kinefit\[detect\]'"):
-        detecting._networks(None, pytest.fail)
+        detecting.networks(None, pytest.fail)
 
 
 def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_path):
@@ -271,18 +271,18 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
 
     monkeypatch.setattr("kinefit.assets.detector_models", fetch)
     steps, said = [], []
-    assert detecting._networks(lambda *step: steps.append(step), said.append) == tmp_path
+    assert detecting.networks(lambda *step: steps.append(step), said.append) == tmp_path
     assert len(said) == 1 and "Apache-2.0" in said[0] and "MediaPipe" in said[0]
     assert steps == [("fetching MB", 0, 36), ("fetching MB", 36, 36)]
     monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
-    detecting._networks(None, pytest.fail)  # nothing is said when they are there already
+    detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
 def test_networks_that_cannot_be_had_are_told(monkeypatch, take):
     def offline(progress, tell):
         raise AssetError("pip could not fetch mediapipe 0.10.21")
 
-    monkeypatch.setattr(detecting, "_networks", offline)
+    monkeypatch.setattr(detecting, "networks", offline)
     with pytest.raises(AssetError, match="mediapipe"):
         ensure_detections(read_take(take))
     assert not take.with_name("take-detect").exists()

@@ -117,6 +117,22 @@ class Sensors:
         """Those of one's own, in the order of their names."""
         return tuple(self._sensors[name] for name in sorted(self._own))
 
+    def set_sigma(self, name: str, sigma: float) -> None:
+        """Another standard deviation from the next frame on: [px] of a camera's keypoints, [m] of depth and markers.
+
+        Raises
+        ------
+        ObservationError
+            No positive number; a sensor of one's own, which has its own.
+        """
+        if not is_number(sigma) or not 0.0 < sigma < np.inf or isinstance(sigma, bool):
+            raise ObservationError(f"a standard deviation of {sigma} of '{name}'", remedy="Give a positive number.")
+        if name in self._own:
+            raise ObservationError(f"'{name}' is a sensor of one's own", remedy="Change it where it was made.")
+        self.sigma[name] = float(sigma)
+        for made in (KEYPOINTS, name):  # is made anew; what a camera learnt of its background stays
+            self._sensors.pop(made, None)
+
     def learnt(self) -> list[dict[str, Any]]:
         """What sensors of one's own have learnt so far; see `unlearn`."""
         return [dict(vars(sensor)) for sensor in self.own]

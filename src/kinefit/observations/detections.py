@@ -141,12 +141,19 @@ class Detections:
             )
         points, lifted = self.points, self.lifted
         if image_frame is not None:
-            points = image_frame.to_calibration(self.points)
-            if lifted is not None:
-                axes = image_frame.to_calibration(np.eye(2)) - image_frame.to_calibration(np.zeros((1, 2)))
-                axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-                lifted = np.concatenate([lifted[..., :2] @ axes, lifted[..., 2:]], axis=-1)
+            points, lifted = in_calibration(points, lifted, image_frame)
         return Keypoints(
             camera or self.camera, "MEDIAPIPE_33", MEDIAPIPE_33, self.rate, points, self.confidence,
             time_offset=time_offset, source=self.source, lifted=lifted,
         )
+
+
+def in_calibration(
+    points: NDArray, lifted: NDArray | None, image_frame: ImageFrame
+) -> tuple[NDArray, NDArray | None]:
+    """Landmarks (..., 2) [px] and those lifted (..., 3) [m] of a video's image, in the calibration's image frame."""
+    if lifted is not None:
+        axes = image_frame.to_calibration(np.eye(2)) - image_frame.to_calibration(np.zeros((1, 2)))
+        axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        lifted = np.concatenate([lifted[..., :2] @ axes, lifted[..., 2:]], axis=-1)
+    return image_frame.to_calibration(points), lifted

@@ -107,7 +107,7 @@ def detect(
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks, job.seconds)]
     if not todo:
         return []
-    folder = _networks(progress, tell)
+    folder = networks(progress, tell)
     number, outlines = people or PEOPLE, True if masks is None else masks
     stop, lock = threading.Event(), threading.Lock()
 
@@ -161,14 +161,14 @@ class _Stopped(Exception):
 
 
 def _look_through(
-    job: Job, networks: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None], threads: int
+    job: Job, folder: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None], threads: int
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detection import detect_people
     from kinefit.images.models import Models
     from kinefit.readers.video import Video
 
-    models = Models(networks, threads)
+    models = Models(folder, threads)
     with Video(job.video, rate=job.rate) as video:
         first, last = 0, len(video)
         if job.seconds is not None:
@@ -188,7 +188,7 @@ def _look_through(
     write_detections(found, job.file, key=key)
 
 
-def _networks(progress: Step | None, tell: Tell) -> Path:
+def networks(progress: Step | None, tell: Tell) -> Path:
     """Folder with the networks; their licence is shown when they are fetched."""
     from kinefit.assets import MODELS_CREDIT, detector_models
     from kinefit.images.models import check_runtime

@@ -122,6 +122,20 @@ class _Frames:
         )  # fmt: skip
 
 
+def tracker_of(
+    recording: Recording, body: Body, settings: TrackSettings, *, values: Any = None
+) -> Tracker:
+    """A tracker for all sensors of a recording, which knows what it states of them; arguments as of `run`."""
+    sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
+    tracker = Tracker(
+        body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis,
+        on_body=recording.on_body, settings=settings, sensors=deepcopy(recording.sensors), values=values,
+    )  # fmt: skip
+    for name, depth in recording.backgrounds.items():
+        tracker.know_background(name, depth)
+    return tracker
+
+
 def run(
     recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *,
     start: Any = None, values: Any = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
@@ -140,13 +154,7 @@ def run(
     TrackingError
         The body is found in none of the first steps.
     """
-    sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
-    tracker = Tracker(
-        body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis, on_body=recording.on_body,
-        settings=settings, sensors=deepcopy(recording.sensors), values=values,
-    )  # fmt: skip
-    for name, depth in recording.backgrounds.items():
-        tracker.know_background(name, depth)
+    tracker = tracker_of(recording, body, settings, values=values)
     layout, times, begin = Layout(channels, body), recording.times, 0
     if start is not None:
         begin, state = start

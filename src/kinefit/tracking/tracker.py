@@ -133,6 +133,16 @@ class Tracker:
         """
         self.sensors.know_background(sensor, depth)
 
+    def set_sigma(self, sensor: str, sigma: float) -> None:
+        """Another standard deviation of a sensor from the next frame on: [px] of keypoints, [m] of depth and markers.
+
+        Raises
+        ------
+        ObservationError
+            No positive number, or a sensor of one's own.
+        """
+        self.sensors.set_sigma(sensor, sigma)
+
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown."""
         of_kind(state, BodyState, "the state", "Give one as body.usual_state(T_world_root), or of a Motion.")

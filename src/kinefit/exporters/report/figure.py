@@ -26,7 +26,7 @@ _DEEP = 0.35  # [m] how far a camera's pyramid reaches
 def figure(motion: Motion, rig: Rig | None = None) -> Html:
     """The body as it moves, with the cameras of a rig; the floor lies under the lowest foot."""
     R = rotation_between_up(motion.up, "z")
-    points, ends, radii, owners, colours = _capsules(motion)
+    points, ends, radii, owners, colours = _capsules(motion.body)
     step = max(1, round(motion.rate / RATE), -(-len(motion) // MOST))
     frames = np.arange(0, len(motion), step)
     T = se3.transform(R, np.zeros(3))
@@ -38,6 +38,15 @@ def figure(motion: Motion, rig: Rig | None = None) -> Html:
         x, ends, radii, rate=motion.rate / step, start=float(motion.times[0]), colours=colours, floor=floor,
         cameras=cameras, dimmed=lost,
     )  # fmt: skip
+
+
+def live_figure(body: Body) -> tuple[Html, PointSet]:
+    """A figure that a page moves by `move(points, lost)`, at rest; and its capsules' ends on the body, two by two."""
+    points, ends, radii, _, colours = _capsules(body)
+    T = se3.transform(rotation_between_up("y", "z"), np.zeros(3))
+    x = body.trajectories(T[None], body.rest_state().angles[None], points)
+    floor = float((x[0, :, 2] - _reach(ends, radii, len(points))).min())
+    return player(x, ends, radii, rate=1.0, colours=colours, floor=floor), points
 
 
 def player(
@@ -83,17 +92,17 @@ def _packed(array: NDArray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def _capsules(motion: Motion) -> tuple[PointSet, NDArray, NDArray, NDArray, list[str]]:
+def _capsules(body: Body) -> tuple[PointSet, NDArray, NDArray, NDArray, list[str]]:
     """Points, ends (C, 2), radii (C, 2), owners (C,) and colours (C,) of a body's surfaces, or of its bones."""
-    tree = motion.body.tree
-    limbs = [limb for c in motion.body.surfaces for limb in _limbs(c, motion.body)]
+    tree = body.tree
+    limbs = [limb for c in body.surfaces for limb in _limbs(c, body)]
     if limbs:
         segments = np.repeat([segment for segment, _, _ in limbs], 2)
         tips = np.concatenate([both for _, both, _ in limbs])
         radii = np.array([r for _, _, r in limbs])
         points = PointSet(tuple(f"{k}" for k in range(len(tips))), segments, tips)
     else:
-        points, _, _ = bones(motion.body)
+        points, _, _ = bones(body)
         radii = np.full((len(points) // 2, 2), _BONE)
     owners = np.asarray(points.segments)[::2]
     colours = ["#%02x%02x%02x" % side_colour(tree.segments[s]) for s in owners]  # noqa: UP031

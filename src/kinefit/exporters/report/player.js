@@ -4,12 +4,13 @@ document.querySelectorAll(".player").forEach(place => {
   const data = JSON.parse(place.querySelector("script").textContent);
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
   const x = new Int16Array(bytes(data.x).buffer), dim = data.dimmed ? bytes(data.dimmed) : null;
-  const { frames, points, quantum, middle, low, high, floor, ends, radii, colours, cameras } = data;
+  const { frames, points, quantum, middle, ends, radii, colours, cameras } = data;
+  let { low, high, floor } = data;
   const last = frames - 1, duration = last / data.rate;
   const size = Math.hypot(...high.map((h, i) => h - low[i])), tall = high[2] - low[2];
   const home = { turn: 0.7, tilt: 0.22, zoom: 1 };
   const view = { ...home, follow: size > 2.2 * tall, cameras: false };
-  let at = 0, playing = false, speed = 1, before = 0;
+  let at = 0, playing = false, speed = 1, before = 0, moved = null;  // moved: points and lost ones of a live figure
 
   const make = (tag, parent, fields = {}) => parent.appendChild(Object.assign(document.createElement(tag), fields));
   const canvas = make("canvas", place), pen = canvas.getContext("2d");
@@ -32,6 +33,7 @@ document.querySelectorAll(".player").forEach(place => {
 
   // Points of the time `at`, in frames: straight between two frames.
   function pose() {
+    if (moved) return moved.points;
     const a = Math.min(Math.floor(at), last), b = Math.min(a + 1, last), s = at - a, out = [];
     for (let p = 0; p < points; p++) {
       const i = 3 * (a * points + p), j = 3 * (b * points + p);
@@ -78,7 +80,7 @@ document.querySelectorAll(".player").forEach(place => {
     ends.forEach(([i, j], k) => {
       const P = project(now[i]), Q = project(now[j]), bit = a * ends.length + k;
       parts.push([Math.max(P[3], Q[3]) + Math.min(P[3], Q[3]), () => capsule(P, Q, radii[k], colours[k],
-        dim && dim[bit >> 3] >> (7 - bit % 8) & 1)]);
+        moved ? moved.lost[k] : dim && dim[bit >> 3] >> (7 - bit % 8) & 1)]);
     });
     if (view.cameras) for (const camera of cameras) {
       const q = camera.points.map(project);
@@ -86,7 +88,7 @@ document.querySelectorAll(".player").forEach(place => {
     }
     parts.sort((p, q) => q[0] - p[0]).forEach(part => part[1]());
     slider.value = at;
-    told.textContent = `${(data.start + at / data.rate).toFixed(2)} s`;
+    if (!moved) told.textContent = `${(data.start + at / data.rate).toFixed(2)} s`;
   }
   function grid(project, c, far) {
     const wide = view.cameras ? 2 * extent() : size, step = wide > 12 ? 2 : wide > 5 ? 1 : 0.5;
@@ -149,6 +151,14 @@ document.querySelectorAll(".player").forEach(place => {
   document.addEventListener("seek", event => {
     run(false); at = Math.min(Math.max((event.detail - data.start) * data.rate, 0), last); draw();
   });
+  place.move = (points, lost) => {
+    const first = !moved, lowest = Math.min(...points.map((p, i) => p[2] - radii[i >> 1][i % 2]));
+    moved = { points, lost };
+    [low, high] = [Math.min, Math.max].map(most => [0, 1, 2].map(k => most(...points.map(p => p[k]))));
+    floor = first ? lowest : Math.min(floor, lowest);
+    if (first) Object.assign(view, { turn: heading() + 0.6, follow: true });
+    draw();
+  };
   const fingers = new Map();
   canvas.addEventListener("pointerdown", e => { fingers.set(e.pointerId, [e.clientX, e.clientY]); canvas.setPointerCapture(e.pointerId); });
   canvas.addEventListener("pointermove", e => {

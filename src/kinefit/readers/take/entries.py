@@ -68,6 +68,7 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
 
     name: str
     video: Path | None = None
+    stream: str | None = None  # of `kinefit live`: a webcam's number, an address, or a folder that fills up
     size: tuple[int, int] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
     rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise

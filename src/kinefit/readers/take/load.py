@@ -124,7 +124,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     FileError
         A file that is damaged.
     """
-    rig = _read_rig(take, exteriors)
+    rig = read_rig(take, exteriors)
     rates: dict[str, float] = {"take": take.rate} if take.rate else {}
     lengths: dict[str, int] = {}
     offsets: dict[str, float] = {}
@@ -138,7 +138,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     if is_alone(take):
         entry = take.cameras[0]
         rig = Rig((assumed_camera(entry, sizes.get(entry.name, entry.size), take),))
-    images = {entry.name: _image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
+    images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
         keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
@@ -200,7 +200,8 @@ def _check_times(
             )  # fmt: skip
 
 
-def _read_rig(take: Take, exteriors: bool) -> Rig | None:
+def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
+    """The calibrated cameras that a take names; None where it has no calibration, or no cameras."""
     if take.calibration is None or not (take.cameras or take.depth):
         return None
     rig = read_calibration(take.calibration.file, unit=take.calibration.unit, exteriors=exteriors)
@@ -214,7 +215,7 @@ def _read_rig(take: Take, exteriors: bool) -> Rig | None:
     return rig.select(tuple(dict.fromkeys(names)))
 
 
-def _image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
+def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
     """How the image of a camera relates to the calibration's; an error proposes the line to write."""
     assert rig is not None
     if video_size and entry.size and entry.size != video_size:

@@ -1,0 +1,138 @@
+"""`kinefit live`: poses while they happen, to whoever listens."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from kinefit.live.session import LiveSession, Receiver
+
+_EXAMPLES = """\b
+Examples:
+  kinefit live take.toml                       a recorded take, replayed at its own speed
+  kinefit live studio.toml --vmc localhost:39539      cameras with streams; an avatar moves
+  kinefit live studio.toml --lsl kinefit --out session1
+  kinefit live take.toml --json - --no-page | my_program
+"""
+
+
+def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, int] | None:
+    """Host and port of "HOST:PORT"."""
+    if value is None:
+        return None
+    host, _, port = value.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise click.BadParameter(f"{value!r} is no HOST:PORT, such as localhost:39539")
+    return host.strip("[]"), int(port)
+
+
+@click.command(short_help="Follow a person live, and stream the poses.", epilog=_EXAMPLES)
+@click.argument("take", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of the session.  [default: TAKE-live]")
+@click.option("--page/--no-page", default=True, show_default=True, help="Serve the page and poses by WebSocket.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Of both; 0 for any.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 for all networks.")
+@click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC.")
+@click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`).")
+@click.option("--json", "lines", metavar="FILE", help="Write every packet as a line; - for the standard output.")
+@click.option(
+    "--speed", type=click.FloatRange(0.0), default=1.0, show_default=True,
+    help="Of a replayed take; 0 as fast as it can be followed, and no frame is dropped.",
+)
+@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="End after so long; default: Ctrl-C.")
+@click.option("--record/--no-record", default=True, show_default=True, help="Leave the motion in the folder.")
+@_screen.verbose_option
+def live(
+    take: Path, out: Path | None, page: bool, port: int, host: str, vmc: tuple[str, int] | None, lsl: str | None,
+    lines: str | None, speed: float, seconds: float | None, record: bool, verbose: bool,
+) -> None:
+    """Follow a person live, and stream the poses.
+
+    TAKE is a take file. Where its cameras have a `stream` (a webcam's number, an address such as rtsp://..., a folder
+    that fills up), they are followed as they see; else what the take recorded is replayed at its own speed. Frames that
+    come faster than they can be followed are dropped and counted, never queued.
+
+    The page at http://localhost:8765 shows the person, and programs get the poses there by WebSocket; docs/live.md has
+    the protocol. The session is left as a motion in the folder: `kinefit export` and `kinefit view` take it.
+    """
+    from kinefit.live.record import MotionRecord
+    from kinefit.live.take import folder_of, live_session
+    from kinefit.readers.take.file import read_take
+    from kinefit.simulation.warm import warm_depth, warm_keypoints
+
+    told = read_take(take)
+    quiet = lines == "-"
+    receivers: list[Receiver] = []
+    session: LiveSession = live_session(told, speed=speed, tell=lambda text: _screen.note(text))
+    try:
+        rate, up = session.tracker.rate, told.up
+        if lines is not None:
+            from kinefit.live.receivers.lines import JsonLines
+
+            receivers.append(JsonLines(lines))
+        if vmc is not None:
+            from kinefit.live.receivers.vmc import Vmc
+
+            receivers.append(Vmc(*vmc, up=up))
+        if lsl is not None:
+            from kinefit.live.receivers.lsl import Lsl
+
+            receivers.append(Lsl(lsl, rate=rate))
+        if page:
+            from kinefit.live.receivers.websocket import WebSockets
+
+            served = WebSockets(port, host=host, title=told.name, ask=session.ask)
+            receivers.append(served)
+            _screen.say(f"page and poses at {served.address}", stderr=quiet)
+        kept = MotionRecord(out or folder_of(told), rate=rate, up=up, name=told.name) if record else None
+        if kept is not None:
+            receivers.append(kept)
+    except BaseException:
+        for receiver in receivers:
+            receiver.close()
+        session.close()
+        raise
+    session.receivers = tuple(receivers)
+    warm_depth() if told.depth or told.stereo else warm_keypoints()
+    with _ctrl_c(session):
+        session.run(seconds)
+    _tell(session, kept, quiet)
+
+
+@contextmanager
+def _ctrl_c(session: LiveSession) -> Iterator[None]:
+    """Ctrl-C ends the session in order."""
+
+    def stop(*_: Any) -> None:
+        session.stop()
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _tell(session: LiveSession, kept: Any, quiet: bool) -> None:
+    """What became of it."""
+    dropped, came = sum(session.inbox.dropped.values()), sum(session.inbox.came.values())
+    steps = f"{session.processed} steps followed, {session.found} with the person found"
+    _screen.say(f"{steps}; {dropped} of {came} frames dropped", stderr=quiet)
+    if session.latencies:
+        ms = sorted(session.latencies)
+        told = f"{1000 * ms[len(ms) // 2]:.1f} ms, 99 % within {1000 * ms[int(0.99 * (len(ms) - 1))]:.1f} ms"
+        _screen.say(f"from frame to pose: median {told}", stderr=quiet)
+    if session.size is not None:
+        _screen.say(f"note: {session.size.told or 'the session was too short to find the size of the person'}",
+                    stderr=quiet)  # fmt: skip
+    if kept is not None:
+        path = "nothing was found, no motion is left" if kept.path is None else str(kept.path)
+        _screen.say(path, stderr=quiet)

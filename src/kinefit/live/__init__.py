@@ -1,0 +1,1 @@
+"""Live sessions: sources that bring frames as they are seen, a tracker, and receivers of its poses."""

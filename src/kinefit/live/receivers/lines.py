@@ -1,0 +1,50 @@
+"""Poses as JSON lines, into a file or to the standard output."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import BinaryIO
+
+from kinefit.bodies import Body
+from kinefit.errors import ExportError
+from kinefit.live.packets import Posed
+
+
+class JsonLines:
+    """Writes every packet as one line; "-" is the standard output.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._file: BinaryIO = sys.stdout.buffer if str(path) == "-" else open(self.path, "wb")
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise ExportError(problem, file=self.path, remedy="Name another file.") from error
+
+    def hello(self, body: Body, packet: bytes) -> None:
+        """One line."""
+        self._write(packet)
+
+    def pose(self, posed: Posed, packet: bytes) -> None:
+        """One line."""
+        self._write(packet)
+
+    def close(self) -> None:
+        """End the file."""
+        if self._file is not sys.stdout.buffer:
+            self._file.close()
+
+    def _write(self, packet: bytes) -> None:
+        try:
+            self._file.write(packet + b"\n")
+            self._file.flush()
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise ExportError(problem, file=self.path, remedy="Free some space, or name another file.") from error

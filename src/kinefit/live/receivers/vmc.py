@@ -1,0 +1,128 @@
+"""Virtual Motion Capture protocol: poses over OSC to avatars in Unity, Unreal, Blender and VRM programs.
+
+Bones are those of Unity's humanoid, resting as a T that faces z; the world is Unity's: left-handed, x right, y up, z
+forward. From kinefit's right-handed world with y up it comes by x -> -x, hence a quaternion (w, x, y, z) becomes
+(w, x, -y, -z). Source: VMC protocol specification 2.7 (addresses /VMC/Ext/OK, /T, /Root/Pos, /Bone/Pos).
+"""
+
+from __future__ import annotations
+
+import socket
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.bodies.joint_names import SIDES
+from kinefit.errors import BodyError, ExportError
+from kinefit.exporters.skeletons.rest import Rest, rest_pose
+from kinefit.geometry import se3
+from kinefit.live.packets import Posed
+from kinefit.live.receivers import osc
+from kinefit.motion import rotation_between_up
+
+_TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck", "head": "Head"}
+_SIDES = {
+    "clavicle": "Shoulder", "upperarm": "UpperArm", "forearm": "LowerArm", "hand": "Hand", "thigh": "UpperLeg",
+    "shank": "LowerLeg", "foot": "Foot", "toes": "Toes",
+}  # fmt: skip
+BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
+"""Segment -> bone of Unity's humanoid."""
+
+_MOST = 1400  # [bytes] of one packet on most networks
+
+
+class Vmc:
+    """Sends poses to a host and port.
+
+    Parameters
+    ----------
+    host, port : where the avatar listens; most programs at 39539
+    up : vertical axis of the session's world
+
+    Raises
+    ------
+    ExportError
+        A host that is not known.
+    BodyError
+        From `hello`: a body without pelvis.
+    """
+
+    def __init__(self, host: str, port: int, *, up: str) -> None:
+        self._to: Any
+        try:
+            family, _, _, _, self._to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except (OSError, UnicodeError) as error:
+            remedy = 'Give it as "192.168.1.5:39539".'
+            raise ExportError(f"the host '{host}:{port}' is not known", place="VMC", remedy=remedy) from error
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._turn = se3.transform(rotation_between_up(up, "y"), np.zeros(3))
+        self._rest: Rest | None = None
+        self._bones: list[tuple[int, int, str]] = []
+        self.unsent = 0
+
+    def hello(self, body: Body, packet: bytes) -> None:
+        """Another body: its bones, each with the next one above that is one."""
+        self._rest = rest_pose(body, "t", "kinefit", "VMC")
+        segments, parents = body.tree.segments, body.tree.parents
+        if "pelvis" not in segments:
+            raise BodyError(f"body '{body.name}' has no pelvis", place="VMC", remedy="Follow a person: humanoid.")
+        self._bones = []
+        for s, name in enumerate(segments):
+            above = int(parents[s])
+            while above >= 0 and segments[above] not in BONES:
+                above = int(parents[above])
+            if name in BONES:
+                self._bones.append((s, above, BONES[name]))
+
+    def pose(self, posed: Posed, packet: bytes) -> None:
+        """Send a pose; where the network is busy, it is left out and counted in `unsent`."""
+        if posed.result is None or self._rest is None:
+            self._send(osc.bundle([osc.message("/VMC/Ext/OK", 0)]))
+            return
+        for data in self.packets(posed.Ts_world_segment, posed.time):
+            self._send(data)
+
+    def packets(self, Ts_world_segment: NDArray, time: float) -> list[bytes]:
+        """OSC bundles of one pose, none larger than a network's packet."""
+        assert self._rest is not None
+        T = self._turn @ Ts_world_segment
+        R = T[:, :3, :3] @ self._rest.turns.swapaxes(-1, -2)
+        out: list[tuple[str | int | float, ...]] = [
+            ("/VMC/Ext/OK", 1), ("/VMC/Ext/T", float(time)),
+            ("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        ]  # fmt: skip
+        for s, above, bone in self._bones:
+            if above < 0:
+                place, turn = T[s, :3, 3], R[s]
+            else:
+                place, turn = R[above].T @ (T[s, :3, 3] - T[above, :3, 3]), R[above].T @ R[s]
+            w, x, y, z = se3.quaternion(turn)
+            px, py, pz = place
+            numbers = (-px, py, pz, x, -y, -z, w)
+            out.append(("/VMC/Ext/Bone/Pos", bone, *(float(v) for v in numbers)))
+        return _parts(out)
+
+    def close(self) -> None:
+        """End it."""
+        self._socket.close()
+
+    def _send(self, data: bytes) -> None:
+        try:
+            self._socket.sendto(data, self._to)
+        except OSError:
+            self.unsent += 1
+
+
+def _parts(messages: list[tuple[str | int | float, ...]]) -> list[bytes]:
+    out, part, size = [], list[bytes](), 0
+    for address, *values in messages:
+        one = osc.message(str(address), *values)
+        if part and size + len(one) + 4 > _MOST:
+            out.append(osc.bundle(part))
+            part, size = [], 0
+        part.append(one)
+        size += len(one) + 4
+    return [*out, osc.bundle(part)]

@@ -1,0 +1,215 @@
+"""A live session: what sources bring is fitted at once, and each pose goes to all receivers."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from kinefit.bodies import Body, load_body
+from kinefit.errors import KinefitError, ObservationError, choices
+from kinefit.frame.results import FrameResult
+from kinefit.live.detecting import LiveDetector
+from kinefit.live.inbox import Arrived, Inbox
+from kinefit.live.packets import Posed, hello
+from kinefit.live.people import LivePerson
+from kinefit.live.sizing import LiveSize
+from kinefit.observations import Keypoints
+from kinefit.tracking.session import axis_of
+from kinefit.tracking.tracker import Tracker
+
+_LATEST = 100_000  # steps whose latency is kept
+_WAIT = 0.25  # [s] at most between looks at what clients ask for
+
+
+class Source(Protocol):
+    """Brings frames in a thread of its own."""
+
+    sensors: tuple[str, ...]
+
+    def start(self, inbox: Inbox) -> None:
+        """Bring frames from now on."""
+
+    def stop(self) -> None:
+        """Bring nothing more."""
+
+
+class Receiver(Protocol):
+    """Takes poses, and must not keep the session waiting."""
+
+    def hello(self, body: Body, packet: bytes) -> None:
+        """The body that follows, with its packet."""
+
+    def pose(self, posed: Posed, packet: bytes) -> None:
+        """A pose, with its packet."""
+
+    def close(self) -> None:
+        """Nothing more comes."""
+
+
+class LiveSession:
+    """Follows one person in what sources bring.
+
+    Parameters
+    ----------
+    tracker : Tracker
+    sources : that bring frames
+    receivers : of poses
+    detector : of images, where sources bring any
+    person : who of all is followed; default: of whom most is seen
+    size : finds the person's lengths in the first seconds; None where they are known
+    name : str of the session
+
+    Attributes
+    ----------
+    inbox : Inbox
+    processed, found : int, steps, and those in which the person was found
+    latencies : [s] of the latest steps, from the arrival of the newest frame until all receivers had the pose
+    asked : queue of what clients ask for, see `ask`
+    """
+
+    def __init__(
+        self, tracker: Tracker, sources: Sequence[Source], receivers: Sequence[Receiver] = (), *,
+        detector: LiveDetector | None = None, person: LivePerson | None = None, size: LiveSize | None = None,
+        name: str = "live",
+    ) -> None:  # fmt: skip
+        self.tracker, self.sources, self.receivers = tracker, tuple(sources), tuple(receivers)
+        self.detector, self.size, self.name = detector, size, name
+        self.person = person or LivePerson(tracker.rig)
+        self.sensors = tuple(sensor for source in self.sources for sensor in source.sensors)
+        self.inbox = Inbox(self.sensors, patience=0.5 / tracker.rate)
+        self.processed = self.found = 0
+        self.latencies: deque[float] = deque(maxlen=_LATEST)
+        self.asked: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self._off: set[str] = set()
+        self._over = False
+
+    def stop(self) -> None:
+        """End the session after the step that is being fitted."""
+        self._over = True
+
+    def run(self, seconds: float | None = None) -> None:
+        """Until the sources end, `stop`, or so many seconds are over.
+
+        Raises
+        ------
+        KinefitError
+            A source that cannot go on, or frames that do not belong to the body or its cameras.
+        """
+        until = None if seconds is None else time.monotonic() + seconds
+        self._hello()
+        for source in self.sources:
+            source.start(self.inbox)
+        try:
+            while not (self._over or self.inbox.over) and (until is None or time.monotonic() < until):
+                arrived = self.inbox.take(_WAIT)
+                self._listen()
+                if arrived:
+                    self.step(arrived)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """End sources and receivers."""
+        self.inbox.close()
+        for source in self.sources:
+            source.stop()
+        if self.size is not None:
+            self.size.close()
+        if self.detector is not None:
+            self.detector.close()
+        for receiver in self.receivers:
+            receiver.close()
+
+    def step(self, arrived: Sequence[Arrived]) -> FrameResult | None:
+        """Fit what arrived, and tell receivers."""
+        frames = self._frames(arrived)
+        result = None
+        if frames:
+            result = self.tracker.update(frames, float(np.mean([f.time for f in frames])))
+        at = max(one.at for one in arrived)
+        now = result.time if result is not None else max(one.time for one in arrived)
+        poses = np.zeros((0, 4, 4))
+        if result is not None:
+            state = result.state
+            poses = self.tracker.body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
+        posed = Posed(
+            self.processed, self.tracker.body, result, poses, now, time.monotonic() - at, self.inbox.dropped,
+            self.inbox.silent(),
+        )  # fmt: skip
+        self.processed, self.found = self.processed + 1, self.found + (result is not None)
+        packet = posed.to_json()
+        for receiver in self.receivers:
+            receiver.pose(posed, packet)
+        self.latencies.append(time.monotonic() - at)
+        if self.size is not None and (body := self.size.after(frames, result)) is not None:
+            self.change_body(body)
+        return result
+
+    def ask(self, wish: Mapping[str, Any]) -> None:
+        """Have something changed before the next step; from any thread.
+
+        {"sensor": name, "use": bool}: whether a sensor takes part; {"sensor": name, "sigma": value}: its standard
+        deviation [px, m]; {"body": name or path}: another body; {"stop": true}.
+        """
+        self.asked.put(wish)
+
+    def change_body(self, body: Body) -> None:
+        """Go on with another body."""
+        self.tracker.change_body(body)
+        self._hello()
+
+    def _hello(self) -> None:
+        t = self.tracker
+        packet = hello(t.body, name=self.name, rate=t.rate, up=axis_of(t.up), sensors=self.sensors)
+        for receiver in self.receivers:
+            receiver.hello(t.body, packet)
+
+    def _frames(self, arrived: Sequence[Arrived]) -> list[Any]:
+        """What the tracker takes of it: one person's."""
+        images = [one for one in arrived if isinstance(one.seen, np.ndarray) and one.sensor not in self._off]
+        records = self.detector(images) if self.detector is not None and images else []
+        frames: list[Any] = []
+        for one in arrived:
+            for seen in one.seen if isinstance(one.seen, list) else ():
+                if isinstance(seen, Keypoints):
+                    records += [seen] if seen.camera not in self._off else []
+                elif seen.sensor not in self._off:
+                    frames.append(seen)
+        return frames + self.person.frames(records, self.tracker.body, self.tracker.state)
+
+    def _listen(self) -> None:
+        """Do what clients asked for; what cannot be done is told to them alone."""
+        while not self.asked.empty():
+            wish = dict(self.asked.get())
+            answer = wish.pop("answer", None)
+            try:
+                self._fulfil(wish)
+                told = {"type": "done", "asked": wish}
+            except KinefitError as error:
+                told = {"type": "refused", "asked": wish, "why": str(error)}
+            if answer is not None:
+                answer(told)
+
+    def _fulfil(self, wish: Mapping[str, Any]) -> None:
+        if wish.get("stop") is True:
+            self.stop()
+        elif isinstance(wish.get("body"), str):
+            self.change_body(load_body(wish["body"]))
+        elif isinstance(wish.get("sensor"), str):
+            name, known = wish["sensor"], sorted({*self.sensors, *self.tracker.rig.names} - {"replay"})
+            if name not in known:
+                raise ObservationError(choices("sensor", name, known))
+            if isinstance(wish.get("use"), bool):
+                (self._off.discard if wish["use"] else self._off.add)(name)
+            elif "sigma" in wish:
+                self.tracker.set_sigma(name, wish["sigma"])
+            else:
+                raise ObservationError(f"nothing to change of {name}", remedy='Give "use" or "sigma".')
+        else:
+            remedy = 'Ask for {"sensor": ..., "use" or "sigma": ...}, {"body": ...} or {"stop": true}.'
+            raise ObservationError(f"{sorted(wish)} is nothing that can be asked for", remedy=remedy)
