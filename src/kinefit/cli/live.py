@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit.cli import _screen
+from kinefit.errors import command
 
 if TYPE_CHECKING:
     from kinefit.live.session import LiveSession, Receiver
@@ -48,7 +49,9 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
     help="Of a replayed take; 0 as fast as it can be followed, and no frame is dropped.",
 )
 @click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="End after so long; default: Ctrl-C.")
-@click.option("--record/--no-record", default=True, show_default=True, help="Leave the motion in the folder.")
+@click.option(
+    "--record/--no-record", default=True, show_default=True, help="Leave motion and a take in the folder."
+)
 @_screen.verbose_option
 def live(
     take: Path, out: Path | None, page: bool, port: int, host: str, vmc: tuple[str, int] | None, lsl: str | None,
@@ -61,7 +64,8 @@ def live(
     come faster than they can be followed are dropped and counted, never queued.
 
     The page at http://localhost:8765 shows the person, and programs get the poses there by WebSocket; docs/live.md has
-    the protocol. The session is left as a motion in the folder: `kinefit export` and `kinefit view` take it.
+    the protocol. The session is left in the folder: as a motion for `kinefit export` and `kinefit view`, and, where the
+    built-in detector looked, as a take for `kinefit track`, which fits and smooths it as a whole.
     """
     from kinefit.live.record import MotionRecord
     from kinefit.live.take import folder_of, live_session
@@ -71,7 +75,8 @@ def live(
     told = read_take(take)
     quiet = lines == "-"
     receivers: list[Receiver] = []
-    session: LiveSession = live_session(told, speed=speed, tell=lambda text: _screen.note(text))
+    folder = (out or folder_of(told)) if record else None
+    session: LiveSession = live_session(told, speed=speed, folder=folder, tell=_screen.note)
     try:
         rate, up = session.tracker.rate, told.up
         if lines is not None:
@@ -92,7 +97,7 @@ def live(
             served = WebSockets(port, host=host, title=told.name, ask=session.ask)
             receivers.append(served)
             _screen.say(f"page and poses at {served.address}", stderr=quiet)
-        kept = MotionRecord(out or folder_of(told), rate=rate, up=up, name=told.name) if record else None
+        kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=told.name)
         if kept is not None:
             receivers.append(kept)
     except BaseException:
@@ -136,3 +141,5 @@ def _tell(session: LiveSession, kept: Any, quiet: bool) -> None:
     if kept is not None:
         path = "nothing was found, no motion is left" if kept.path is None else str(kept.path)
         _screen.say(path, stderr=quiet)
+    if session.seen is not None and session.seen.path is not None:
+        _screen.say(f"{session.seen.path}: {command('track', session.seen.path)} fits it as a whole", stderr=quiet)

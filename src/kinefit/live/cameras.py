@@ -43,6 +43,7 @@ class _Camera:
     def __init__(self, name: str, size: tuple[int, int], clock: Clock) -> None:
         self.name, self.size, self.clock = name, size, clock
         self.sensors: tuple[str, ...] = (name,)
+        self.patient = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -180,7 +181,7 @@ class VideoReplay(_Camera):
     ) -> None:  # fmt: skip
         self._video = Video(video, rate=rate)
         super().__init__(name, self._video.size, clock)
-        self.offset, self.speed = offset, speed
+        self.offset, self.speed, self.patient = offset, speed, not speed
         self.frames = frames or (0, len(self._video))
 
     @property

@@ -64,6 +64,8 @@ class Inbox:
                 return False
             if one.sensor in self._slots:
                 self.dropped[one.sensor] += 1
+            if not any(self.came.values()):  # to begin with, all are waited for
+                self._last = dict.fromkeys(self._last, one.at)
             self._slots[one.sensor], self._last[one.sensor] = one, one.at
             self.came[one.sensor] += 1
             self._changed.notify_all()
@@ -103,16 +105,15 @@ class Inbox:
         KinefitError
             With which a sensor ended.
         """
-        until = time.monotonic() + timeout
         with self._changed:
             self._changed.wait_for(lambda: self._slots or not self._open or self._error, max(timeout, 0.0))
             if self._error is not None:
                 raise self._error
             if self._slots:
                 first = min(one.at for one in self._slots.values())
-                until = min(max(first + self.patience, time.monotonic()), until)
-            while self._slots and self._awaited() and (left := until - time.monotonic()) > 0.0:
-                self._changed.wait(left)
+                until = max(first + self.patience, time.monotonic())
+                while self._awaited() and (left := until - time.monotonic()) > 0.0:
+                    self._changed.wait(left)
             out = list(self._slots.values())
             self._slots.clear()
             self._changed.notify_all()
@@ -120,5 +121,6 @@ class Inbox:
 
     def _awaited(self) -> bool:
         now = time.monotonic()
-        lively = (name for name in self._open if now - self._last[name] <= SILENT)
+        long = max(SILENT, self.patience)
+        lively = (name for name in self._open if now - self._last[name] <= long)
         return any(name not in self._slots for name in lively)

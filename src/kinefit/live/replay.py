@@ -29,6 +29,7 @@ class Replay:
     def __init__(self, recording: Recording, keypoints: Sequence[Keypoints], *, speed: float = 1.0) -> None:
         self.recording, self.keypoints, self.speed = recording, tuple(keypoints), speed
         self.sensors: tuple[str, ...] = (REPLAY,)
+        self.patient = not speed
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 

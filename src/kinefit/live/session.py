@@ -10,19 +10,22 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from kinefit.bodies import Body, load_body
-from kinefit.errors import KinefitError, ObservationError, choices
+from kinefit.bodies import Body, catalogue, load_body
+from kinefit.errors import BodyError, KinefitError, ObservationError, choices
 from kinefit.frame.results import FrameResult
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.inbox import Arrived, Inbox
 from kinefit.live.packets import Posed, hello
 from kinefit.live.people import LivePerson
+from kinefit.live.replay import REPLAY
+from kinefit.live.seen import SeenRecord
 from kinefit.live.sizing import LiveSize
 from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker
 
 _LATEST = 100_000  # steps whose latency is kept
+_PATIENT = 10.0  # [s] for which the other sensors are waited for, where none may be dropped
 _WAIT = 0.25  # [s] at most between looks at what clients ask for
 
 
@@ -30,6 +33,7 @@ class Source(Protocol):
     """Brings frames in a thread of its own."""
 
     sensors: tuple[str, ...]
+    patient: bool  # whether it waits until its frames are taken, so that none is dropped
 
     def start(self, inbox: Inbox) -> None:
         """Bring frames from now on."""
@@ -62,6 +66,7 @@ class LiveSession:
     detector : of images, where sources bring any
     person : who of all is followed; default: of whom most is seen
     size : finds the person's lengths in the first seconds; None where they are known
+    seen : keeps what cameras saw of the person
     name : str of the session
 
     Attributes
@@ -75,18 +80,24 @@ class LiveSession:
     def __init__(
         self, tracker: Tracker, sources: Sequence[Source], receivers: Sequence[Receiver] = (), *,
         detector: LiveDetector | None = None, person: LivePerson | None = None, size: LiveSize | None = None,
-        name: str = "live",
+        seen: SeenRecord | None = None, name: str = "live",
     ) -> None:  # fmt: skip
         self.tracker, self.sources, self.receivers = tracker, tuple(sources), tuple(receivers)
-        self.detector, self.size, self.name = detector, size, name
+        self.detector, self.size, self.seen, self.name = detector, size, seen, name
         self.person = person or LivePerson(tracker.rig)
         self.sensors = tuple(sensor for source in self.sources for sensor in source.sensors)
-        self.inbox = Inbox(self.sensors, patience=0.5 / tracker.rate)
+        patience = _PATIENT if any(source.patient for source in self.sources) else 0.5 / tracker.rate
+        self.inbox = Inbox(self.sensors, patience=patience)
         self.processed = self.found = 0
         self.latencies: deque[float] = deque(maxlen=_LATEST)
         self.asked: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
         self._off: set[str] = set()
         self._over = False
+
+    @property
+    def names(self) -> list[str]:
+        """Sensors that a client may leave out or weigh: cameras, and what else sources bring by name."""
+        return sorted({*self.sensors, *self.tracker.rig.names} - {REPLAY})
 
     def stop(self) -> None:
         """End the session after the step that is being fitted."""
@@ -124,11 +135,15 @@ class LiveSession:
             self.detector.close()
         for receiver in self.receivers:
             receiver.close()
+        if self.seen is not None:
+            self.seen.close()
 
     def step(self, arrived: Sequence[Arrived]) -> FrameResult | None:
         """Fit what arrived, and tell receivers."""
         frames = self._frames(arrived)
         result = None
+        if self.seen is not None:
+            self.seen.keep(frames)
         if frames:
             result = self.tracker.update(frames, float(np.mean([f.time for f in frames])))
         at = max(one.at for one in arrived)
@@ -154,7 +169,7 @@ class LiveSession:
         """Have something changed before the next step; from any thread.
 
         {"sensor": name, "use": bool}: whether a sensor takes part; {"sensor": name, "sigma": value}: its standard
-        deviation [px, m]; {"body": name or path}: another body; {"stop": true}.
+        deviation [px, m]; {"body": name}: another body of the catalogue; {"stop": true}.
         """
         self.asked.put(wish)
 
@@ -165,7 +180,7 @@ class LiveSession:
 
     def _hello(self) -> None:
         t = self.tracker
-        packet = hello(t.body, name=self.name, rate=t.rate, up=axis_of(t.up), sensors=self.sensors)
+        packet = hello(t.body, name=self.name, rate=t.rate, up=axis_of(t.up), sensors=self.names)
         for receiver in self.receivers:
             receiver.hello(t.body, packet)
 
@@ -199,9 +214,11 @@ class LiveSession:
         if wish.get("stop") is True:
             self.stop()
         elif isinstance(wish.get("body"), str):
+            if wish["body"] not in catalogue():  # no file of this computer
+                raise BodyError(choices("body of the catalogue", wish["body"], catalogue()))
             self.change_body(load_body(wish["body"]))
         elif isinstance(wish.get("sensor"), str):
-            name, known = wish["sensor"], sorted({*self.sensors, *self.tracker.rig.names} - {"replay"})
+            name, known = wish["sensor"], self.names
             if name not in known:
                 raise ObservationError(choices("sensor", name, known))
             if isinstance(wish.get("use"), bool):

@@ -17,9 +17,10 @@ from kinefit.live.cameras import CameraStream, Clock, FolderStream, VideoReplay
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.people import LivePerson
 from kinefit.live.replay import Replay
+from kinefit.live.seen import SeenRecord
 from kinefit.live.session import LiveSession, Receiver, Source
 from kinefit.live.sizing import LiveSize
-from kinefit.preparing.detecting import Tell, networks
+from kinefit.preparing.detecting import Tell, hush, networks
 from kinefit.preparing.take import warn
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
@@ -45,7 +46,8 @@ class _Opened:
 
 
 def live_session(
-    take: Take, receivers: Sequence[Receiver] = (), *, speed: float = 1.0, threads: int | None = None, tell: Tell = warn
+    take: Take, receivers: Sequence[Receiver] = (), *, speed: float = 1.0, threads: int | None = None,
+    folder: Path | None = None, tell: Tell = warn,
 ) -> LiveSession:
     """A session of a take: live where its cameras have a `stream`, else what it recorded at its own speed.
 
@@ -56,6 +58,7 @@ def live_session(
     receivers : of the poses
     speed : of a replay; 0 as fast as it can be followed, and no frame is dropped
     threads : of the detector; default: all cores
+    folder : where what the detector saw of the person is left as a take; None for nowhere
     tell : called with what is worth saying
 
     Raises
@@ -87,9 +90,12 @@ def live_session(
     size = None if sized or not (streams or opened.detector or take.keypoints) else LiveSize(
         body, recording.rig, rate=recording.rate, sigma=sigma, settings=settings, height=take.height, up=take.up
     )  # fmt: skip
+    seen = None
+    if folder is not None and opened.detector is not None:
+        seen = SeenRecord(folder, take, recording.rig, rate=recording.rate, alone=is_alone(take))
     return LiveSession(
         tracker, opened.sources, receivers, detector=opened.detector, person=LivePerson(recording.rig, take.person),
-        size=size, name=take.name,
+        size=size, seen=seen, name=take.name,
     )  # fmt: skip
 
 
@@ -163,7 +169,9 @@ def _with_detector(
         if entry.name in sizes:
             images[entry.name] = image_frame(entry, rig, sizes[entry.name], take)
     people = 1 if take.person is None else 3
-    detector = LiveDetector(networks(None, tell), images, rate=rate, people=people, threads=threads)
+    folder = networks(None, tell)
+    hush(folder)
+    detector = LiveDetector(folder, images, rate=rate, people=people, threads=threads)
     sigma = dict.fromkeys(images, _SIGMA)
     recording = Recording(np.zeros(1), rate, rig, sigma=sigma, up=take.up, name=take.name)
     return _Opened(recording, body, tuple(sources), detector)

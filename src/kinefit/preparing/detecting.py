@@ -124,7 +124,7 @@ def detect(
         key = f"{keys[job]} {_settings(number, outlines, job.seconds)}"
         _look_through(job, folder, number, outlines, key, step, threads)
 
-    _hush(folder)
+    hush(folder)
     with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
         futures = [pool.submit(work, job) for job in todo]
         try:
@@ -254,7 +254,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _hush(networks: Path) -> None:
+def hush(networks: Path) -> None:
     """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
     from kinefit.images.models import Models
 

@@ -20,7 +20,6 @@
       if (body && body.body !== p.body) { location.reload(); return; }
       body = p; list.textContent = "";
       for (const name of p.sensors) {
-        if (name === "replay") continue;
         const label = list.appendChild(document.createElement("label"));
         const box = Object.assign(document.createElement("input"), { type: "checkbox", checked: true });
         box.onchange = () => socket.send(JSON.stringify({ sensor: name, use: box.checked }));
