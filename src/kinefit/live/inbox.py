@@ -89,7 +89,7 @@ class Inbox:
     def over(self) -> bool:
         """Whether nothing is there and nothing more can come."""
         with self._changed:
-            return not (self._open or self._slots)
+            return not (self._open or self._slots or self._error)
 
     def silent(self) -> list[str]:
         """Sensors that may still bring something and have brought nothing for a while."""

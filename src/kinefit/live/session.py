@@ -24,7 +24,7 @@ from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker
 
-_LATEST = 100_000  # steps whose latency is kept
+_LATEST = 10_000  # steps whose latency is kept
 _PATIENT = 10.0  # [s] for which the other sensors are waited for, where none may be dropped
 _WAIT = 0.25  # [s] at most between looks at what clients ask for
 

@@ -8,12 +8,15 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import Any
 
+import numpy as np
+
 from kinefit.bodies import Body
 from kinefit.errors import KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
-from kinefit.observations import KeypointFrame, LiftedFrame
+from kinefit.observations import KeypointFrame, Keypoints, LiftedFrame
 from kinefit.sensors.settings import TrackSettings
+from kinefit.simulation.warm import warm_keypoints
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.sizing import channels_of, fitted_to_person
 
@@ -27,7 +30,6 @@ class LiveSize:
     ----------
     body : Body, generic
     rig : Rig
-    rate : float [Hz]
     sigma : {camera: float} [px]
     settings : TrackSettings
     height : float [m] of the person, where it is known
@@ -39,11 +41,11 @@ class LiveSize:
     """
 
     def __init__(
-        self, body: Body, rig: Rig, *, rate: float, sigma: dict[str, float], settings: TrackSettings,
+        self, body: Body, rig: Rig, *, sigma: dict[str, float], settings: TrackSettings,
         height: float | None = None, up: str = "z",
     ) -> None:  # fmt: skip
         self._task: dict[str, Any] = {
-            "body": body, "rig": rig, "rate": rate, "sigma": sigma, "settings": settings, "height": height, "up": up,
+            "body": body, "rig": rig, "sigma": sigma, "settings": settings, "height": height, "up": up,
         }  # fmt: skip
         self._steps: list[list[Any]] = []
         self._next = -float("inf")
@@ -61,8 +63,11 @@ class LiveSize:
         if seen and result is not None and result.support > _SEEN and result.time >= self._next:
             self._steps.append(seen)
             self._next = result.time + _BETWEEN
+            if self._pool is None:  # its start takes seconds, and is over when the steps are there
+                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+                self._pool.submit(warm_keypoints)
         if len(self._steps) == _STEPS:
-            self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+            assert self._pool is not None
             self._future = self._pool.submit(fitted_body, self._steps, **self._task)
             self._steps = []
         return None
@@ -91,15 +96,35 @@ class LiveSize:
 
 
 def fitted_body(
-    steps: Sequence[Sequence[Any]], *, body: Body, rig: Rig, rate: float, sigma: dict[str, float],
+    steps: Sequence[Sequence[Any]], *, body: Body, rig: Rig, sigma: dict[str, float],
     settings: TrackSettings, height: float | None, up: str,
 ) -> Body:  # fmt: skip
     """The body with the person's lengths, from keypoints of some steps."""
-    seen = {f.sensor for step in steps for f in step}
-    known = {name: value for name, value in sigma.items() if name in seen}
-    recording = Recording.of_frames(steps, rig, rate=1.0 / _BETWEEN, sigma=known, up=up)
+    records = _records(steps)
+    recording = Recording.of_keypoints(rig, records, accuracy=[sigma.get(k.camera, 8.0) for k in records], up=up)
     person = fitted_to_person(
         recording, body, channels_of(recording, body), settings, subject=None, trial=None, height=height, size=True,
         frames=None, progress=None,
     )  # fmt: skip
     return person.subject.body
+
+
+def _records(steps: Sequence[Sequence[Any]]) -> list[Keypoints]:
+    """Of each camera one record, a frame a step, with the points lifted to space where there are any."""
+    out = []
+    seen = {(f.sensor, f.keypoint_set, f.names) for step in steps for f in step if isinstance(f, KeypointFrame)}
+    for camera, keypoint_set, names in sorted(seen):
+        points = np.full((len(steps), 1, len(names), 2), np.nan)
+        confidence, lifted = np.zeros(points.shape[:3]), np.full((*points.shape[:3], 3), np.nan)
+        for i, step in enumerate(steps):
+            for f in step:
+                if (f.sensor, f.keypoint_set, f.names) == (camera, keypoint_set, names):
+                    if isinstance(f, KeypointFrame):
+                        points[i, 0], confidence[i, 0] = f.uv, f.confidence
+                    else:
+                        lifted[i, 0] = f.x
+        known = np.isfinite(lifted).any()
+        out.append(Keypoints(
+            camera, keypoint_set, names, 1.0 / _BETWEEN, points, confidence, lifted=lifted if known else None
+        ))  # fmt: skip
+    return out

@@ -88,7 +88,7 @@ def live_session(
     sized = trial is not None or take.start is not None or take.size is False
     sigma = {k: v for k, v in tracker.accuracy.items() if k in recording.rig.names}
     size = None if sized or not (streams or opened.detector or take.keypoints) else LiveSize(
-        body, recording.rig, rate=recording.rate, sigma=sigma, settings=settings, height=take.height, up=take.up
+        body, recording.rig, sigma=sigma, settings=settings, height=take.height, up=take.up
     )  # fmt: skip
     seen = None
     if folder is not None and opened.detector is not None:

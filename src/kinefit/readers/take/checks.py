@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.errors import FileError, ObservationError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices, command
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
 from kinefit.readers.depth.images import listed
@@ -46,6 +46,9 @@ def check_enough(take: Take) -> None:
     """
     others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
               take.surface_points)  # fmt: skip
+    if any(entry.stream is not None for entry in take.cameras) and not (take.keypoints or any(others)):
+        remedy = f"Follow them by {command('live', take.path)}, which leaves a take of what they saw."
+        raise TakeError("its cameras are streams, nothing is recorded", file=take.path, remedy=remedy)
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     lifted = not take.keypoints or any(entry.format == "detect" for entry in take.keypoints)
     if len(seeing) == 1 and not (lifted or any(others) or take.start or take.pose):
@@ -103,6 +106,8 @@ def _values(take: Take) -> None:
     for camera in take.cameras:
         if not abs(camera.time_offset) < 1e6 or (camera.size and not _is_size(camera.size)):
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
+        if camera.stream is not None and camera.video is not None:
+            refuse("a stream and a video", f"camera {camera.name}", "Leave one of both out.")
     for source in (*take.keypoints, *take.skin):
         place = f"keypoints of camera {source.camera}"
         sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS}.get(source.format, ("MEDIAPIPE_33",))

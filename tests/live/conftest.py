@@ -1,0 +1,54 @@
+"""A simulated person in front of four cameras, as a recording that sessions replay."""
+
+import pytest
+
+from kinefit.live.replay import Replay
+from kinefit.motion import UP_AXES
+from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.tracker import Tracker
+
+FRAMES = 30
+
+
+class Scene:
+    """What the tests replay, with truth."""
+
+    def __init__(self):
+        self.motion = cut(squat_and_wave(), 0, FRAMES)
+        self.rig = studio_rig(self.motion)
+        self.keypoints = simulate_keypoints(self.motion, self.rig, "BODY_25B")
+        self.recording = Recording.of_keypoints(self.rig, self.keypoints, up=self.motion.up)
+
+    def tracker(self):
+        return Tracker(self.motion.body, self.rig, rate=self.motion.rate, up=UP_AXES[self.motion.up])
+
+    def replay(self, speed=0.0):
+        return Replay(self.recording, self.keypoints, speed=speed)
+
+
+@pytest.fixture(scope="session")
+def scene():
+    return Scene()
+
+
+class Collected:
+    """A receiver that keeps what it gets."""
+
+    def __init__(self):
+        self.hellos, self.poses, self.packets, self.closed = [], [], [], False
+
+    def hello(self, body, packet):
+        self.hellos.append(packet)
+
+    def pose(self, posed, packet):
+        self.poses.append(posed)
+        self.packets.append(packet)
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def collected():
+    return Collected()
