@@ -1,7 +1,7 @@
 """Live sessions on the balancing trial, replayed at 30 frames a second: latency, an hour's memory and drift.
 
-Latency is from the arrival of a step until all receivers have its pose: a client of the page, an avatar, a file, the motion on
-disk. The trial is gone through forwards and backwards, so that the person never leaps; settings are the defaults.
+Latency is from the arrival of a step until all receivers have its pose: a client of the page, an avatar, a file, the
+motion on disk. The trial is gone through forwards and backwards, so that the person never leaps; settings are defaults.
 """
 
 from __future__ import annotations
