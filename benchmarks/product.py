@@ -8,6 +8,7 @@ PARTS = {
     "start": "how long a user waits: first and later starts, the whole track of the demo's recording",
     "long": "long takes: memory by length, going on after a kill, the page of an hour",
     "product_live": "live sessions of the balancing trial: latency, an hour's memory and drift",
+    "product_setups": "which sensor set-up is how exact, simulated: cameras by number, and sensors",
     "fuzz": "every reader on damaged files: a typed error or a valid result, soon and in little memory",
 }
 
