@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import click
 
+from kinefit.batch import results
 from kinefit.cli import _results, _screen
 from kinefit.errors import spelled
 from kinefit.readers.units import LENGTHS, worth
@@ -120,9 +121,9 @@ def export(
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
     (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
     recorded = read_motion(motion)
-    _results.write_format(recorded, format, out, **options)
+    results.write_format(recorded, format, out, **options)
     told = ", ".join(f"{key} {value}" for key, value in options.items())
-    _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+    _screen.say(f"{out}: {results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
 
 
 def _meant(key: str, value: str, valid: Sequence[str]) -> str:
