@@ -22,7 +22,8 @@ ROWS = (
         lost=0.2, ranges=(*knee(64.0, 40.0), Range("lumbar_extension", "", -5.0, 5.0, 10.0, 3.0, 1.0))),
     Row(take="c/take.toml", status=FAILED, error="it is, alas, broken"),
     Row(take="d/take.toml", person=2, subject="s2", folder="d/take-kinefit/person-2", frames=9, seconds=0.3,
-        quality=0.7, lost=0.0, ranges=(Range("knee_angle", "left"), Range("knee_angle", "right", 1.0, 2.0, 1.0, 0.5, 1.0))),
+        quality=0.7, lost=0.0,
+        ranges=(Range("knee_angle", "left"), Range("knee_angle", "right", 1.0, 2.0, 1.0, 0.5, 1.0))),
 )  # fmt: skip
 
 

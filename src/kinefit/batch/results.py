@@ -17,10 +17,11 @@ Step = Callable[[str, int, int], None]
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
+    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap",
 }  # fmt: skip
 """What each format is called in a folder of results."""
 
-USUAL = tuple(name for name in NAMES if name not in ("parquet", "c3d", "usd"))
+USUAL = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 """Formats that are written where none are named."""
 
 ABOUT = {
@@ -34,6 +35,9 @@ ABOUT = {
     "osim": "the fitted body for OpenSim",
     "c3d": "joint centres and landmarks for motion laboratories",
     "usd": "animated figure for film and simulation programs",
+    "x3d": "animated H-Anim figure for browsers and archives",
+    "nwb": "joint centres with confidence for neuroscience",
+    "mcap": "joint states and transforms for ROS 2",
     "overlays": "videos with the skeleton drawn on them",
     "montage": "one picture of all cameras",
     "report": "what came out and how far to trust it, on one page for a browser",
@@ -48,7 +52,8 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
     writers: dict[str, Callable[..., Any]] = {
         "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
         "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
-        "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot,
+        "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot, "x3d": exporters.write_x3d,
+        "nwb": exporters.write_nwb, "mcap": exporters.write_mcap,
         "osim": lambda motion, path: exporters.write_osim(motion.body, path),
     }  # fmt: skip
     writers[format](motion, path, **options)

@@ -25,10 +25,11 @@ class Freedom(NamedTuple):
 
 
 _UPS = ("x", "y", "z", "-x", "-y", "-z")
-_Y_UPS = ("y", *(up for up in _UPS if up != "y"))
+_Y_UPS, _Z_UPS = (tuple(sorted(_UPS, key=lambda up, first=first: up != first)) for first in "yz")
 _NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
 _RESTS = ("body", "t")
 _OF_BVH = ("bvh", *_NAMES[:-1])
+_OF_HANIM = ("hanim", *(name for name in _NAMES if name != "hanim"))
 _OPENSIM = "OpenSim's files are in metres, y up, under the names of the body's coordinates"
 
 FREEDOM = {
@@ -39,6 +40,9 @@ FREEDOM = {
     "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD knows y and z up"),
     "c3d": Freedom(("mm", "cm", "m"), _UPS, _NAMES),
     "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC holds landmarks, which bear the names of H-Anim"),
+    "x3d": Freedom((), (), _OF_HANIM, _RESTS, "X3D is in metres and y up by its standard"),
+    "nwb": Freedom((), _UPS, _NAMES, (), "NWB is in metres here"),
+    "mcap": Freedom((), _Z_UPS, _NAMES, (), "ROS is in metres"),
     "mot": Freedom(why=_OPENSIM),
     "osim": Freedom(why=_OPENSIM),
 }
@@ -58,7 +62,7 @@ Examples:
   kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
 
 \b
-Choices, the default first (csv, parquet and c3d keep the take's vertical axis; --names mixamo rests as t):
+Choices, the default first (csv, parquet, c3d and nwb keep the take's vertical axis; --names mixamo rests as t):
 """ + "".join(
     f"  {format:<8} "
     + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
