@@ -161,7 +161,8 @@ def _nwb(folder: Path) -> Places:
 
     with h5py.File(folder / "motion.nwb") as file:
         pose = file["processing/behavior/PoseEstimation"]
-        return {name: pose[name]["data"][:] for name in pose if "data" in pose[name]}
+        series = {name: group for name, group in pose.items() if isinstance(group, h5py.Group)}
+        return {name: group["data"][:] for name, group in series.items() if "data" in group}
 
 
 def _mcap(folder: Path) -> Places:

@@ -25,8 +25,9 @@ def heads(path: Path, rate: int, frames: int) -> dict[str, np.ndarray]:
         bpy.ops.import_scene.gltf(filepath=str(path))
     (figure,) = (thing for thing in bpy.context.scene.objects if thing.type == "ARMATURE")
     out = {bone.name: np.empty((frames, 3)) for bone in figure.pose.bones}
+    first = round(figure.animation_data.action.frame_range[0])  # of BVH 1, of glTF 0
     for frame in range(frames):
-        bpy.context.scene.frame_set(frame)
+        bpy.context.scene.frame_set(first + frame)
         bpy.context.view_layer.update()
         for bone in figure.pose.bones:
             out[bone.name][frame] = figure.matrix_world @ bone.head

@@ -41,7 +41,10 @@ def markers(path: Path) -> dict[str, np.ndarray]:
     """{marker: (F, 3)} [m] of a TRC file."""
     table = opensim.TimeSeriesTableVec3(str(path))
     factor = {"m": 1.0, "cm": 0.01, "mm": 0.001}[table.getTableMetaDataString("Units")]
-    return {name: factor * table.getDependentColumn(name).to_numpy() for name in table.getColumnLabels()}
+    flat = table.flatten()  # columns NAME_1, NAME_2, NAME_3
+    names = {label.rpartition("_")[0] for label in flat.getColumnLabels()}
+    axes = {name: [flat.getDependentColumn(f"{name}_{k}").to_numpy() for k in (1, 2, 3)] for name in names}
+    return {name: factor * np.stack(columns, axis=1) for name, columns in axes.items()}
 
 
 def main(folder: Path) -> None:

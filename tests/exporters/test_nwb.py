@@ -70,6 +70,13 @@ def test_pynwb_has_nothing_to_say(motion, tmp_path):
     assert edges[s - 1].tolist() == [motion.body.tree.parents[s], s]
 
 
+def test_names_that_nwb_does_not_allow_become_plain(motion, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    write_nwb(motion, tmp_path / "a.nwb", names="mixamo")
+    with h5py.File(tmp_path / "a.nwb") as file:
+        assert "mixamorig_Hips" in file["processing/behavior/PoseEstimation"]
+
+
 def test_confidence_is_the_probability_of_being_near():
     for sigma in (0.001, 0.008, 0.02, 0.3):
         assert np.isclose(confidence(np.full(3, sigma)), chi(3).cdf(CLOSE / sigma), atol=1e-12)

@@ -38,7 +38,7 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     up : str, optional
         Vertical axis of the file's world. Default: the motion's own.
     names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
-        Names of the joints.
+        Names of the joints; ":" becomes "_": mixamorig_Hips.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
         warnings.simplefilter("ignore")  # of packages about each other
         file = _file(pynwb, world)
         behavior = file.create_processing_module("behavior", "motion of a body, fitted by kinefit")
-        for thing in _pose(ndx_pose, pynwb, world, plain_names(bones)):
+        for thing in _pose(ndx_pose, pynwb, world, plain_names(bone.replace(":", "_") for bone in bones)):
             behavior.add(thing)
         with pynwb.NWBHDF5IO(str(temporary), "w") as out:
             out.write(file)
