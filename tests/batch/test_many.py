@@ -136,3 +136,10 @@ def test_bad_arguments_are_told(sessions, tmp_path):
             track_takes(sessions, tmp_path, **more)
     with pytest.raises(FileError):
         track_takes(Path("nowhere") / "*.toml", tmp_path)
+
+
+def test_an_old_key_of_a_take_stands_in_its_notes(sessions, tmp_path):
+    take = sessions / "s01" / "pre" / "take.toml"
+    take.write_text(take.read_text().replace("sigma = 2.0", "accuracy = 2.0", 1))
+    (row,) = work(job(take, tmp_path / "a"))
+    assert row.status == "done" and "'accuracy' is now called 'sigma'" in row.notes[0]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,9 +110,10 @@ def work(job: Job) -> tuple[Row, ...]:
     """
     from kinefit.tracking.checkpoint import key_of
 
-    start = Row(take=job.label)
+    start, said = Row(take=job.label), list[str]()
     try:
-        take = asked_take(job.take, job.choices)
+        with _warnings_in(said):
+            take = asked_take(job.take, job.choices)
         start = _of_session(start, take)
         key = key_of(take, **asdict(replace(job.choices, restart=False)))
     except KinefitError as error:
@@ -118,7 +121,7 @@ def work(job: Job) -> tuple[Row, ...]:
     known = None if job.choices.restart else _read(job.out / RECORD)
     if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
         return known.rows
-    rows, made = _tracked(job, take, start)
+    rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):
         _write(job.out / RECORD, _Record(key, tuple(made), rows))
     return rows
@@ -129,17 +132,23 @@ def failed(row: Row, error: str) -> Row:
     return msgspec.structs.replace(row, status=FAILED, error=error)
 
 
-def _tracked(job: Job, take: Take, start: Row) -> tuple[tuple[Row, ...], list[str]]:
-    """A row for each person, and the files that were made, from the folder of results on."""
-    said: list[str] = []
+@contextmanager
+def _warnings_in(said: list[str]) -> Iterator[None]:
+    """Enter what is warned of in between: old keys of a take."""
     with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always", UserWarning)
         warnings.simplefilter("always", FutureWarning)
         try:
-            view, people = people_of(take, job.out, _silent, said.append)
-        except KinefitError as error:
-            return (failed(start, str(error)),), []
-        said += [str(one.message) for one in warned if issubclass(one.category, UserWarning | FutureWarning)]
+            yield
+        finally:
+            said += [str(one.message) for one in warned if issubclass(one.category, FutureWarning)]
+
+
+def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
+    """A row for each person, and the files that were made, from the folder of results on."""
+    try:
+        view, people = people_of(take, job.out, _silent, said.append)
+    except KinefitError as error:
+        return (failed(start, str(error)),), []
     rows, made = [], []
     for k, (person, folder) in enumerate(people, 1):
         alone = len(people) == 1
