@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmarks.figures import LEFT_OUT, figure, peers
 from benchmarks.peers.environments import run_peer
+from benchmarks.retarget import validated
 from kinefit import exporters
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import bone_names
@@ -56,7 +57,7 @@ def difference(motion: Motion, found: Places, up: str) -> float:
 
 
 def _programs(motion: Motion, folder: Path) -> None:
-    """Blender and OpenSim."""
+    """Blender, OpenSim and Khronos' validator."""
     exporters.write_bvh(motion, folder / "m.bvh", unit="m")
     exporters.write_glb(motion, folder / "motion.glb")
     exporters.write_osim(motion.body, folder / "body.osim")
@@ -73,6 +74,15 @@ def _programs(motion: Motion, folder: Path) -> None:
                     found = dict(read)
                 value = _landmarks(motion, found) if name == "trc" else difference(motion, found, _UPS[name])
             figure(f"formats_{name}_{program}", value, "m", GOAL, told.get("reason", ""))
+
+
+    figure("formats_glb_khronos", *_errors(folder / "motion.glb"))
+
+
+def _errors(path: Path) -> tuple[float | None, str, str, str]:
+    """What `figure` tells of the validator's errors."""
+    errors, why = validated([path])
+    return errors, "errors", "== 0", why
 
 
 _UPS = {"bvh": "z", "glb": "z", "mot": "y"}

@@ -53,7 +53,8 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
 
     done = [row for row in rows if row.status == DONE]
     takes, bad = len({row.take for row in rows}), len({row.take for row in rows if row.status != DONE})
-    told = f"{takes} takes, {len({row.subject for row in rows if row.subject})} subjects named; {bad} takes failed."
+    named = len({row.subject for row in rows if row.subject})
+    told = f"{takes - bad} of {takes} takes are done; {named} subjects are named."
     parts: list[p.Section | str] = [
         p.callout("bad" if not done else "warning" if bad else "good", told),
         p.section("Takes", _takes(rows, folder)),
@@ -63,7 +64,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
     notes = [(row.take, _person(row), note) for row in rows for note in row.notes]
     if notes:
         parts.append(p.section("Notes", p.table(("take", "person", "note"), notes, first_left=3)))
-    return p.page("Summary of takes", parts, subtitle=told)
+    return p.page("Summary of takes", parts)
 
 
 _ABOUT = (
