@@ -219,6 +219,22 @@ def _x3d(folder: Path) -> Places:
     return out
 
 
+def _rrd(folder: Path) -> Places:
+    from rerun.server import Server
+
+    local = {"host": "127.0.0.1", "addr": "127.0.0.1"}
+    with Server(**local, datasets={"motion": [str(folder / "motion.rrd")]}) as server:
+        client = server.client()  # which must live as long as what it gives
+        view = client.get_dataset("motion").filter_contents(["/**"])
+        frames = view.reader(index="time")
+        table = frames.to_arrow_table()
+    positions, labels = (
+        next(table.column(name).to_pylist() for name in table.schema.names if name.endswith(f"joints:Points3D:{what}"))
+        for what in ("positions", "labels")
+    )
+    return dict(zip(next(filter(None, labels)), np.moveaxis(np.array(positions), 1, 0)))
+
+
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
     """(F, 3, 3) of unit quaternions w, x, y, z."""
     w, v = quaternions[:, :1], quaternions[:, 1:]
@@ -236,6 +252,7 @@ READERS: dict[str, tuple[Write, Callable[[Path], Places], str]] = {
     "c3d_c3d": (lambda m, f: exporters.write_c3d(m, f / "motion.c3d", up="y"), _c3d_second, "y"),
     "nwb_h5py": (lambda m, f: exporters.write_nwb(m, f / "motion.nwb", up="y"), _nwb, "y"),
     "mcap_rosbags": (lambda m, f: exporters.write_mcap(m, f / "motion.mcap"), _mcap, "z"),
+    "rrd_rerun": (lambda m, f: exporters.write_rrd(m, f / "motion.rrd", up="y"), _rrd, "y"),
     "x3d_xml": (lambda m, f: exporters.write_x3d(m, f / "motion.x3d"), _x3d, "y"),
 }
 """{format and reader: (writer, reader, vertical axis of what it gives)}"""

@@ -43,7 +43,7 @@ def test_usd_is_binary_unless_named_otherwise(file):
     assert "mixamorig_Hips/mixamorig_LeftUpLeg" in (file.parent / "x.usda").read_text()
 
 
-EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2"}
+EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2", "rrd": "rerun"}
 
 
 def test_every_choice_that_help_lists_is_one_of_the_exporter(file):

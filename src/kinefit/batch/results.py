@@ -17,7 +17,7 @@ Step = Callable[[str, int, int], None]
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
-    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap",
+    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd",
 }  # fmt: skip
 """What each format is called in a folder of results."""
 
@@ -38,6 +38,7 @@ ABOUT = {
     "x3d": "animated H-Anim figure for browsers and archives",
     "nwb": "joint centres with confidence for neuroscience",
     "mcap": "joint states and transforms for ROS 2",
+    "rrd": "joints, error bars and angles for the viewer of Rerun",
     "overlays": "videos with the skeleton drawn on them",
     "montage": "one picture of all cameras",
     "report": "what came out and how far to trust it, on one page for a browser",
@@ -53,7 +54,7 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
         "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
         "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
         "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot, "x3d": exporters.write_x3d,
-        "nwb": exporters.write_nwb, "mcap": exporters.write_mcap,
+        "nwb": exporters.write_nwb, "mcap": exporters.write_mcap, "rrd": exporters.write_rrd,
         "osim": lambda motion, path: exporters.write_osim(motion.body, path),
     }  # fmt: skip
     writers[format](motion, path, **options)
