@@ -16,6 +16,8 @@ from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices
 from kinefit.batch.work import Job, work
 from kinefit.errors import ExportError, FileError
+from kinefit.tracking import run as running
+from kinefit.tracking.tracker import Tracker
 
 CHOICES = Choices(formats=("motion", "csv"), overlays=False, report=False, smooth=False)
 NAMES = ("s01/pre", "s01/post", "s02/pre")
@@ -143,3 +145,24 @@ def test_an_old_key_of_a_take_stands_in_its_notes(sessions, tmp_path):
     take.write_text(take.read_text().replace("sigma = 2.0", "accuracy = 2.0", 1))
     (row,) = work(job(take, tmp_path / "a"))
     assert row.status == "done" and "'accuracy' is now called 'sigma'" in row.notes[0]
+
+
+def test_a_take_that_was_stopped_goes_on_where_it_was(sessions, tmp_path, monkeypatch):
+    take = sessions / "s01" / "pre" / "take.toml"
+    whole = work(job(take, tmp_path / "a"))
+    monkeypatch.setattr(running, "_EVERY", 2)
+    update, count = Tracker.update, []
+
+    def until(self, frames, time=None, **more):
+        count.append(time)
+        if len(count) == 7:
+            raise MemoryError("as if it were killed here")
+        return update(self, frames, time, **more)
+
+    monkeypatch.setattr(Tracker, "update", until)
+    with pytest.raises(MemoryError):
+        work(job(take, tmp_path / "b" / "a"))
+    assert (tmp_path / "b" / "a" / "unfinished").is_dir() and not (tmp_path / "b" / "a" / RECORD).exists()
+    assert work(job(take, tmp_path / "b" / "a")) == whole
+    assert len(count) == 7 + 2  # of eight frames the last two
+    assert contents(tmp_path / "b" / "a") == contents(tmp_path / "a")

@@ -25,7 +25,7 @@ class Freedom(NamedTuple):
 
 
 _UPS = ("x", "y", "z", "-x", "-y", "-z")
-_Y_UPS, _Z_UPS = (tuple(sorted(_UPS, key=lambda up, first=first: up != first)) for first in "yz")
+_Y_UPS, _Z_UPS = (("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:]))
 _NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
 _RESTS = ("body", "t")
 _OF_BVH = ("bvh", *_NAMES[:-1])
