@@ -91,6 +91,7 @@ def test_what_is_wrong_with_takes_stands_in_their_rows(sessions, tmp_path):
     rows = track_takes(sessions, tmp_path / "out", choices=CHOICES, workers=2)
     assert [row.status for row in rows] == ["done", "failed", "failed"]
     assert "take.toml" in rows[1].error and rows[2].subject == "s02" and rows[2].error
+    assert not list((tmp_path / "out" / "s02").rglob("*"))
     text = (tmp_path / "out" / "summary.csv").read_text()
     assert text.count("failed") == 2 and text.count("done") == 1
     shutil.rmtree(sessions / "s01" / "post")
@@ -127,6 +128,10 @@ def test_done_takes_are_done_again_only_where_something_changed(sessions, tmp_pa
     os.utime(take.with_name("calibration.toml"), (1, 1))
     with pytest.raises(Again):
         work(job(take, out))
+    other = shutil.copytree(take.parent, tmp_path / "other") / "take.toml"
+    assert "results of another take lie in a" in work(job(other, out))[0].error
+    with pytest.raises(Again):
+        work(job(other, out, Choices(**{**vars(CHOICES), "restart": True})))
     (out / RECORD).write_text("{")
     with pytest.raises(Again):
         work(job(take, out))

@@ -78,6 +78,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Record(msgspec.Struct, frozen=True):
+    take: str
     key: str
     files: tuple[str, ...]
     rows: tuple[Row, ...]
@@ -119,11 +120,14 @@ def work(job: Job) -> tuple[Row, ...]:
     except KinefitError as error:
         return (failed(start, str(error)),)
     known = None if job.choices.restart else _read(job.out / RECORD)
+    if known is not None and known.take != str(job.take):
+        told = f"the results of another take lie in {job.folder} ({known.take})"
+        return (failed(start, f"{told}. Name another folder by --out, or write over them by --restart."),)
     if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
         return known.rows
     rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):
-        _write(job.out / RECORD, _Record(key, tuple(made), rows))
+        _write(job.out / RECORD, _Record(str(job.take), key, tuple(made), rows))
     return rows
 
 
@@ -155,7 +159,8 @@ def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[R
         row = msgspec.structs.replace(
             start, person=0 if alone else k, folder=job.folder if alone else f"{job.folder}/person-{k}"
         )
-        folder.mkdir(parents=True, exist_ok=True)
+        if not alone:
+            folder.mkdir(parents=True, exist_ok=True)
         files: dict[str, Path] = {}
         try:
             done = track_person(person, folder, job.choices, view=view, step=_silent, tell=_silent, files=files)
