@@ -50,6 +50,8 @@ PEERS: dict[str, Peer] = {
     "mink": Peer(*_MUJOCO, "mujoco_mink", ("mink",)),
     "opensim": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_ik"),
     "opensim_takes": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_takes"),
+    "opensim_formats": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_formats"),
+    "blender_formats": Peer("blender", ("bpy==5.0.1",), "bpy", "blender_formats", pythons=("3.11",)),
     "pyvale": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_dic"),
     "pyvale_plates": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_plates"),
     "momentum": Peer(*_MOMENTUM, ("markers",), **_MOMENTUM_FILES),

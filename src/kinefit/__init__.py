@@ -58,6 +58,7 @@ _HOMES = {
     "split_people": "kinefit.markers.people",
     "track": "kinefit.tracking.video",
     "track_take": "kinefit.tracking.take",
+    "track_takes": "kinefit.batch.many",
     "training_gate": "kinefit.identification.model.gate",
     "write_calibration_like": "kinefit.readers.calibration.write",
 }

@@ -14,7 +14,7 @@ from kinefit.errors import AssetError, command
 @pytest.fixture
 def no_overlays(monkeypatch):
     """Overlays are the slow part, and test_track.py sees to them."""
-    monkeypatch.setattr("kinefit.cli._results.write_overlays", lambda *args, **more: None)
+    monkeypatch.setattr("kinefit.batch.one.write_overlays", lambda *args, **more: None)
 
 
 def run(*args):

@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from kinefit.batch.results import NAMES
 from kinefit.bodies import catalogue, load_body, records
 from kinefit.bodies.files import JOINT_TYPES
-from kinefit.cli._results import NAMES
 from kinefit.exporters import tables
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.take import file as takes

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from tests.tracking.test_checkpoint import assert_same
 
 from kinefit import read_motion
-from kinefit.cli import _results as results
+from kinefit.batch import one
 from kinefit.cli import main
 from kinefit.readers.take.file import read_take
 from kinefit.tracking import run as running
@@ -49,7 +49,7 @@ def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
 def test_restart_begins_anew(take, tmp_path, monkeypatch):
     words = ["track", str(take), "--no-overlays", "--no-report", "--formats", "motion", "--out", str(tmp_path / "out")]
     with monkeypatch.context() as patched:
-        patched.setattr(results, "write_results", lambda *given: 1 / 0)
+        patched.setattr(one, "write_results", lambda *given: 1 / 0)
         assert CliRunner().invoke(main, words).exit_code != 0
     counted = []
     update = Tracker.update

@@ -14,8 +14,8 @@ from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
 
 import kinefit
+from kinefit.batch.results import NAMES, USUAL
 from kinefit.cli import main
-from kinefit.cli._results import NAMES, USUAL
 from kinefit.cli._summary import bone_lengths, frame_ranges
 from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 from kinefit.readers.video import Video
@@ -253,7 +253,7 @@ def test_a_folder_in_whose_place_a_file_stands_is_told_at_once(take, tmp_path):
 def test_a_full_disk_leaves_only_whole_files(take, tmp_path):
     code = (
         "import resource, sys; from kinefit.cli import main\n"
-        "import kinefit.cli._results as r; write = r.write_overlays\n"
+        "import kinefit.batch.one as r; write = r.write_overlays\n"
         "def limited(*a, **k):\n    resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000)); write(*a, **k)\n"
         "r.write_overlays = limited; main()"
     )
@@ -341,7 +341,7 @@ def test_ctrl_c_during_overlays_lists_what_is_whole(take, tmp_path, monkeypatch)
     def interrupted(*args, **more):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("kinefit.cli._results.write_overlays", interrupted)
+    monkeypatch.setattr("kinefit.batch.one.write_overlays", interrupted)
     told = run("track", take, "--out", tmp_path / "out", "--formats", "bvh")
     assert told.exit_code == 130
     assert str(tmp_path / "out" / "motion.bvh") in told.stdout

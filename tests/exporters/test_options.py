@@ -18,7 +18,7 @@ from kinefit.exporters.skeletons.common import NAMES, bone_names
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 UPS = ("x", "y", "z", "-x", "-y", "-z")
-CLOSE = 1e-4  # [m]
+CLOSE = 1e-5  # [m]
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +74,20 @@ def same(found, motion, up, names, unit):
 def test_bvh(motion, tmp_path, unit, up):
     write_bvh(motion, tmp_path / "a.bvh", unit=unit, up=up, names="mixamo")
     same(bvh_positions(tmp_path / "a.bvh"), motion, up, "mixamo", unit)
+
+
+def test_bvh_by_a_second_program(motion, tmp_path):
+    bvhio = pytest.importorskip("bvhio")
+    write_bvh(motion, tmp_path / "a.bvh", unit="m")
+    root = bvhio.readAsHierarchy(str(tmp_path / "a.bvh"))
+    joints = [joint for joint, _, _ in root.layout()]
+    truth = dict(zip(bone_names(motion.body, "bvh", ""), np.moveaxis(motion.turned("y").joint_centres, 1, 0)))
+    first, last = root.getKeyframeRange()
+    assert {joint.Name for joint in joints} == set(truth) and last - first + 1 == len(motion)
+    for frame in range(first, last + 1):
+        root.loadPose(frame)
+        for joint in joints:
+            assert np.linalg.norm(np.array(list(joint.PositionWorld)) - truth[joint.Name][frame - first]) < 1e-5
 
 
 @pytest.mark.parametrize("names", NAMES)

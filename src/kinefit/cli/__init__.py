@@ -18,8 +18,8 @@ from kinefit.cli._group import Group
 from kinefit.errors import KinefitError
 
 COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "live", "markers", "surface", "body", "view", "replay",
-    "export", "retarget", "simulate", "evaluate", "warmup",
+    "demo", "init", "calibrate", "detect", "check", "track", "live", "batch", "markers", "surface", "body", "view",
+    "replay", "export", "retarget", "simulate", "evaluate", "warmup",
 )  # fmt: skip
 
 _EPILOG = """\b
@@ -29,6 +29,7 @@ Examples:
   kinefit check my_take/take.toml       what is wrong with it, and what would fix it
   kinefit track my_take/take.toml       angles, figures, videos and a report
   kinefit live my_take/take.toml        the same while it happens, streamed to avatars and programs
+  kinefit batch 'sessions/**/take.toml' many takes, side by side, with one summary
   kinefit markers --help                points without names: labelled takes, joint angles
   kinefit surface --help                photographs of a textured surface: points, strain
   kinefit export motion.npz --to bvh    a result in another format

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit.batch import results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
@@ -51,7 +52,7 @@ def fit_file(
     unit : str, optional, of files that state none or a wrong one.
     up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
     limits : bool, whether joints stay within their ranges.
-    formats : names of `_results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
+    formats : names of `results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, told of progress.
 
     Returns
@@ -72,9 +73,9 @@ def fit_file(
     step = step or (lambda what, done, total: None)
     source, formats = Path(path), tuple(formats)
     folder = Path(out) if out is not None else source.with_name(f"{source.stem}-kinefit")
-    unknown = [name for name in formats if name not in (*_results.NAMES, "markers")]
+    unknown = [name for name in formats if name not in (*results.NAMES, "markers")]
     if unknown:
-        raise ExportError(_results.no_format(unknown[0], (*_results.NAMES, "markers")), remedy="Leave it out.")
+        raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Leave it out.")
     _results.check_folder(folder)
     generic = body if isinstance(body, Body) else load_body(Path(body) if isinstance(body, PathLike) else body)
     people = split_people(read_markers(source, unit=unit))
@@ -89,10 +90,10 @@ def fit_file(
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
         plain = [name for name in formats if name not in ("markers", "osim")]
-        _results.write_results(motion, own, plain, step, files)
+        results.write_results(motion, own, plain, step, files)
         if "osim" in formats:
-            write_osim(wearing(subject), own / _results.NAMES["osim"])
-            files["osim"] = own / _results.NAMES["osim"]
+            write_osim(wearing(subject), own / results.NAMES["osim"])
+            files["osim"] = own / results.NAMES["osim"]
         if "markers" in formats:
             R = rotation_between_up(motion.up, "y")
             write_markers(replace(markers, positions=markers.positions @ R.T, up="y"), own / _MARKERS, unit="m")

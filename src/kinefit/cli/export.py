@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import click
 
+from kinefit.batch import results
 from kinefit.cli import _results, _screen
 from kinefit.errors import spelled
 from kinefit.readers.units import LENGTHS, worth
@@ -24,10 +25,11 @@ class Freedom(NamedTuple):
 
 
 _UPS = ("x", "y", "z", "-x", "-y", "-z")
-_Y_UPS = ("y", *(up for up in _UPS if up != "y"))
+_Y_UPS, _Z_UPS = (("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:]))
 _NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
 _RESTS = ("body", "t")
 _OF_BVH = ("bvh", *_NAMES[:-1])
+_OF_HANIM = ("hanim", *(name for name in _NAMES if name != "hanim"))
 _OPENSIM = "OpenSim's files are in metres, y up, under the names of the body's coordinates"
 
 FREEDOM = {
@@ -38,6 +40,10 @@ FREEDOM = {
     "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD knows y and z up"),
     "c3d": Freedom(("mm", "cm", "m"), _UPS, _NAMES),
     "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC holds landmarks, which bear the names of H-Anim"),
+    "x3d": Freedom((), (), _OF_HANIM, _RESTS, "X3D is in metres and y up by its standard"),
+    "nwb": Freedom((), _UPS, _NAMES, (), "NWB is in metres here"),
+    "mcap": Freedom((), _Z_UPS, _NAMES, (), "ROS is in metres"),
+    "rrd": Freedom((), _UPS, _NAMES, (), "RRD is in metres here"),
     "mot": Freedom(why=_OPENSIM),
     "osim": Freedom(why=_OPENSIM),
 }
@@ -57,7 +63,7 @@ Examples:
   kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
 
 \b
-Choices, the default first (csv, parquet and c3d keep the take's vertical axis; --names mixamo rests as t):
+Choices, the default first (csv, parquet, c3d, nwb and rrd keep the take's vertical axis; --names mixamo rests as t):
 """ + "".join(
     f"  {format:<8} "
     + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
@@ -120,9 +126,9 @@ def export(
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
     (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
     recorded = read_motion(motion)
-    _results.write_format(recorded, format, out, **options)
+    results.write_format(recorded, format, out, **options)
     told = ", ".join(f"{key} {value}" for key, value in options.items())
-    _screen.say(f"{out}: {_results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+    _screen.say(f"{out}: {results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
 
 
 def _meant(key: str, value: str, valid: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ import pickle
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from types import FunctionType, MappingProxyType, MethodType, TracebackType
 from typing import Any, TypeVar
@@ -206,8 +207,7 @@ class _Unpickler(pickle.Unpickler):
 def key_of(take: Take, **options: Any) -> str:
     """Digest of a take, of its files as far as size and time of change tell, of options and of kinefit's own code."""
     digest = hashlib.sha256(repr((take, sorted(options.items()), np.__version__)).encode())
-    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(source.read_bytes())
+    digest.update(code_digest())
     takes = [take] if take.subject is None else [take, read_take(take.subject)]
     paths = set().union(*(_paths(one) | {Path(one.body)} for one in takes)) - {take.path}
     for path in sorted(paths, key=str):
@@ -216,6 +216,15 @@ def key_of(take: Take, **options: Any) -> str:
                 info = one.stat()
                 digest.update(f"{one} {info.st_size} {info.st_mtime_ns}".encode())
     return digest.hexdigest()
+
+
+@cache
+def code_digest() -> bytes:
+    """Of kinefit's own code, as it was when this process first asked."""
+    digest = hashlib.sha256()
+    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(source.read_bytes())
+    return digest.digest()
 
 
 def _paths(thing: Any) -> set[Path]:

@@ -9,7 +9,7 @@ from tests.exporters.synthetic import smooth_motion
 
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.names import NAMES
-from kinefit.exporters.report.ranges import WIDE, extremes, ranges_table
+from kinefit.exporters.report.ranges import WIDE, extremes, ranges_of, ranges_table
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE
@@ -66,3 +66,13 @@ def test_the_highest_speed_has_the_uncertainty_that_smoothing_told():
     rows = own(ranges_table(motion)).split("<tr>")
     knee = next(row for row in rows if "Knee flexion" in row)
     assert knee.count("±") == 9 and "± 23" in knee and "± 11" in knee
+
+
+def test_ranges_of_all_angles_by_side():
+    motion = smooth_motion(20)
+    found = ranges_of(motion)
+    assert set(found["knee_angle"]) == {"left", "right"} and set(found["lumbar_extension"]) == {""}
+    (knee,) = (c for c in curves(motion) if c.name == "knee_angle_l")
+    assert found["knee_angle"]["left"].span[0] == pytest.approx(np.ptp(knee.values))
+    blind = replace(motion, quality=np.zeros(len(motion)))
+    assert all(one is None for sides in ranges_of(blind).values() for one in sides.values())

@@ -66,20 +66,32 @@ def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
     return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share)
 
 
+def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
+    """{coordinate without its side: {"left", "right", or "" of the body's middle: how far it moved}} of all angles.
+
+    None stands for what was observed in no two frames.
+    """
+    tracked = motion.quality > 0
+    out: dict[str, dict[str, Extremes | None]] = {}
+    for rows in by_joint(curves(motion)).values():
+        for stem, found in rows.items():
+            of = {c.side: extremes(c, motion.rate, tracked) for c in found if c.unit == "deg"}
+            if of:
+                out[stem] = of
+    return out
+
+
 def ranges_table(motion: Motion) -> p.Html:
     """Two tables: what the body has twice, left beside right, and its middle."""
     paired: list[tuple[str, ...]] = []
     single: list[tuple[str, ...]] = []
-    tracked = motion.quality > 0
-    for rows in by_joint(curves(motion)).values():
-        for stem, found in rows.items():
-            of = {c.side: extremes(c, motion.rate, tracked) for c in found if c.unit == "deg"}
-            name = spoken(stem).capitalize()
-            if "" in of:
-                single.append((name, *_cells(of[""])))
-            elif of:
-                left, right = of.get("left"), of.get("right")
-                paired.append((name, *_cells(left), *_cells(right), _difference(left, right)))
+    for stem, of in ranges_of(motion).items():
+        name = spoken(stem).capitalize()
+        if "" in of:
+            single.append((name, *_cells(of[""])))
+        else:
+            left, right = of.get("left"), of.get("right")
+            paired.append((name, *_cells(left), *_cells(right), _difference(left, right)))
     parts = []
     if paired:
         columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
@@ -94,15 +106,16 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
         return ("not observed", "", "", "")
     part = "" if found.share > 0.995 else "*"
     speed, twice = found.fastest
-    fastest = "–" if not np.isfinite(speed) else _told(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
-    return (*(_told(*pair) for pair in (found.lowest, found.highest)), _told(*found.span) + part, fastest)
+    fastest = "–" if not np.isfinite(speed) else told(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
+    return (*(told(*pair) for pair in (found.lowest, found.highest)), told(*found.span) + part, fastest)
 
 
 def _difference(left: Extremes | None, right: Extremes | None) -> str:
     if left is None or right is None:
         return "–"
-    return _told(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
+    return told(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
 
 
-def _told(value: float, twice: float) -> str:
+def told(value: float, twice: float) -> str:
+    """A value with two standard deviations."""
     return f"{value:.0f} ± {twice:.0f}".replace("-0 ", "0 ").replace("-", "−")

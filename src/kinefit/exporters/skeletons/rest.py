@@ -93,10 +93,20 @@ def rest_pose(body: Body, rest: str | None, names: str, path: str | PathLike[str
     rest = rest or ("t" if convention(names) == "mixamo" else "body")
     if rest not in RESTS:
         raise ExportError(choices("rest pose", rest, RESTS), file=path)
-    tree, count = body.tree, len(body.tree.segments)
+    count = len(body.tree.segments)
     turns = np.tile(np.eye(3), (count, 1, 1)) if rest == "body" else np.stack([_turn(body, s) for s in range(count)])
+    return _rest(body, turns)
+
+
+def standing(body: Body) -> Rest:
+    """The body's own rest pose, facing z: arms hanging, as H-Anim has its figures stand."""
+    return _rest(body, np.tile(_FACING, (len(body.tree.segments), 1, 1)))
+
+
+def _rest(body: Body, turns: NDArray) -> Rest:
+    tree = body.tree
     offsets = np.array([turns[max(parent, 0)] @ o for parent, o in zip(tree.parents, tree.offsets)])
-    positions = np.zeros((count, 3))
+    positions = np.zeros((len(turns), 3))
     for s, parent in enumerate(tree.parents):
         positions[s] = offsets[s] + (positions[parent] if parent >= 0 else 0.0)
     return Rest(turns, offsets, positions)

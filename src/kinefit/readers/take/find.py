@@ -46,10 +46,11 @@ def find_take(path: str | PathLike[str]) -> Path:
 
 def takes_in(folder: Path) -> list[Path]:
     """The take files that lie in a folder, take.toml first."""
-    return sorted((file for file in folder.glob("*.toml") if _is_take(file)), key=lambda f: (f.name != "take.toml", f))
+    return sorted((file for file in folder.glob("*.toml") if is_take(file)), key=lambda f: (f.name != "take.toml", f))
 
 
-def _is_take(file: Path) -> bool:
+def is_take(file: Path) -> bool:
+    """Whether a TOML file is a take file; one that cannot be read is, where it is called take.toml."""
     if file.name == "take.toml":
         return True
     try:

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kinefit.cli._screen import Step
+from kinefit.batch.results import Step
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +30,7 @@ def write_track_report(
 
     `pictures` are "full", "blurred" or "none"; `notes` are what the command says, too.
     """
-    from kinefit.cli._results import ABOUT
+    from kinefit.batch.results import ABOUT
     from kinefit.exporters.report.norms import read_norms
     from kinefit.exporters.report.report import write_report
 
@@ -52,7 +52,7 @@ def take_pictures(
 
     Frames that a video does not reach are left out.
     """
-    from kinefit.cli._results import _residuals
+    from kinefit.batch.results import _residuals
     from kinefit.exporters.report.pictures import close_up, report_frames
     from kinefit.readers.video import Video
 

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from kinefit.cli._report import provenance, take_pictures, write_track_report
+from kinefit.batch.report import provenance, take_pictures, write_track_report
 from kinefit.exporters.report.pictures import report_frames
 from kinefit.readers.take.file import read_take
 from kinefit.tracking.take import track_take

@@ -1,0 +1,104 @@
+"""Which takes patterns mean, and where the results of each go."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from kinefit._files import parse_toml
+from kinefit.errors import FileError, KinefitError, command
+from kinefit.readers.take.find import is_take, takes_in
+
+RECORD = "batch.json"
+"""File in every folder of results of a batch: what was made there, and of what."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Takes that patterns mean.
+
+    Parameters
+    ----------
+    base : Path, folder in which all of them lie
+    takes : absolute paths, each once, in the order of their names
+    left_out : TOML files that match as well and are no takes, such as calibrations
+    """
+
+    base: Path
+    takes: tuple[Path, ...]
+    left_out: tuple[Path, ...]
+
+    def label(self, take: Path) -> str:
+        """A take's path from the base on: no two takes have the same."""
+        return take.relative_to(self.base).as_posix()
+
+    def folder(self, take: Path, out: Path) -> Path:
+        """Where the results of a take go: each has a folder of its own."""
+        return out / take.relative_to(self.base).with_name(f"{take.stem}-kinefit")
+
+
+def find_takes(patterns: Sequence[str | os.PathLike[str]]) -> Found:
+    """The take files that patterns such as "sessions/**/take.toml" mean.
+
+    A file means itself; a folder every take.toml in it and below; a folder that a pattern matches its own take file.
+    TOML files that are no takes are left out, those that cannot be read are not: they are to be told. What lies in
+    results of an earlier batch is never taken.
+
+    Raises
+    ------
+    FileError
+        A pattern matches nothing, or no take file.
+    """
+    bases: list[Path] = []
+    files: dict[Path, Path] = {}
+    left: dict[Path, Path] = {}
+    for pattern in patterns:
+        base, hits = _matched(os.fspath(pattern))
+        takes = [take for hit in hits for take in _takes_at(hit) if not _is_result(take, base)]
+        good = [take for take in takes if _may_be_take(take)]
+        if not good:
+            told = f"no take file among the {len(hits)} files and folders that match" if hits else "nothing matches"
+            remedy = f"Name take files, such as 'sessions/**/take.toml'; one is written by {command('init')} FOLDER."
+            raise FileError(told, file=pattern, remedy=remedy)
+        bases.append(base)
+        files |= {take.resolve(): take for take in good}
+        left |= {take.resolve(): take for take in takes if take not in good}
+    base = Path(os.path.commonpath(bases))
+    return Found(base, tuple(sorted(files.values())), tuple(sorted(left.values())))
+
+
+def _matched(pattern: str) -> tuple[Path, list[Path]]:
+    """The folder before the first wildcard, and what matches, absolute."""
+    path = Path(os.path.abspath(os.path.expanduser(pattern)))
+    if path.is_dir():
+        return path, sorted(path.glob("**/take.toml"))
+    if path.exists() or not glob.has_magic(pattern):
+        return path.parent, [path] if path.exists() else []
+    base = path
+    while glob.has_magic(str(base)):
+        base = base.parent
+    return base, sorted(map(Path, glob.glob(str(path), recursive=True)))
+
+
+def _takes_at(hit: Path) -> Iterable[Path]:
+    if not hit.is_dir():
+        return [hit] if hit.suffix.lower() == ".toml" else []
+    takes = takes_in(hit)
+    return takes[:1] if takes and takes[0].name == "take.toml" else takes
+
+
+def _is_result(take: Path, base: Path) -> bool:
+    """Whether it lies in the results of a batch, below the base."""
+    above = [folder for folder in take.parents if folder.is_relative_to(base)]
+    return any((folder / RECORD).is_file() for folder in above)
+
+
+def _may_be_take(file: Path) -> bool:
+    try:
+        parse_toml(file.read_text("utf-8"), file)
+    except (OSError, UnicodeDecodeError, KinefitError):
+        return True
+    return is_take(file)

@@ -1,0 +1,169 @@
+"""One take into a folder of results: what is made of it, who is in it, and each of them tracked and written."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kinefit.batch.results import USUAL, Step, write_overlays, write_results
+from kinefit.errors import KinefitError, TakeError
+
+if TYPE_CHECKING:
+    from kinefit.motion import Motion
+    from kinefit.preparing.detecting import Tell
+    from kinefit.readers.take.file import Take
+    from kinefit.tracking.take import InView
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What is made of a take.
+
+    Parameters
+    ----------
+    formats : of `results.NAMES`
+    overlays : bool, whether the fit is drawn on every video
+    report : bool, whether report.html is written
+    pictures : what report and overlays show of the videos: "full", "blurred" (no faces) or "none"
+    smooth : bool, whether each frame knows the whole take
+    contacts : bool, whether soles that rest on a level floor are held still
+    lag : float [s], see `track`
+    person : who is followed; None: whom the take names, else everybody in view
+    restart : bool, whether what an earlier run left is forgotten
+    """
+
+    formats: tuple[str, ...] = USUAL
+    overlays: bool = True
+    report: bool = True
+    pictures: str = "full"
+    smooth: bool = True
+    contacts: bool = False
+    lag: float | None = None
+    person: str | None = None
+    restart: bool = False
+
+    @property
+    def draws(self) -> bool:
+        """Whether overlays are written."""
+        return self.overlays and self.pictures != "none"
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What came of one person of a take.
+
+    Parameters
+    ----------
+    motion : Motion
+    notes : sentences that the user should read
+    total : int, how many frames there are where Ctrl-C left some of them out; else 0
+    """
+
+    motion: Motion
+    notes: tuple[str, ...]
+    total: int = 0
+
+
+def asked_take(path: Path, choices: Choices) -> Take:
+    """A take file with the person that the choices name.
+
+    Raises
+    ------
+    KinefitError
+        What is wrong with the take, or with the person named.
+    """
+    from kinefit.readers.take.checks import check_enough, check_take
+    from kinefit.readers.take.file import read_take
+
+    take = read_take(path)
+    if choices.person is not None:
+        take = replace(take, person=choices.person)
+        try:
+            check_take(take)
+        except KinefitError as error:  # of this option: the take alone is right
+            raise type(error)(error.problem, place="--person", remedy=error.remedy) from None
+    check_enough(take)
+    return take
+
+
+def check_drawable(take: Take) -> None:
+    """Refuse overlays of a take that has nothing to draw on.
+
+    Raises
+    ------
+    TakeError
+    """
+    if not (take.depth or any(camera.video for camera in take.cameras)):
+        raise TakeError("overlays, but no video or depth to draw on", file=take.path, remedy="Leave --overlays out.")
+
+
+def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
+    """Who is to be tracked: what the cameras saw, and a take and a folder of results for each person.
+
+    Keypoints are detected and bodies fetched first, where the take needs them.
+    """
+    from kinefit.preparing.take import prepared
+    from kinefit.tracking.take import people_in_view
+
+    take = prepared(take, step, tell)
+    view = people_in_view(take) if take.person is None else None
+    people = len(view.people) if view else 0
+    if people < 2:
+        return view, [(take, out)]
+    numbers = range(1, people + 1)
+    return view, [(replace(take, person=k, name=f"{take.name}-person-{k}"), out / f"person-{k}") for k in numbers]
+
+
+def track_person(
+    take: Take, out: Path, choices: Choices, *, view: InView | None, step: Step, tell: Tell, files: dict[str, Path],
+) -> Tracked:  # fmt: skip
+    """Track one person of a take and write what comes of it; enter into `files` what is there, one after the other.
+
+    A run that was stopped is gone on with (`out/unfinished`), unless the choices say to restart.
+
+    Raises
+    ------
+    KinefitError
+        What tracking and writing raise.
+    """
+    from kinefit.batch.report import provenance, write_track_report
+    from kinefit.multiview import followed
+    from kinefit.tracking import cameras
+    from kinefit.tracking.agreement import sentences
+    from kinefit.tracking.checkpoint import Checkpoint, key_of
+    from kinefit.tracking.take import settings_of, track_take
+    from kinefit.tracking.video import TrackingInterrupted
+
+    notes: list[str] = []
+    how: dict[str, Any] = {"smooth": choices.smooth, "contacts": choices.contacts, "lag": choices.lag}
+    total = 0
+    with ExitStack() as work:
+        unfinished = work.enter_context(Checkpoint(out / "unfinished", key_of(take, **how), restart=choices.restart))
+        if unfinished.resumed:
+            tell(f"going on with what an earlier run left in {unfinished.folder}; --restart begins anew")
+        step("reading", 0, 0)
+
+        def read(what: str, done: int, count: int) -> None:
+            step("reading", 1, 1)
+            step(what, done, count)
+
+        try:
+            motion, seen = track_take(
+                take, **how, checkpoint=unfinished, view=view, progress=read
+            )
+            notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
+            notes += followed.sentences(motion.provenance, asked=take.person is not None)
+            notes += cameras.sentences(motion.provenance, settings_of(take).camera_std)
+        except TrackingInterrupted as stopped:
+            motion, total = stopped.motion, stopped.total
+        motion = replace(motion, provenance=provenance(take, **motion.provenance))
+        write_results(motion, out, choices.formats, step, files)
+        if choices.draws and not total:
+            write_overlays(motion, take, seen, out, step, files, blur=choices.pictures == "blurred")
+        if choices.report and not total:
+            write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
+        if not total:
+            unfinished.remove()
+    return Tracked(motion, tuple(notes), total)

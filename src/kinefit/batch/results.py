@@ -1,0 +1,126 @@
+"""Results of one motion into a folder: every format, overlay videos, a picture of all cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from kinefit.motion import Motion, Residuals
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
+
+Step = Callable[[str, int, int], None]
+"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
+
+NAMES = {
+    "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
+    "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
+    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd",
+}  # fmt: skip
+"""What each format is called in a folder of results."""
+
+USUAL = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
+"""Formats that are written where none are named."""
+
+ABOUT = {
+    "motion": "everything, for kinefit export and kinefit.read_motion",
+    "csv": "tables of angles, joint centres, landmarks, quality, residuals",
+    "parquet": "the same tables as Parquet",
+    "bvh": "animated skeleton for animation programs",
+    "glb": "animated figure for browsers and game engines",
+    "trc": "landmarks over time for OpenSim",
+    "mot": "angles over time for OpenSim",
+    "osim": "the fitted body for OpenSim",
+    "c3d": "joint centres and landmarks for motion laboratories",
+    "usd": "animated figure for film and simulation programs",
+    "x3d": "animated H-Anim figure for browsers and archives",
+    "nwb": "joint centres with confidence for neuroscience",
+    "mcap": "joint states and transforms for ROS 2",
+    "rrd": "joints, error bars and angles for the viewer of Rerun",
+    "overlays": "videos with the skeleton drawn on them",
+    "montage": "one picture of all cameras",
+    "report": "what came out and how far to trust it, on one page for a browser",
+}
+"""What each is for."""
+
+
+def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
+    """Write a motion in one of the formats of `NAMES`; options are those of its exporter."""
+    from kinefit import exporters
+
+    writers: dict[str, Callable[..., Any]] = {
+        "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
+        "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
+        "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot, "x3d": exporters.write_x3d,
+        "nwb": exporters.write_nwb, "mcap": exporters.write_mcap, "rrd": exporters.write_rrd,
+        "osim": lambda motion, path: exporters.write_osim(motion.body, path),
+    }  # fmt: skip
+    writers[format](motion, path, **options)
+
+
+def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:
+    """Write a motion in several formats; enter into `files` what is there, one after the other."""
+    from kinefit._mapped import release
+
+    formats = tuple(formats)
+    for number, format in enumerate(formats):
+        step("results", number, len(formats))
+        write_format(motion, format, folder / NAMES[format])
+        files[format] = folder / NAMES[format]
+        for residuals in motion.residuals.values():
+            release(residuals.values, residuals.weights, residuals.measured)
+    step("results", len(formats), len(formats))
+
+
+def write_overlays(
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path], *,
+    blur: bool = False,
+) -> None:  # fmt: skip
+    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`.
+
+    With `blur` faces are made unrecognisable.
+    """
+    import numpy as np
+
+    from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
+    from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
+    from kinefit.readers.video import Video
+
+    if not (seen.videos or seen.depth) or seen.rig is None:
+        return
+    pictures, middle = {}, motion.times[len(motion) // 2]
+    for name, path in seen.videos.items():
+        offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
+        with Video(path, rate=seen.rate) as colour:
+            shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
+            at = nearest_frame(motion, shown / colour.rate + offset)
+            pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
+            bar, count = f"overlay {name}", len(frames_of(motion, np.arange(len(colour)) / colour.rate + offset))
+            step(bar, 0, count)
+            write_overlay(
+                motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,
+                progress=lambda done: step(bar, done, count), **given,  # noqa: B023
+            )  # fmt: skip
+        files["overlays"] = folder / "overlays"
+    for video in seen.depth:
+        camera, shown = seen.rig[video.sensor], video.nearest(float(middle))
+        at = nearest_frame(motion, float(video.times[shown]))
+        pictures[video.sensor] = depth_picture(video.frame(shown).depth, motion, at, camera, label=video.sensor)
+        bar, count = f"overlay {video.sensor}", len(frames_of(motion, video.times))
+        step(bar, 0, count)
+        write_depth_overlay(
+            motion, camera, video, folder / "overlays" / f"{video.sensor}.mp4",
+            progress=lambda done: step(bar, done, count),  # noqa: B023
+        )  # fmt: skip
+        files["overlays"] = folder / "overlays"
+    write_montage(pictures, folder / "montage.png")
+    files["montage"] = folder / "montage.png"
+
+
+def _residuals(motion: Motion, camera: str) -> Residuals | None:
+    """Of a camera; of the first of its detectors where it has several."""
+    labels = [label for label in motion.residuals if label == camera or label.startswith(f"{camera} ")]
+    return motion.residuals[labels[0]] if labels else None

@@ -1,0 +1,116 @@
+"""MCAP with messages of ROS 2: joint states and transforms over time, for robots, Foxglove and `ros2 bag`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import writing
+from kinefit.exporters.skeletons.common import bone_names, turned
+from kinefit.geometry import se3
+from kinefit.motion import Motion
+from kinefit.motion_columns import continuous_quaternions
+
+WORLD = "world"
+"""Frame that the root's transforms are given in."""
+
+_TIME = "int32 sec\nuint32 nanosec\n"
+_HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
+_LINE = f"{'=' * 80}\nMSG: "
+_STATE = (
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n"
+    f"{_LINE}std_msgs/Header\n{_HEADER}{_LINE}builtin_interfaces/Time\n{_TIME}"
+)
+_MOVE = (
+    "geometry_msgs/TransformStamped[] transforms\n"
+    f"{_LINE}geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
+    "geometry_msgs/Transform transform\n"
+    f"{_LINE}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n"
+    f"{_LINE}geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
+    f"{_LINE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+    f"{_LINE}std_msgs/Header\n{_HEADER}{_LINE}builtin_interfaces/Time\n{_TIME}"
+)
+
+
+def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", names: str = "kinefit") -> None:
+    """Write a motion as MCAP with messages of ROS 2, in metres and radians.
+
+    - `/tf` (tf2_msgs/TFMessage): every segment in its parent, the root in "world"; origins are joint centres.
+    - `/joint_states` (sensor_msgs/JointState): all coordinates under the body's names.
+    - `/joint_std` (sensor_msgs/JointState): their standard deviations, as positions; inf where nothing observed one.
+
+    Stamps are the motion's times, from 0 on; a negative time cannot be told.
+
+    Parameters
+    ----------
+    motion : Motion
+    path : path
+    up : str
+        Vertical axis of the world; of ROS it is z.
+    names : "kinefit", "mixamo", "cmu", "opensim", "hanim" or "bvh"
+        Names of the frames in `/tf`; with "kinefit" those of the segments.
+
+    Raises
+    ------
+    ExportError
+        The extra "ros" is not installed, no frame, a time before 0, unknown axis or names, or the file cannot be
+        written.
+    """
+    try:
+        from mcap_ros2.writer import Writer
+    except ImportError as error:
+        remedy = "Install it: pip install 'kinefit[ros]'."
+        raise ExportError("MCAP needs the package mcap-ros2-support", file=path, remedy=remedy) from error
+    if not len(motion) or motion.times[0] < 0:
+        told = "a motion without frames" if not len(motion) else "a motion that begins before 0 s"
+        raise ExportError(f"{told} has no stamps in ROS", file=path, remedy="Cut it to frames of time 0 and later.")
+    bones, world = bone_names(motion.body, names, path), turned(motion, up, path)
+    with writing(path) as temporary, temporary.open("wb") as file, Writer(file) as out:
+        state = out.register_msgdef("sensor_msgs/msg/JointState", _STATE)
+        move = out.register_msgdef("tf2_msgs/msg/TFMessage", _MOVE)
+        for time, transforms, angles, std in _frames(world, bones):
+            header = {"stamp": _stamp(time), "frame_id": ""}
+            log = {"log_time": time, "publish_time": time}
+            out.write_message("/tf", move, {"transforms": transforms}, **log)
+            for topic, values in (("/joint_states", angles), ("/joint_std", std)):
+                message = {"header": header, "name": list(motion.body.tree.coordinates), "position": values.tolist(),
+                           "velocity": [], "effort": []}  # fmt: skip
+                out.write_message(topic, state, message, **log)
+
+
+def _frames(motion: Motion, bones: list[str]) -> Iterator[tuple[int, list[dict[str, Any]], NDArray, NDArray]]:
+    """Time [ns], transforms, coordinates and their standard deviations of every frame."""
+    parents = motion.body.tree.parents
+    above = [bones[p] if p >= 0 else WORLD for p in parents]
+    before = None
+    for part in motion.parts():
+        Ts_world = np.array(part.segment_poses())
+        Ts = se3.inverse(Ts_world[:, np.maximum(parents, 0)]) @ Ts_world
+        Ts[:, parents < 0] = Ts_world[:, parents < 0]
+        turns = continuous_quaternions(Ts[..., :3, :3], before)
+        before = turns[-1] if len(turns) else before
+        for f, seconds in enumerate(part.times):
+            time = round(float(seconds) * 1e9)
+            yield time, [
+                _transform(time, above[s], bone, Ts[f, s, :3, 3].tolist(), turns[f, s].tolist())
+                for s, bone in enumerate(bones)
+            ], part.angles[f], part.dof_std[f, 6:]
+
+
+def _transform(time: int, parent: str, child: str, place: list[float], turn: list[float]) -> dict[str, Any]:
+    w, x, y, z = turn
+    return {
+        "header": {"stamp": _stamp(time), "frame_id": parent}, "child_frame_id": child,
+        "transform": {
+            "translation": dict(zip("xyz", place)), "rotation": {"x": x, "y": y, "z": z, "w": w},
+        },
+    }  # fmt: skip
+
+
+def _stamp(time: int) -> dict[str, int]:
+    return {"sec": time // 10**9, "nanosec": time % 10**9}

@@ -1,0 +1,122 @@
+"""X3D (ISO/IEC 19775) with an H-Anim figure (ISO/IEC 19774): a skeleton that moves, for browsers and archives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.errors import ExportError
+from kinefit.exporters.atomic import write_lines
+from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
+from kinefit.exporters.skeletons.rest import Rest, rest_pose, standing
+from kinefit.motion import Motion
+
+_HEAD = """<?xml version="1.0" encoding="UTF-8"?>
+<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" "https://www.web3d.org/specifications/x3d-4.0.dtd">
+<X3D profile="Immersive" version="4.0" xmlns:xsd="http://www.w3.org/2001/XMLSchema-instance" \
+xsd:noNamespaceSchemaLocation="https://www.web3d.org/specifications/x3d-4.0.xsd">"""
+
+
+def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = None, rest: str | None = None) -> None:
+    """Write a motion as X3D 4.0: an HAnimHumanoid of HAnimJoints, turned by interpolators.
+
+    Metres, y up, as the standard has it. At rest the figure stands as H-Anim asks: arms hanging, facing z. Every
+    joint turns by an OrientationInterpolator; the root, and joints that slide, move by a PositionInterpolator, too.
+    Keys are the frames, over one cycle of the TimeSensor. Segments are lines between joints, under the body's names.
+
+    Parameters
+    ----------
+    motion : Motion
+    path : path
+    names : "hanim", "kinefit", "mixamo", "cmu", "opensim" or "bvh", optional
+        Names of the joints. Default: "hanim" for a body that has such names, else its own.
+    rest : "body" or "t", optional
+        Rest pose: arms hanging, facing z; or a T facing z. Default: "t" with Mixamo's names.
+
+    Raises
+    ------
+    ExportError
+        Fewer than two frames, unknown names or rest pose, or the file cannot be written.
+    """
+    body = motion.body
+    if len(motion) < 2:
+        raise ExportError("X3D moves a figure between two frames or more", file=path, remedy="Give a longer motion.")
+    names = names or ("hanim" if body.aliases.get("hanim") else "kinefit")
+    joints = bone_names(body, names, path)
+    plain = rest_pose(body, rest, names, path)
+    pose = standing(body) if np.array_equal(plain.turns, np.broadcast_to(np.eye(3), plain.turns.shape)) else plain
+    turns, places = pose.local_moves(motion, "y")
+    moves = slides(body)
+    moves[0] = True
+    keys = _numbers(np.arange(len(motion)) / (len(motion) - 1))
+
+    def lines() -> Iterator[str]:
+        seconds = (len(motion) - 1) / motion.rate
+        yield _HEAD
+        yield f'<head><component name="HAnim" level="1"/><meta name="title" content={quoteattr(motion.name)}/>'
+        yield '<meta name="generator" content="kinefit"/></head>\n<Scene>'
+        yield f'<TimeSensor DEF="clock" cycleInterval="{seconds:.9g}" loop="true"/>'
+        yield '<HAnimHumanoid DEF="humanoid" name="humanoid" version="2.0">'
+        yield from _joints(body, pose, joints)
+        yield from (f'<HAnimJoint USE="joint_{s}" containerField="joints"/>' for s in range(len(joints)))
+        yield from (f'<HAnimSegment USE="segment_{s}" containerField="segments"/>' for s in range(len(joints)))
+        yield "</HAnimHumanoid>"
+        for s in range(len(joints)):
+            yield from _moved("Orientation", "rotation", s, keys, _axis_angles(turns[:, s]))
+            if moves[s]:
+                yield from _moved("Position", "translation", s, keys, places[:, s] - pose.offsets[s])
+        yield "</Scene>\n</X3D>"
+
+    write_lines(path, lines())
+
+
+def _joints(body: Body, pose: Rest, names: Sequence[str]) -> Iterator[str]:
+    """The tree of joints, each with its segment: lines to the joints below, or to its end."""
+    tree, ends = body.tree, body.segment_ends()
+    plain = plain_names(tree.segments)
+
+    def joint(s: int) -> Iterator[str]:
+        field = ' containerField="skeleton"' if tree.parents[s] < 0 else ""
+        centre = _numbers(pose.positions[s])
+        yield f'<HAnimJoint{field} DEF="joint_{s}" name={quoteattr(names[s])} center="{centre}">'
+        children = [int(child) for child in np.flatnonzero(tree.parents == s)]
+        to = [pose.positions[child] for child in children]
+        if not to and s in ends:
+            to = [pose.positions[s] + pose.turns[s] @ ends[s]]
+        yield f'<HAnimSegment DEF="segment_{s}" name={quoteattr(plain[s])}>'
+        if to:
+            points = _numbers(np.array([[pose.positions[s], end] for end in to]))
+            yield '<Shape><Appearance><Material emissiveColor="0.1 0.4 0.7"/></Appearance>'
+            yield f'<LineSet vertexCount="{" ".join(["2"] * len(to))}"><Coordinate point="{points}"/></LineSet></Shape>'
+        yield "</HAnimSegment>"
+        for child in children:
+            yield from joint(child)
+        yield "</HAnimJoint>"
+
+    for root in np.flatnonzero(tree.parents < 0):
+        yield from joint(int(root))
+
+
+def _moved(kind: str, field: str, s: int, keys: str, values: NDArray) -> Iterator[str]:
+    """An interpolator, and its routes from the clock and to the joint."""
+    name = f"{field}_{s}"
+    yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{_numbers(values)}"/>'
+    yield f'<ROUTE fromNode="clock" fromField="fraction_changed" toNode="{name}" toField="set_fraction"/>'
+    yield f'<ROUTE fromNode="{name}" fromField="value_changed" toNode="joint_{s}" toField="set_{field}"/>'
+
+
+def _axis_angles(quaternions: NDArray) -> NDArray:
+    """(F, 4) axis and angle [rad] of quaternions w, x, y, z; the axis z where nothing turns."""
+    sines = np.linalg.norm(quaternions[:, 1:], axis=1)
+    turned = sines > 1e-12
+    axes = np.where(turned[:, None], quaternions[:, 1:] / np.where(turned, sines, 1.0)[:, None], [0.0, 0.0, 1.0])
+    return np.column_stack([axes, 2.0 * np.arctan2(sines, quaternions[:, 0])])
+
+
+def _numbers(values: NDArray) -> str:
+    return " ".join(f"{value + 0.0:.9g}" for value in np.ravel(values).tolist())

@@ -1,0 +1,38 @@
+"""Jobs for workers, which import them: some end well, some do not."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def square(number):
+    return number * number
+
+
+def slow_first(number):
+    time.sleep(0.6 if number == 0 else 0.0)
+    return number
+
+
+def odd_is_wrong(number):
+    if number % 2:
+        raise RuntimeError(f"{number} is odd")
+    return number
+
+
+def dies_once(marker):
+    if Path(marker).exists():
+        return "alive"
+    Path(marker).touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def killed(number):
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def threads(_):
+    return os.environ["OMP_NUM_THREADS"], os.getpid()
