@@ -114,8 +114,8 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clic
     for c, camera in enumerate(seen.rig.names):
         places = clicks.places(camera)
         uv[:, c] = seen.images[camera].to_calibration(places) if camera in seen.images else places
-    x_world = clicked_points(seen.rig, names, uv)
-    fitted, state, left = clicked_start(body, names, x_world)
+    x_world, covariance = clicked_points(seen.rig, names, uv)
+    fitted, state, left = clicked_start(body, names, x_world, covariance)
     save_body(fitted, out.with_name(BODY))
     tree, R = fitted.tree, state.T_world_root[:3, :3]
     angles = np.clip(state.angles, tree.lower + _INSIDE, tree.upper - _INSIDE)
