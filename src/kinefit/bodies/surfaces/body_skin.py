@@ -223,17 +223,20 @@ def _hole(
     taken[faces[~free]] = True
     covered = field(limbs, host.vertices) >= LEVEL
     best, out = np.inf, None
+    turns = (np.arange(len(ring)) + np.arange(len(ring))[:, None]) % len(ring)
     for block, loop in _blocks(host, len(ring)):
         if taken[loop].any() or not free[block].all():
             continue
-        border, inside = host.vertices[loop], np.zeros(len(host.vertices), bool)
+        border = host.vertices[loop]
+        if len(ring) * float(np.sum((border.mean(axis=0) - ring.mean(axis=0)) ** 2)) >= best:
+            continue  # however it is turned
+        inside = np.zeros(len(host.vertices), bool)
         inside[faces[block]] = True
-        poking = (covered & ~inside).sum()
-        for shift in range(len(ring)):
-            turned = np.roll(border, -shift, axis=0)
-            cost = float(np.sum((turned - ring) ** 2)) * (1.0 + poking / len(ring))
-            if cost < best:
-                best, out = cost, (block, np.roll(loop, -shift))
+        squares = np.sum((border[turns] - ring) ** 2, axis=(1, 2))
+        shift = int(np.argmin(squares))
+        cost = float(squares[shift]) * (1.0 + (covered & ~inside).sum() / len(ring))
+        if cost < best:
+            best, out = cost, (block, loop[turns[shift]])
     if out is None:
         name = body.tree.segments[limbs[0].limb.segment]
         raise BodyError(f"no room for the limb of segment '{name}' where it branches off", remedy="Move limbs apart.")

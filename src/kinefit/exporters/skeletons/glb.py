@@ -23,8 +23,8 @@ _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSI
 def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None) -> None:
     """Write a motion as GLB, in metres and y up, as the format prescribes; time starts at 0.
 
-    One mesh hangs on one skin: rounded tubes about the body's surfaces, a seamless skin over its metaballs. The bind pose
-    is the rest pose; the animation turns every joint that can turn and moves the root.
+    One mesh hangs on one skin: rounded tubes about the body's surfaces, a seamless skin over its metaballs. The bind
+    pose is the rest pose; the animation turns every joint that can turn and moves the root.
 
     Parameters
     ----------
