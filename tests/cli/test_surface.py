@@ -124,6 +124,13 @@ def test_two_photographs_of_a_plate_become_a_strain_map(tmp_path):
     assert isinstance(told.exception, ObservationError) and "a=before.png" in str(told.exception)
 
 
+def test_a_flat_surface_without_texture_is_told(tmp_path):
+    for name in ("before.png", "after.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((200, 200), 128, np.uint8))
+    told = call(tmp_path / "before.png", tmp_path / "after.png", "--flat", 0.05, "-o", tmp_path / "out")
+    assert isinstance(told.exception, ObservationError) and "no texture" in str(told.exception)
+
+
 def test_smoothing_is_heard(folder, tmp_path):
     std = []
     for smooth in (0, 1):
