@@ -46,7 +46,7 @@ def _errors(
     names = clickable(truth)
     x = truth.positions(state, truth.landmarks.select(names))
     uv = np.stack([c.project(x) + NOISE * rng.normal(size=(len(x), 2)) for c in rig], axis=1)
-    body, found, _ = clicked_start(generic, names, clicked_points(rig, names, uv))
+    body, found, _ = clicked_start(generic, names, *clicked_points(rig, names, uv))
     there = body.positions(found, body.landmarks.select(names))
     off = [np.degrees(found.angles - state.angles)[truth.tree.coordinate(bend)] for bend in bends]
     return float(np.linalg.norm(there - x, axis=1).max()), [float(v) for v in off]

@@ -8,24 +8,33 @@ ways: radii and poses at once (`subject.fit.fit_subject`, as takes have it), and
 
 from __future__ import annotations
 
+import tempfile
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from tests.bodies.surfaces.test_body_skin import crossings
 
 from benchmarks.figures import amount, figure
+from benchmarks.retarget import validated
 from benchmarks.surface_body import OFF, moving_arm
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import Metaballs, nearest
-from kinefit.bodies.surfaces.spline_skin import chain_skin, chains
+from kinefit.bodies.surfaces.body_skin import BodySkin, body_skins
+from kinefit.bodies.surfaces.metaballs import LEVEL
+from kinefit.bodies.surfaces.skin_tubes import field
+from kinefit.bodies.surfaces.subdivision import subdivided
 from kinefit.correspondences import surface_rows
+from kinefit.exporters import write_glb
 from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
 from kinefit.recipes.metaball_bodies import metaball_bodies
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.simulation import squat_and_wave
 from kinefit.solvers.equations import normal_equations
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_balls
@@ -64,20 +73,47 @@ def run() -> None:
 
 
 def _skin() -> None:
-    """The seamless skin of arms: how far vertices are from where the balls' fields end, and edges without a twin."""
-    off, open_edges = [], 0
+    """The seamless skin of arms and of whole bodies: open edges, how far it is from where the fields end, crossings."""
+    off, open_edges, through = {"arm": [], "body": []}, 0, 0
     for seed in range(24, 24 + amount(6, 1)):
-        body = arm(seed, 1, 10)[0]
-        for limbs in chains(body):
-            x, faces, _ = chain_skin(body, limbs).patch.mesh()
-            told = [limb.derivatives(x - body.tree.rest[limb.segment]) for limb in limbs]
-            value = np.array([one.value for one in told])
-            slope = np.array([one.by_point for one in told])[np.argmax(value, axis=0), np.arange(len(x))]
-            off.append((value.max(axis=0) - 0.5) / np.linalg.norm(slope, axis=1))
-            edges = {tuple(edge) for i in range(3) for edge in faces[:, [i, (i + 1) % 3]].tolist()}
-            open_edges += sum((b, a) not in edges for a, b in edges)
+        for name, body in (("arm", arm(seed, 1, 10)[0]), ("body", another_body(seed))):
+            for skin in body_skins(body):
+                x, triangles, _ = skin.mesh()
+                joined = subdivided(skin.joined.astype(float)[:, None], skin.faces)[0][:, 0] > 0
+                off[name].append(distances(x[~joined], skin))
+                edges = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+                open_edges += int(np.count_nonzero(np.unique(edges, axis=0, return_counts=True)[1] != 2))
+                through += len(crossings(x, triangles))
     figure("metaballs_skin_open_edges", open_edges, "edges", "== 0")
-    figure("metaballs_skin_off", 1e3 * float(np.sqrt(np.mean(np.concatenate(off) ** 2))), "mm RMS", "<= 1")
+    figure("metaballs_skin_crossings", through, "pairs of triangles", "== 0")
+    for name, values in off.items():
+        rms = 1e3 * float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
+        figure(f"metaballs_skin_off_{name}", rms, "mm RMS", "<= 1")
+    motion = next(squat_and_wave(up="y").parts(30))
+    with tempfile.TemporaryDirectory() as place:
+        write_glb(replace(motion, body=load_body("humanoid_metaballs")), Path(place) / "skin.glb")
+        errors, why = validated([Path(place) / "skin.glb"])
+    figure("metaballs_skin_validator_errors", errors, "errors", "== 0", why)
+
+
+def another_body(seed: int) -> Body:
+    """A whole body of other lengths and radii, up to 10 % from the catalogue's."""
+    rng, body = np.random.default_rng(seed), load_body("humanoid_metaballs")
+    body = body.scaled(1.0 + 0.1 * rng.uniform(-1, 1, len(body.scale_groups)))
+    limbs = [s.changed(s.radii * np.exp(rng.uniform(-0.1, 0.1, s.radii.shape))) for s in body.surfaces
+             if isinstance(s, Metaballs)]  # fmt: skip
+    return replace(body, surfaces=tuple(limbs))
+
+
+def distances(x: NDArray, skin: BodySkin) -> NDArray:
+    """(N,) [m] from points of a skin to where the fields of the nearest of its tubes end."""
+    out, h = np.full(len(x), np.inf), 1e-6
+    for limbs in skin.tubes:
+        ways = h * np.eye(3)
+        slope = np.stack([(field(limbs, x + way) - field(limbs, x - way)) / (2 * h) for way in ways], axis=1)
+        with np.errstate(all="ignore"):  # far away there is no slope
+            out = np.fmin(out, np.abs(field(limbs, x) - LEVEL) / np.linalg.norm(slope, axis=1))
+    return out
 
 
 def _told(radii: NDArray) -> str:

@@ -11,6 +11,7 @@ PARTS = {
     "lsm": "sub-pixel shifts and affinities of drawn texture, beside OpenCV",
     "stereo_cylinder": "a speckled cylinder before two cameras, in three positions",
     "surface_body": "a drawn textured arm through `kinefit surface` and `kinefit track`",
+    "surface_return": "points of the same arm that vanish, found again where its motion says",
     "video_bodies": "drawn videos and a bar recording through the commands, with nothing but clicked joints",
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",

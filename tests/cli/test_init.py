@@ -164,6 +164,31 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
     assert answer.exit_code == 2 and "[1] is no pixel" in answer.stderr
 
 
+def test_clicks_that_no_pose_has_are_told(folder, tmp_path):
+    motion = squat_and_wave()
+    assert run("init", folder).exit_code == 0
+    told = clicked(folder, motion)
+
+    def answered(change):
+        other = json.loads(json.dumps(told))
+        change(other["points"])
+        (tmp_path / "clicks.json").write_text(json.dumps(other))
+        return run("init", folder, "--points", tmp_path / "clicks.json", "--force")
+
+    def exchanged(points):
+        for of in points.values():
+            for name in ("hip", "knee", "ankle"):
+                of[f"r_{name}"], of[f"l_{name}"] = of[f"l_{name}"], of[f"r_{name}"]
+
+    assert "Warning" not in answered(lambda points: None).stdout
+    answer = " ".join(answered(exchanged).stdout.split())
+    assert "Warning: no pose of this body has them" in answer and "left and right are exchanged" in answer
+    answer = answered(lambda points: points["cam02"].update(knie=[10.0, 20.0]))
+    assert answer.exit_code == 2 and "'knie'" in answer.stderr
+    answer = answered(lambda points: points["cam02"].update(r_thigh_front=[10.0, 20.0]))
+    assert "Clicked in one image alone, and not used: r_thigh_front" in " ".join(answer.stdout.split())
+
+
 def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
     assert run("init", folder).exit_code == 0
     right, seen = clicked(folder, squat_and_wave(), frame=0), {}

@@ -1,6 +1,7 @@
 """`kinefit surface`: photographs and videos of drawn planes, a real board, and input that cannot be."""
 
 import csv
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -123,6 +124,13 @@ def test_two_photographs_of_a_plate_become_a_strain_map(tmp_path):
     assert isinstance(told.exception, ObservationError) and "a=before.png" in str(told.exception)
 
 
+def test_a_flat_surface_without_texture_is_told(tmp_path):
+    for name in ("before.png", "after.png"):
+        cv2.imwrite(str(tmp_path / name), np.full((200, 200), 128, np.uint8))
+    told = call(tmp_path / "before.png", tmp_path / "after.png", "--flat", 0.05, "-o", tmp_path / "out")
+    assert isinstance(told.exception, ObservationError) and "no texture" in str(told.exception)
+
+
 def test_smoothing_is_heard(folder, tmp_path):
     std = []
     for smooth in (0, 1):
@@ -147,6 +155,26 @@ def test_videos_are_tracked(folder, tmp_path):
     assert len(last) > 30
     told = call(folder / "calib.toml", *views, "-o", out, "--gauge", 3)
     assert isinstance(told.exception, ObservationError) and "--gauge with videos" in str(told.exception)
+
+
+def test_a_motion_must_be_of_the_same_videos(folder, tmp_path):
+    from benchmarks.surface_body import moving_arm
+
+    from kinefit.exporters.motion_file import write_motion
+
+    views = f"a={folder / 'a.avi'}", f"b={folder / 'b.avi'}"
+    motion, file = moving_arm(0, 4), tmp_path / "motion.npz"
+    write_motion(motion, file)
+    told = call(folder / "calib.toml", *views, "-o", tmp_path / "out", "--step", 15, "--motion", file)
+    assert told.exit_code == 0, told.output  # nothing of the plane is the arm's: as without it
+    for other in (replace(motion, rate=60.0), replace(motion, times=motion.times + 1.0)):
+        write_motion(other, file)
+        told = call(folder / "calib.toml", *views, "-o", tmp_path / "out", "--motion", file)
+        assert isinstance(told.exception, FileError) and "for videos at 30 Hz" in str(told.exception)
+    told = call(folder / "calib.toml", f"a={folder / 'a'}", f"b={folder / 'b'}", "--motion", file)
+    assert isinstance(told.exception, ObservationError) and "--motion with photographs" in str(told.exception)
+    told = call("a.png", "b.png", "--flat", 0.05, "--motion", file)
+    assert isinstance(told.exception, ObservationError) and "--motion with --flat" in str(told.exception)
 
 
 def test_a_real_board_from_seeds_by_hand_is_flat(data_dir, tmp_path):

@@ -30,7 +30,7 @@ def test_pose_and_lengths_come_back():
     scales = np.linspace(0.9, 1.1, len(BODY.scale_groups))
     person = BODY.scaled(scales)
     x, uv = clicks(noise=2.0)
-    assert np.linalg.norm(clicked_points(RIG, NAMES, uv) - x, axis=1).max() < 0.03
+    assert np.linalg.norm(clicked_points(RIG, NAMES, uv)[0] - x, axis=1).max() < 0.03
     state = MOTION.state(20)
     x = person.positions(state, person.landmarks.select(NAMES))
     fitted, found, left = clicked_start(BODY, NAMES, x)
@@ -74,3 +74,25 @@ def test_two_cameras_do_not_tell_which_of_them_is_off():
 def test_names_that_the_body_does_not_have():
     with pytest.raises(TrackingError, match="no landmark of body 'humanoid' 'knie'"):
         clicked_start(BODY, ["knie", "r_hip", "l_hip"], np.zeros((3, 3)))
+
+
+def test_short_bones_follow_the_others_as_far_as_their_clicks_are_unsure():
+    person = BODY.scaled(np.full(len(BODY.scale_groups), 1.1))
+    x = person.positions(MOTION.state(20), person.landmarks.select(NAMES))
+    group, camera = BODY.scale_groups.index("foot"), RIG.cameras[0]
+    off, alone = [], []
+    for seed in range(8):
+        uv = np.stack([c.project(x) for c in RIG], axis=1)
+        uv += 3.0 * np.random.default_rng(seed).normal(size=uv.shape)
+        points, covariance = clicked_points(RIG, NAMES, uv)
+        along = (points - camera.centre_world) / np.linalg.norm(points - camera.centre_world, axis=1, keepdims=True)
+        assert (np.einsum("ni,nij,nj->n", along, covariance, along) > np.trace(covariance, axis1=1, axis2=2) / 3).all()
+        for told, values in (((covariance,), off), ((), alone)):
+            values.append(_scale(clicked_start(BODY, NAMES, points, *told)[0], group) / 1.1 - 1.0)
+    assert np.abs(off).max() < 0.06 < np.abs(alone).max()
+
+
+def _scale(body, group):
+    segment = BODY.tree.segment("toes_r")
+    assert BODY.scale_groups[group] == "foot"
+    return np.linalg.norm(body.tree.offsets[segment]) / np.linalg.norm(BODY.tree.offsets[segment])

@@ -90,6 +90,9 @@ def test_cameras_in_one_place_are_refused():
     rig = Rig(scenes.three(apart=0.004).cameras[:2])
     with pytest.raises(CalibrationError, match="degrees at most"):
         measure(rig, images(rig), GRID)
+    rig = Rig(scenes.three(apart=0.0).cameras[:2])
+    with pytest.raises(CalibrationError, match="camera b.*stands where camera a does"):
+        measure(rig, images(rig), GRID)
 
 
 @pytest.mark.parametrize("field", ["odd", "even"])

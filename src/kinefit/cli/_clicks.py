@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from kinefit.readers.take.load import Observations
 
 _INSIDE = 1e-6  # [rad] or [m] from a joint's limits, that rounding does not cross them
+_FAR = 0.1  # [m] of a clicked joint from the pose: the worst of those clicked with care is 2 to 5 cm off
+_LISTED = 4  # joints that a warning names
 BODY = "clicked-body.npz"
 CLICKS = "clicks.json"
 
@@ -103,23 +105,28 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clic
 
     from kinefit.bodies.serial import save_body
     from kinefit.exporters.atomic import write_text
-    from kinefit.initialization.from_clicks import clicked_points, clicked_start
+    from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
 
     assert seen.rig is not None
     unknown = [camera for camera in clicks.points if camera not in seen.rig.names]
     if unknown:
         raise TrackingError(choices("camera of the take", unknown[0], seen.rig.names))
+    every = [name for of in clicks.points.values() for name in of]
+    strange = [name for name in every if name not in body.landmarks.names]
+    if strange:
+        raise TrackingError(choices(f"landmark of body '{body.name}'", strange[0], clickable(body)))
+    once = [name for name in dict.fromkeys(every) if every.count(name) == 1]
     names = clicks.names
     uv = np.full((len(names), len(seen.rig), 2), np.nan)
     for c, camera in enumerate(seen.rig.names):
         places = clicks.places(camera)
         uv[:, c] = seen.images[camera].to_calibration(places) if camera in seen.images else places
-    x_world = clicked_points(seen.rig, names, uv)
-    fitted, state, left = clicked_start(body, names, x_world)
+    x_world, covariance = clicked_points(seen.rig, names, uv)
+    fitted, state, left = clicked_start(body, names, x_world, covariance)
     save_body(fitted, out.with_name(BODY))
     tree, R = fitted.tree, state.T_world_root[:3, :3]
     angles = np.clip(state.angles, tree.lower + _INSIDE, tree.upper - _INSIDE)
-    told = ", ".join(
+    written = ", ".join(
         f"{name} = {value if slides else np.degrees(value):.6f}"
         for name, value, slides in zip(tree.coordinates, angles, tree.prismatic)
     )
@@ -127,7 +134,16 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clic
     lines = [f"{key} = [{', '.join(f'{v:.6f}' for v in vector)}]" for key, vector in vectors.items()]
     text = re.sub(r"\n\[start\]  # clicked\n.*?(?=\n\[|\Z)", "", out.read_text("utf-8"), flags=re.S)
     text = re.sub(r"(?m)^body = .*$", f'body = "{BODY}"  # {body.name} of the clicked lengths', text, count=1)
-    start = "\n".join(["[start]  # clicked", f"step = {clicks.step}", *lines, f"angles = {{ {told} }}"])
+    start = "\n".join(["[start]  # clicked", f"step = {clicks.step}", *lines, f"angles = {{ {written} }}"])
     write_text(out, f"{text.rstrip()}\n\n{start}\n")
     known = np.isfinite(x_world).all(axis=1).sum()
-    return f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
+    told = f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
+    if once:
+        told += f" Clicked in one image alone, and not used: {', '.join(once)}."
+    off = np.linalg.norm(fitted.positions(state, fitted.landmarks.select(names)) - x_world, axis=1)
+    if np.nanmax(off) > _FAR:
+        worst = np.argsort(-np.nan_to_num(off))[:_LISTED].tolist()
+        told += " Warning: no pose of this body has them; the worst are "
+        told += ", ".join(f"{names[n]} ({100 * off[n]:.0f} cm)" for n in worst)
+        told += ". Look whether left and right are exchanged, the same in every image."
+    return told

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -14,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, TrackingError, shortened
+from kinefit.cli._surface_files import PHOTOGRAPHS, Views, read_seeds
+from kinefit.errors import FileError, ObservationError, TrackingError
 from kinefit.exporters.surface_files import (
     point_columns,
     write_field_picture,
@@ -24,20 +24,18 @@ from kinefit.exporters.surface_files import (
     write_surface_vtk,
 )
 from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
 from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import Surface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, uniform
-from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.image_folders import images_in
+from kinefit.readers.motion import read_motion
 from kinefit.readers.video import Video, check_rates
-
-_PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 Progress = Callable[[str, int, int], None]
 
@@ -57,6 +55,7 @@ class Wanted:
     still: int | None
     field: str | None
     smooth: float
+    motion: Path | None = None
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all."""
@@ -70,85 +69,6 @@ class Wanted:
         if self.window == "texture":
             return windows_by_texture(first, second, np.nan_to_num(grid.points))
         return self.side_of_all()
-
-
-@dataclass(frozen=True)
-class Views:
-    """Photographs of each camera, one a state; or a video of each."""
-
-    names: tuple[str, ...]
-    photographs: tuple[tuple[Path, ...], ...]
-    videos: tuple[Path, ...]
-
-
-def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig, Views]:
-    """Cameras that are named, and their files; a calibration that states no image size has that of the first view.
-
-    Raises
-    ------
-    ObservationError
-        Fewer than two views, one without a name, photographs beside videos, or other numbers of photographs.
-    FileError
-        A file or folder that is not there or holds no image.
-    """
-    names, photographs, videos = [], [], []
-    for view in views:
-        name, sign, path = view.partition("=")
-        if not sign or not path:
-            raise ObservationError(f"a view '{view}'", remedy="Write CAMERA=PATH, with the camera's name.")
-        place = Path(path)
-        names.append(name)
-        if place.is_dir() or "*" in place.name:
-            files = images_in(place)
-            if not files:
-                raise FileError("no images here", file=place, remedy="Name a photograph, a folder of them, or a video.")
-            photographs.append(tuple(files))
-        elif place.suffix.lower() in _PHOTOGRAPHS:
-            photographs.append((place,))
-        else:
-            videos.append(place)
-    if len(names) < 2 or (photographs and videos) or len({len(files) for files in photographs}) > 1:
-        counts = ", ".join(str(len(files)) for files in photographs)
-        problem = f"{len(names)} views: {len(videos)} videos, photographs: {counts or 'none'}"
-        raise ObservationError(problem, remedy="Give two views or more, all videos or all with as many photographs.")
-    if photographs:
-        size = read_picture(photographs[0][0]).shape[1::-1]
-    else:
-        with Video(videos[0]) as video:
-            size = video.size
-    metres = float(unit) if _is_number(unit) else unit
-    rig = read_calibration(calibration, unit=metres, image_size=size)
-    return rig.select(tuple(names)), Views(tuple(names), tuple(photographs), tuple(videos))
-
-
-def read_seeds(path: Path, views: int) -> list[Seeds]:
-    """Seeds from the first camera to each other one, of a CSV file: a row has u and v in every view."""
-    remedy = "Give u and v [px] of each point in every view: u1,v1,u2,v2."
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            rows = [(reader.line_num, row) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"cannot be read: {error}", file=path, remedy="Write numbers, separated by commas.") from None
-    if rows and not _is_number(rows[0][1][0]):
-        rows = rows[1:]
-    for line, row in rows:
-        bad = next((cell for cell in row if cell.strip() and not _is_number(cell)), None)
-        if bad is not None or len(row) != 2 * views:
-            problem = f"{len(row)} columns for {views} views" if bad is None else f"'{shortened(bad, 60)}' is no number"
-            raise FileError(problem, file=path, place=f"line {line}", remedy=remedy)
-    table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for _, row in rows])
-    if not len(table):
-        raise FileError("no points in it", file=path, remedy=remedy)
-    return [Seeds.of(table[:, :2], table[:, 2 * k : 2 * k + 2]) for k in range(1, views)]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def with_field(rig: Rig, field: str | None) -> Rig:
@@ -195,7 +115,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
     ObservationError
         Fewer than two photographs, views with names of cameras, or --seeds.
     """
-    named = [str(p) for p in photographs if p.suffix.lower() not in _PHOTOGRAPHS or ("=" in p.name and not p.exists())]
+    named = [str(p) for p in photographs if p.suffix.lower() not in PHOTOGRAPHS or ("=" in p.name and not p.exists())]
     if named or wanted.seeds is not None or len(photographs) < 2:
         problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
         raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
@@ -308,16 +228,19 @@ def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -
         problem = f"{', '.join(given)} with videos"
         raise ObservationError(problem, remedy="These are for photographs: states of one surface.")
     rig = with_field(rig, wanted.field)
+    motion = None if wanted.motion is None else read_motion(wanted.motion)
     with ExitStack() as opened:
         videos = [opened.enter_context(Video(path)) for path in views.videos]
         check_rates({name: video.rate for name, video in zip(views.names, videos)})
+        if motion is not None:
+            _check_motion(motion, wanted.motion, videos[0].rate)
         count = min(len(video) for video in videos)
         settings = SurfaceTracking(
             window=wanted.side_of_all(), step=wanted.step,
             least=LEAST_CORRELATION if wanted.least is None else wanted.least,
         )  # fmt: skip
         seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
-        tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds)
+        tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)
         told = []
         for k in range(count):
             images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
@@ -339,6 +262,14 @@ def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -
     about = f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} a frame"
     told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
     return told
+
+
+def _check_motion(motion: Motion, path: Path | None, rate: float) -> None:
+    """Refuse a motion of another rate than the videos', or one that does not begin with them."""
+    if abs(motion.rate - rate) > 1e-3 * rate or abs(float(motion.times[0])) > 0.5 / rate:
+        problem = f"a motion at {motion.rate:g} Hz from {motion.times[0]:.3f} s on, for videos at {rate:g} Hz"
+        remedy = "Give the motion of these videos: kinefit track of a take with rate and first frame as theirs."
+        raise FileError(problem, file=path, place="times", remedy=remedy)
 
 
 def _surroundings(paths: Trajectories) -> float:

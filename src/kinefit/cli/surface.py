@@ -40,12 +40,17 @@ Examples:
     "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
     help="Photographs of one camera that faces a flat surface; MM are the millimetres that a pixel shows.",
 )  # fmt: skip
+@click.option(
+    "--motion", type=click.Path(path_type=Path),
+    help="Of videos: the motion.npz, or its folder, of the body that they show; lost points are sought where it says.",
+)  # fmt: skip
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
-    smooth: float, flat: float | None, field: str | None, verbose: bool,
+    smooth: float, flat: float | None, motion: Path | None, field: str | None,
+    verbose: bool,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 
@@ -56,14 +61,20 @@ def surface(
     With --flat no calibration is needed: all arguments are photographs, before and after.
     """
     from kinefit.cli._results import check_folder
-    from kinefit.cli._surface import Wanted, measure_one_camera, measure_photographs, measure_videos, read_views
+    from kinefit.cli._surface import Wanted, measure_one_camera, measure_photographs, measure_videos
+    from kinefit.cli._surface_files import read_views
+    from kinefit.errors import ObservationError
 
     check_folder(out)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth)
+    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion)
+    if motion is not None and flat is not None:
+        raise ObservationError("--motion with --flat", remedy="It is for videos, which are followed in time.")
     if flat is not None:
         told = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
         rig, paths = read_views(calibration, unit, views)
+        if motion is not None and not paths.videos:
+            raise ObservationError("--motion with photographs", remedy="It is for videos, which are followed in time.")
         with _screen.bars() as progress:
             told = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
     for line in told:

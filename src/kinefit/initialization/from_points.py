@@ -11,16 +11,21 @@ from kinefit.correspondences import point_rows, prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3
 from kinefit.losses import SQUARED, geman_mcclure
-from kinefit.rows import AnyRows
+from kinefit.rows import AnyRows, Rows
 from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.shape import PROPORTIONS
 
 _NUMBERS = {3: "three", 6: "six"}
 
 
-def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: float | None = None) -> NDArray:
+def first_scales(
+    body: Body, points: PointSet, x_world: NDArray, *, height: float | None = None, covariance: NDArray | None = None
+) -> NDArray:
     """(G,) scales from the median lengths of bones over frames: x_world (F, K, 3) [m], NaN where unknown.
 
     Groups without a bone to measure follow the person's height [m] where it is given, else the median of the others.
+    Where the points' `covariance` (K, 3, 3) [m²] is given, so do those whose bones are short against it: means of what
+    was measured and of what people's proportions vary by, weighted by their variances.
 
     Raises
     ------
@@ -28,23 +33,41 @@ def first_scales(body: Body, points: PointSet, x_world: NDArray, *, height: floa
         No bone can be measured in any frame.
     """
     ratios: dict[int, list[tuple[float, float]]] = {}
+    sure = covariance is not None
     for i, j, group, length in rigid_pairs(body, points):
-        distances = np.linalg.norm(x_world[:, i] - x_world[:, j], axis=1)
+        gaps = x_world[:, i] - x_world[:, j]
+        distances = np.linalg.norm(gaps, axis=1)
         if np.isfinite(distances).any():
-            ratios.setdefault(group, []).append((float(np.nanmedian(distances)) / length, length))
+            weight = length if covariance is None else length**2 / _along(gaps, covariance[i] + covariance[j])
+            ratios.setdefault(group, []).append((float(np.nanmedian(distances)) / length, weight))
     if not ratios:
         raise TrackingError(
             "no bone of the body can be measured: too few keypoints are seen by two cameras at once",
             remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
         )
     means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
-    whole = height / body.stature if height and body.stature else float(np.median(list(means.values())))
+    told = {g: sum(w for _, w in v) for g, v in ratios.items()}
+    people = PROPORTIONS**-2
+    if height and body.stature:
+        whole = height / body.stature
+    elif sure:
+        whole = float(np.average(list(means.values()), weights=[1.0 / (1.0 / w + 1.0 / people) for w in told.values()]))
+    else:
+        whole = float(np.median(list(means.values())))
+    if sure:
+        means = {g: (told[g] * m + people * whole) / (told[g] + people) for g, m in means.items()}
     if not 0.2 < whole < 5.0:
         raise TrackingError(
             f"the person would be {float(f'{whole:.2g}'):g} times the body's size: the calibration's unit is wrong",
             remedy=f"Set unit = {_unit_for(whole)} under [calibration], or correct what stands there.",
         )
     return np.array([np.clip(means.get(g, whole), 0.6 * whole, 1.6 * whole) for g in range(len(body.scale_groups))])
+
+
+def _along(gaps: NDArray, covariance: NDArray) -> float:
+    """[m²] variance (3, 3) of a difference along the median of its values (F, 3)."""
+    way = np.nanmedian(gaps, axis=0)
+    return float(way @ covariance @ way / (way @ way))
 
 
 def _unit_for(times: float) -> str:
@@ -67,10 +90,11 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
 
 def pose_from_points(
     body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None,
-    fewest: int = 6, robust: bool = True,
+    fewest: int = 6, robust: bool = True, covariance: NDArray | None = None,
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 
+    `sigma` [m] along each axis, or else a `covariance` (K, 3, 3) [m²] of each.
     `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and
     turned about its long axis; the cheaper end wins. `near` is a start that is known to be close, the only one then.
 
@@ -84,8 +108,18 @@ def pose_from_points(
         problem = f"fewer than {_NUMBERS.get(fewest, fewest)} points are known in space"
         raise TrackingError(problem, remedy="Start where more cameras see the body.")
 
+    if covariance is not None:
+        values, vectors = np.linalg.eigh(covariance[known])
+        axes, variances = vectors.swapaxes(1, 2).reshape(-1, 3), values.ravel()
+        own = np.arange(known.sum()).repeat(3)
+
     def rows(state: BodyState) -> list[AnyRows]:
-        return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
+        if covariance is None:
+            return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
+        x = body.positions(state, points)[known].repeat(3, axis=0)
+        gap = np.einsum("ni,ni->n", axes, x_world[known].repeat(3, axis=0) - x)
+        segments = points.segments[known].repeat(3)
+        return [Rows.of(segments, x, axes, gap, 1.0 / variances, own), prior_rows(body, state)]
 
     starts = (
         [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]

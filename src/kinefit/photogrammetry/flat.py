@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.surface import Surface, refuse_repeated
+from kinefit.photogrammetry.surface import Surface, refuse_repeated, refuse_untextured
 from kinefit.photogrammetry.unaided import grow_over_time
 
 _EXACT = 1e-6  # [px²] of the places in the first image, which define the points
@@ -63,6 +63,7 @@ def measure_flat(
             raise ObservationError(problem, remedy="Give images of one camera.")
         found = grow_over_time(first, image, here, window=window, least=least)
         if not found.found.any():
+            refuse_untextured(first, "first image")
             remedy = "Light it better, take a larger window, or images of states between."
             raise ObservationError(f"nothing of the first image is found in image {k}", remedy=remedy)
         refuse_repeated(first, image, found, f"image {k}")

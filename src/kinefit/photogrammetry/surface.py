@@ -23,6 +23,7 @@ _FEWEST = 3  # points of a surface
 _REPEATED = 31  # [px] of windows in which a repetition is sought
 _ALIKE = 0.95  # of the best correlation; of random texture the runner-up has 0.6 to 0.8 of it
 _OUTLYING = 6.0  # robust deviations of the parallax beyond which a match is a wrong one
+_ONE_PLACE = 1e-5  # [m] between two cameras: less is a copy
 _LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration leaves as much
 
 
@@ -75,7 +76,7 @@ def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
     ObservationError
         Fewer than two, or another number than cameras.
     CalibrationError
-        An image of another size than its camera's calibration.
+        An image of another size than its camera's calibration; a camera that stands where the first one does.
     """
     if len(images) != len(rig) or len(rig) < 2:
         raise ObservationError(f"{len(images)} images for {len(rig)} cameras", remedy="Give one of each, two or more.")
@@ -84,6 +85,12 @@ def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
             has, was = ("x".join(map(str, size)) for size in (image.size, camera.size))
             problem = f"its image has {has} px, its calibration {was}"
             remedy = "Give images as they were calibrated, or calibrate the camera at this size."
+            raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
+    centres = np.array([camera.centre_world for camera in rig])
+    for camera, centre in zip(rig.cameras[1:], centres[1:]):
+        if np.linalg.norm(centre - centres[0]) < _ONE_PLACE:
+            problem = f"it stands where camera {rig.names[0]} does: nothing tells a distance"
+            remedy = "Put the cameras apart, or check the calibration and its unit."
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
 
 
@@ -135,12 +142,23 @@ def measure(
     return surface
 
 
-def _refuse(first: SplineImage, camera: str) -> None:
-    """Say why nothing was matched."""
+def refuse_untextured(first: SplineImage, place: str) -> None:
+    """Say so where an image in which nothing was matched has no texture.
+
+    Raises
+    ------
+    ObservationError
+        It has none beyond its noise; `place` is named.
+    """
     contrast = float(np.std(first.grey))
     if contrast < 3.0 * first.noise:
         problem = f"no texture coarser than noise: grey values scatter by {contrast:.1f}, noise by {first.noise:.1f}"
-        raise ObservationError(problem, place="first camera", remedy="Put texture on the surface, or light it better.")
+        raise ObservationError(problem, place=place, remedy="Put texture on the surface, or light it better.")
+
+
+def _refuse(first: SplineImage, camera: str) -> None:
+    """Say why nothing was matched."""
+    refuse_untextured(first, "first camera")
     problem = "nothing of the first image is found in it"
     remedy = "Give seeds by hand, a larger window, or a mask; texture that repeats is found nowhere for sure."
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)

@@ -3,7 +3,8 @@
 N. D'Apuzzo, R. Plänkers, P. Fua, A. Gruen and D. Thalmann, Modeling human bodies from video sequences (1999), section
 2.4: linear prediction, a search box scanned by cross-correlation, least-squares matching to the next image in every
 view, and between the views where the points ended up; a point is kept if both agree. Lost points are regenerated, and
-new ones made as they become visible, from the neighbours that are there.
+new ones made as they become visible, from the neighbours that are there. Where a body's motion is known, lost points
+are found again, with their names, as it brings them back into view (`returning`).
 """
 
 from __future__ import annotations
@@ -16,16 +17,19 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
 from kinefit.photogrammetry.correlation import search_box
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, match
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface import check_images, largest_parallax, measure
 from kinefit.photogrammetry.trajectories import Trajectories
 
 _BEYOND = 3.0  # standard deviations by which temporal and spatial matches may differ beyond the stated agreement
 _BESIDE = 3.0  # steps of the grid from a point that was lost to one that was found, for it to be sought again
+_EXPECTED = 0.5  # of the box, within which a point that comes back is taken for itself
 _ROUNDS = 20  # of seeking again, in which a motion spreads from point to point
 
 
@@ -90,6 +94,7 @@ class SurfaceTracker:
     mask : (H, W) bool, where in the first camera's first image the surface is; regenerated points need live neighbours,
         and so stay with it
     seeds : as of `measure`, for the first frame
+    motion : of a body whose surface it is, frame by frame; it says where points that were lost come back
     """
 
     rig: Rig
@@ -97,10 +102,16 @@ class SurfaceTracker:
     settings: SurfaceTracking = SurfaceTracking()
     mask: NDArray | None = None
     seeds: Sequence[Seeds] | None = None
+    motion: Motion | None = None
     _frames: list[SurfacePoints] = field(default_factory=list)
     _images: Sequence[SplineImage] = ()
     _velocity: NDArray = field(default_factory=lambda: np.zeros((0, 0, 2)))
     _next: int = 0
+    _vanished: Vanished | None = None
+
+    def __post_init__(self) -> None:
+        if self.motion is not None:
+            self._vanished = Vanished(self.rig, self.motion, self.settings.window)
 
     def update(self, images: Sequence[SplineImage]) -> SurfacePoints:
         """Follow the surface into the next images, one of each camera.
@@ -121,14 +132,19 @@ class SurfaceTracker:
             problem = f"no point of the surface is left in frame {len(self._frames)}"
             raise TrackingError(problem, remedy="A larger reach or window, more light, or a shorter exposure may help.")
         self._velocity = np.zeros_like(now.uv) if velocity is None else velocity
+        if velocity is not None and self._vanished is not None:
+            now = self._with(now, self._returned(images, now))
         if velocity is not None and self.settings.regenerate:
-            more = self._regenerated(images, now)
-            shift = _of_nearest(now.uv[:, 0], self._velocity, more.uv[:, 0])
-            self._velocity = np.concatenate([self._velocity, shift])
-            now = SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(now).values(), vars(more).values())))
+            now = self._with(now, self._regenerated(images, now))
         self._images = images
         self._frames.append(now)
         return now
+
+    def _with(self, now: SurfacePoints, more: SurfacePoints) -> SurfacePoints:
+        """Points and others, which move as their neighbours."""
+        shift = _of_nearest(now.uv[:, 0], self._velocity, more.uv[:, 0])
+        self._velocity = np.concatenate([self._velocity, shift])
+        return SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(now).values(), vars(more).values())))
 
     def trajectories(self) -> Trajectories:
         """All points over all frames so far."""
@@ -210,16 +226,58 @@ class SurfaceTracker:
             good &= found.found & (found.correlation >= settings.least)
         velocity, maps, index = uv - last.uv, last.deformation.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
-            told = match(
-                images[0], images[c], uv[index, 0], uv[index, c], deformation=maps[index, c - 1], window=settings.window
-            )
-            gap = np.linalg.norm(told.uv - uv[index, c], axis=1)
-            spread = np.sqrt(np.trace(told.covariance + covariance[index, c], axis1=1, axis2=2))
-            near = gap <= settings.agreement + _BEYOND * spread
-            good[index] &= told.found & (told.correlation >= settings.least) & near
-            uv[index, c], covariance[index, c] = told.uv, told.covariance
-            maps[index, c - 1] = told.deformation
+            good[index] &= self._agreeing(images, c, index, uv, covariance, maps)
         return uv, covariance, velocity, maps, good
+
+    def _returned(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
+        """Points that were lost before, where the body's motion says that they are in view again.
+
+        Each is matched in every view to what it looked like last, and between the views as the check.
+        """
+        assert self._vanished is not None
+        settings, frame, last = self.settings, len(self._frames), self._frames[-1]
+        lost = np.flatnonzero(~np.isin(last.ids, now.ids))
+        self._vanished.remember(frame - 1, last.ids[lost], last.x_world[lost], last.uv[lost], list(self._images))
+        expected = self._vanished.expected(frame)
+        if expected is None:
+            return now.only(np.zeros(0, int))
+        window, good = settings.window, np.ones(len(expected.ids), bool)
+        uv, covariance = expected.uv.copy(), np.empty((*expected.uv.shape, 2))
+        for c, image in enumerate(images):
+            mosaic, at = expected.mosaics[c], expected.at[:, c]
+            box = search_box(mosaic, image, at, expected.uv[:, c], reach=settings.reach, window=window)
+            start = np.where(np.isfinite(box.uv), box.uv, expected.uv[:, c])
+            told = match(mosaic, image, at, start, deformation=expected.maps[:, c], window=window)
+            good &= told.found & (told.correlation >= settings.least)
+            good &= np.linalg.norm(told.uv - expected.uv[:, c], axis=1) <= _EXPECTED * settings.reach
+            uv[:, c], covariance[:, c] = told.uv, told.covariance
+        maps, index = expected.between.copy(), np.flatnonzero(good)
+        for c in range(1, len(images)):
+            good[index] &= self._agreeing(images, c, index, uv, covariance, maps)
+        index = np.flatnonzero(good)
+        meet = intersect(self.rig, uv[index], covariance[index])
+        agree = meet.parallax <= largest_parallax(meet.parallax)
+        self._vanished.found(expected.index[index[agree]])
+        kept = (expected.ids[index], meet.x_world, meet.covariance, uv[index], maps[index])
+        return SurfacePoints(*(value[agree] for value in kept))
+
+    def _agreeing(
+        self, images: Sequence[SplineImage], c: int, index: NDArray, uv: NDArray, covariance: NDArray, maps: NDArray
+    ) -> NDArray[np.bool_]:
+        """(K,) whether matching from the first image to camera c's finds points where they are, some of all.
+
+        Their places, covariances and maps are made those of that match.
+        """
+        settings = self.settings
+        told = match(
+            images[0], images[c], uv[index, 0], uv[index, c], deformation=maps[index, c - 1], window=settings.window
+        )
+        gap = np.linalg.norm(told.uv - uv[index, c], axis=1)
+        spread = np.sqrt(np.trace(told.covariance + covariance[index, c], axis1=1, axis2=2))
+        near = gap <= settings.agreement + _BEYOND * spread
+        uv[index, c], covariance[index, c] = told.uv, told.covariance
+        maps[index, c - 1] = told.deformation
+        return np.asarray(told.found & (told.correlation >= settings.least) & near)
 
     def _regenerated(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
         """New points where the grid has none, next to those that are there."""

@@ -23,8 +23,8 @@ _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSI
 def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None) -> None:
     """Write a motion as GLB, in metres and y up, as the format prescribes; time starts at 0.
 
-    One mesh of rounded tubes about the body's surfaces hangs on one skin. The bind pose is the rest pose; the
-    animation turns every joint that can turn and moves the root.
+    One mesh hangs on one skin: rounded tubes about the body's surfaces, a seamless skin over its metaballs. The bind
+    pose is the rest pose; the animation turns every joint that can turn and moves the root.
 
     Parameters
     ----------
@@ -89,9 +89,8 @@ class _Buffer:
 
 
 def _mesh(mesh: SkinnedMesh, buffer: _Buffer) -> gl.Mesh:
-    four = ((0, 0), (0, 2))
-    weights = np.pad(mesh.weights, four).astype(np.float32)
-    segments = np.where(weights > 0, np.pad(mesh.segments, four), 0).astype(np.uint16)
+    weights = mesh.weights.astype(np.float32)
+    segments = np.where(weights > 0, mesh.segments, 0).astype(np.uint16)
     colours = np.pad(mesh.colours, ((0, 0), (0, 1)), constant_values=255)
     attributes = gl.Attributes(
         POSITION=buffer.add(mesh.vertices, target=gl.ARRAY_BUFFER, bounds=True),

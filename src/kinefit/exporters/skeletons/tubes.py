@@ -1,4 +1,4 @@
-"""A body's surfaces as one closed, smooth mesh whose vertices follow one or two segments."""
+"""A body's surfaces as closed, smooth meshes whose vertices follow up to four segments."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.spline_skin import ChainSkin, chain_skin, chains
+from kinefit.bodies.surfaces.body_skin import FOLLOWED, BodySkin, body_skins
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
@@ -25,8 +25,8 @@ class SkinnedMesh:
     normals : (V, 3) unit, outward.
     colours : (V, 3) uint8 RGB
     triangles : (T, 3) int, counterclockwise from outside.
-    segments : (V, 2) int, the segments that each vertex follows.
-    weights : (V, 2) how much it follows each; they sum to 1.
+    segments : (V, 4) int, the segments that each vertex follows.
+    weights : (V, 4) how much it follows each; they sum to 1.
     """
 
     vertices: NDArray
@@ -43,15 +43,15 @@ def side_colour(name: str) -> tuple[int, int, int]:
 
 
 def body_mesh(body: Body) -> SkinnedMesh:
-    """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that follow each other.
+    """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that hang together.
 
     Near a joint tubes and skins follow both segments.
     """
     others = [c for c in body.surfaces if not isinstance(c, Metaballs)]
     parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
-    parts += [_skin(body, chain_skin(body, limbs)) for limbs in chains(body)]
+    parts += [_skin(body, skin) for skin in body_skins(body)]
     if not parts:
-        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (2, int), (2, float))
+        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
         return SkinnedMesh(*(np.zeros((0, count), kind) for count, kind in columns))
     first = np.cumsum([0] + [len(p.vertices) for p in parts])
     return SkinnedMesh(
@@ -59,9 +59,14 @@ def body_mesh(body: Body) -> SkinnedMesh:
         normals=np.concatenate([p.normals for p in parts]),
         colours=np.concatenate([p.colours for p in parts]),
         triangles=np.concatenate([p.triangles + n for p, n in zip(parts, first)]),
-        segments=np.concatenate([p.segments for p in parts]),
-        weights=np.concatenate([p.weights for p in parts]),
+        segments=np.concatenate([_four(p.segments) for p in parts]),
+        weights=np.concatenate([_four(p.weights) for p in parts]),
     )
+
+
+def _four(columns: NDArray) -> NDArray:
+    """(V, 4) with zeros for what is missing."""
+    return np.pad(columns, ((0, 0), (0, FOLLOWED - columns.shape[1])))
 
 
 def is_last(body: Body, c: TaperedCylinder) -> bool:
@@ -91,13 +96,15 @@ def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
     )
 
 
-def _skin(body: Body, skin: ChainSkin) -> SkinnedMesh:
-    vertices, faces, u = skin.patch.mesh()
-    segments, weights = skin.weights(u)
+def _skin(body: Body, skin: BodySkin) -> SkinnedMesh:
+    there, faces, every = skin.mesh()
+    vertices = skin.at_rest(there, every)
+    order = np.argsort(-every, axis=1)[:, :FOLLOWED]
+    weights = np.take_along_axis(every, order, axis=1)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return SkinnedMesh(
-        vertices=vertices, normals=_normals(vertices, faces),
-        colours=colours[segments[:, 0]], triangles=faces, segments=segments, weights=weights,
+        vertices=vertices, normals=_normals(vertices, faces), colours=colours[order[:, 0]], triangles=faces,
+        segments=np.where(weights > 0.0, order, 0), weights=weights,
     )
 
 

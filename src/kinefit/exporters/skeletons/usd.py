@@ -170,5 +170,7 @@ def _mesh(stage: Any, content: SkinnedMesh, T_skeleton_root: NDArray, factor: fl
     colour.Set(Vt.Vec3fArray.FromNumpy(np.float32((content.colours / 255.0) ** 2.2)))  # linear, of sRGB
     binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
     binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
-    binding.CreateJointIndicesPrimvar(False, 2).Set(Vt.IntArray.FromNumpy(np.int32(content.segments.ravel())))
-    binding.CreateJointWeightsPrimvar(False, 2).Set(Vt.FloatArray.FromNumpy(np.float32(content.weights.ravel())))
+    followed, shares = np.int32(content.segments.ravel()), np.float32(content.weights.ravel())
+    count = content.segments.shape[1]
+    binding.CreateJointIndicesPrimvar(False, count).Set(Vt.IntArray.FromNumpy(followed))
+    binding.CreateJointWeightsPrimvar(False, count).Set(Vt.FloatArray.FromNumpy(shares))

@@ -1,0 +1,234 @@
+"""Tubes about limbs of metaballs: cross-sections by ray casting, and caps over their ends (P4, section 3.1).
+
+Limbs that go on in about one direction, such as upper arm, forearm and hand, are one tube. Rays from the line through
+its balls, at right angles to it, end where they leave the last limb that they are in; at a closed end rays over half a
+sphere do. All of a tube are quadrilaterals: a grid of rings and columns, and on each cap a grid of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces.metaballs import LEVEL, Metaballs
+from kinefit.errors import BodyError
+
+_SCANNED, _HALVED = 48, 24  # steps along a ray from its far end, halvings: to a millionth of a limb's width
+_FAR = 1.2  # of a ball's radius: beyond, its field alone is below a tenth of the level
+_LINE = 200  # points of the line through a tube's balls
+_FIRST = 24  # rings with which a tube is measured, before it gets as many as make its faces about square
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A limb of metaballs where a pose has it.
+
+    Parameters
+    ----------
+    limb : Metaballs
+    T : (4, 4) from its segment's frame
+    """
+
+    limb: Metaballs
+    T: NDArray
+
+    @property
+    def centres(self) -> NDArray:
+        """(K, 3) [m] of its balls."""
+        return np.asarray(self.limb.centres @ self.T[:3, :3].T + self.T[:3, 3])
+
+    @property
+    def way(self) -> NDArray:
+        """(3,) unit direction from its first ball to its last one."""
+        if len(self.limb.centres) == 1:
+            return np.asarray(self.T[:3, :3] @ self.limb.axes[0, int(np.argmax(self.limb.radii[0]))])
+        gap = self.centres[-1] - self.centres[0]
+        return np.asarray(gap / np.linalg.norm(gap))
+
+    def field(self, x: NDArray) -> NDArray:
+        """(...) of its balls at points (..., 3) [m]."""
+        return self.limb.field((x - self.T[:3, 3]) @ self.T[:3, :3])
+
+
+def field(limbs: Sequence[Posed], x: NDArray) -> NDArray:
+    """(...) of some limbs at points (..., 3) [m]: the root of the sum of their fields' squares.
+
+    Their sum would make a joint, where two limbs end in each other, thicker than both; the largest of them a groove.
+    """
+    return np.asarray(np.sqrt(np.sum([limb.field(x) ** 2 for limb in limbs], axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class Tube:
+    """The control net of some limbs.
+
+    Parameters
+    ----------
+    limbs : in their order
+    rings : (R, A) vertices of its cross-sections
+    caps : for each end a grid (n + 1, n + 1) of vertices, whose border is the ring there, or None where it is open
+    vertices : (V, 3) [m]
+    segment : (V,) that each belongs to
+    """
+
+    limbs: tuple[Posed, ...]
+    rings: NDArray
+    caps: tuple[NDArray | None, NDArray | None]
+    vertices: NDArray
+    segment: NDArray
+
+    def faces(self) -> NDArray:
+        """(Q, 4) facing outwards; those of the walls first, ring by ring, then the caps', row by row."""
+        after = np.roll(self.rings, -1, axis=1)
+        walls = np.stack([self.rings[:-1], after[:-1], after[1:], self.rings[1:]], axis=-1).reshape(-1, 4)
+        out = [walls]
+        for end, cap in enumerate(self.caps):
+            if cap is not None:
+                quads = np.stack([cap[:-1, :-1], cap[1:, :-1], cap[1:, 1:], cap[:-1, 1:]], axis=-1).reshape(-1, 4)
+                out.append(quads if end else quads[:, ::-1])
+        return np.concatenate(out)
+
+    @property
+    def cut(self) -> Tube:
+        """Without vertices that no ring and no cap has, renumbered."""
+        parts = [self.rings.ravel(), *(cap.ravel() for cap in self.caps if cap is not None)]
+        kept, number = np.unique(np.concatenate(parts)), np.zeros(len(self.vertices), int)
+        number[kept] = np.arange(len(kept))
+        low, high = (None if cap is None else number[cap] for cap in self.caps)
+        return Tube(self.limbs, number[self.rings], (low, high), self.vertices[kept], self.segment[kept])
+
+
+def tube(limbs: Sequence[Posed], around: int, closed: tuple[bool, bool]) -> Tube:
+    """The net about limbs, with so many corners around (a multiple of 8), closed at the start or the end or open.
+
+    Raises
+    ------
+    BodyError
+        Limbs with a gap between them.
+    """
+    middles = np.concatenate([limb.centres for limb in limbs])
+    owner = np.repeat([limb.limb.segment for limb in limbs], [len(limb.limb.centres) for limb in limbs])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1))])
+    kept = np.concatenate([[True], np.diff(way) > 1e-6])
+    balls, owner = way[kept], owner[kept]
+    if len(balls) > 1:
+        wide = 2.0 * float(np.mean([limb.limb.radii.min(axis=1).mean() for limb in limbs]))
+        way, middles = _smooth(balls, middles[kept], wide)
+        slopes = np.gradient(middles, way, axis=0)
+    else:
+        way, middles, slopes = balls, middles[:1], limbs[0].way[None]
+    reach = 2.0 * _FAR * max(float(limb.limb.radii.max()) for limb in limbs)
+
+    def sections(at: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        centre = np.stack([np.interp(at, way, middles[:, k]) for k in range(3)], axis=1)
+        along = np.stack([np.interp(at, way, slopes[:, k]) for k in range(3)], axis=1)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        side = _sides(along)
+        angle = 2.0 * np.pi * np.arange(around) / around
+        across = np.cross(along, side)
+        rays = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * across[:, None]
+        return centre, rays, np.stack([side, across, along], axis=1)
+
+    middle = np.linspace(0.0, way[-1], _FIRST)
+    centre, rays, _ = sections(middle)
+    radius = float(np.mean(_exits(centre.repeat(around, axis=0), rays.reshape(-1, 3), reach, limbs)))
+    count = max(4, 1 + round(way[-1] * around / (2.0 * np.pi * radius)))
+    at = np.linspace(0.0, way[-1], count) if way[-1] > 0 else np.zeros(1)
+    centre, rays, axes = sections(at)
+    x = _exits(centre.repeat(around, axis=0), rays.reshape(-1, 3), reach, limbs)[:, None] * rays.reshape(-1, 3)
+    vertices, segment = [centre.repeat(around, axis=0) + x], [_owners(at, balls, owner).repeat(around)]
+    rings = np.arange(len(at) * around).reshape(len(at), around)
+    caps, first = list[NDArray | None](), rings.size
+    for end, wanted in enumerate(closed):
+        if not wanted:
+            caps.append(None)
+            continue
+        cap, ways = _cap(rings[-end], first)
+        a = axes[-end] * np.array([1.0, 1.0, 2.0 * end - 1.0])[:, None]
+        ways = ways @ a
+        start = np.tile(centre[-end], (len(ways), 1))
+        vertices.append(start + _exits(start, ways, reach, limbs)[:, None] * ways)
+        segment.append(np.full(len(ways), owner[-end]))
+        caps.append(cap)
+        first += len(ways)
+    return Tube(tuple(limbs), rings, (caps[0], caps[1]), np.concatenate(vertices), np.concatenate(segment))
+
+
+def _smooth(way: NDArray, middles: NDArray, wide: float) -> tuple[NDArray, NDArray]:
+    """(M,), (M, 3) [m] a line through balls, its bends spread over so much [m], so that cross-sections do not cross."""
+    at = np.linspace(0.0, way[-1], _LINE)
+    line = np.stack([np.interp(at, way, middles[:, k]) for k in range(3)], axis=1)
+    half = min(int(np.ceil(wide / at[1])), _LINE - 1)
+    before, after = 2.0 * line[0] - line[half:0:-1], 2.0 * line[-1] - line[-2 : -half - 2 : -1]
+    weight = np.hanning(2 * half + 3)[1:-1]
+    longer = np.concatenate([before, line, after])
+    return at, np.stack([np.convolve(longer[:, k], weight / weight.sum(), "valid") for k in range(3)], axis=1)
+
+
+def _owners(at: NDArray, way: NDArray, owner: NDArray) -> NDArray:
+    """(R,) segments of places along a tube: those of the nearest balls."""
+    return np.asarray(owner[np.argmin(np.abs(at[:, None] - way), axis=1)])
+
+
+def _cap(ring: NDArray, first: int) -> tuple[NDArray, NDArray]:
+    """Grid (n + 1, n + 1) of vertices with a ring (4 n,) as its border, and directions of the new ones.
+
+    These are numbered from `first` on; directions (M, 3) are along side, across and outwards.
+    """
+    n, ways = len(ring) // 4, list[tuple[float, float, float]]()
+    half, grid = n // 2, np.full((n + 1, n + 1), -1)
+    for k in range(half, -1, -1):
+        line = np.arange(-k, k)
+        sides = [np.full(2 * k, k), -line, np.full(2 * k, -k), line]
+        a, b = (np.roll(np.concatenate([sides[i % 4] for i in (s, s + 1, s + 2, s + 3)]), -k) for s in (0, 3))
+        if k == half:
+            grid[half + a, half + b] = ring
+            continue
+        if k == 0:
+            a = b = np.zeros(1, int)
+        angle, tilt = 2.0 * np.pi * np.arange(len(a)) / len(a), 0.5 * np.pi * k / half
+        grid[half + a, half + b] = first + len(ways) + np.arange(len(a))
+        ways += [(np.cos(t) * np.sin(tilt), np.sin(t) * np.sin(tilt), np.cos(tilt)) for t in angle]
+    return grid, np.array(ways)
+
+
+def _sides(along: NDArray) -> NDArray:
+    """(R, 3) directions at right angles to each tangent (R, 3), turned as little as can be from one to the next."""
+    side = np.cross(along[0], np.eye(3)[np.argmin(np.abs(along[0]))])
+    out = np.empty_like(along)
+    for k, t in enumerate(along):
+        side = side - (side @ t) * t
+        side = side / np.linalg.norm(side)
+        out[k] = side
+    return out
+
+
+def _exits(starts: NDArray, ways: NDArray, reach: float, limbs: Sequence[Posed]) -> NDArray:
+    """(N,) [m] along rays, where they leave the last limb.
+
+    Raises
+    ------
+    BodyError
+        A ray that is in none: limbs with a gap between them.
+    """
+
+    def inside(steps: NDArray) -> NDArray:
+        x = starts[:, None] + steps[..., None] * ways[:, None]
+        return np.asarray(field(limbs, x) >= LEVEL)
+
+    steps = np.linspace(0.0, reach, _SCANNED + 1)
+    within = inside(np.broadcast_to(steps, (len(starts), _SCANNED + 1)))
+    if not within.any(axis=1).all():
+        place = np.round(starts[int(np.argmin(within.any(axis=1)))], 3).tolist()
+        remedy = "Give larger radii along the limbs, or another ball between them."
+        raise BodyError(f"limbs of metaballs do not meet near {place} m", remedy=remedy)
+    last = _SCANNED - np.argmax(within[:, ::-1], axis=1)
+    low, high = steps[last], steps[np.minimum(last + 1, _SCANNED)]
+    for _ in range(_HALVED):
+        middle = 0.5 * (low + high)
+        there = inside(middle[:, None])[:, 0]
+        low, high = np.where(there, middle, low), np.where(there, high, middle)
+    return np.asarray(0.5 * (low + high))
