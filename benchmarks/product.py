@@ -7,8 +7,8 @@ from benchmarks.figures import run_parts
 PARTS = {
     "start": "how long a user waits: first and later starts, the whole track of the demo's recording",
     "long": "long takes: memory by length, going on after a kill, the page of an hour",
-    "product_live": "live sessions of the balancing trial: latency, an hour's memory and drift",
-    "product_setups": "which sensor set-up is how exact, simulated: cameras by number, and sensors",
+    "live": "live sessions of the balancing trial: latency, an hour's memory and drift",
+    "setups": "which sensor set-up is how exact, simulated: cameras by number, and sensors",
     "batch": "many takes: two workers against one, what Dask adds to a take, equal after a kill",
     "formats": "every format, read back by a program that others wrote",
     "fuzz": "every reader on damaged files: a typed error or a valid result, soon and in little memory",
