@@ -12,6 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import place_joint
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification.frame.polish import NEAR, labels_of, rivals
+from kinefit.identification.frame.posture import unusual
 from kinefit.identification.frame.search import Frame
 from kinefit.identification.model.model import MarkerModel
 
@@ -119,10 +120,10 @@ def identify(
             f"previous positions of shape {before.shape} for {count} labels",
             remedy="Give (M, 3) [m], NaN if not known.",
         )
-    return _decide(best, before, settings.certain)
+    return _decide(model, best, before, settings.certain)
 
 
-def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
+def _decide(model: MarkerModel, found: Solution, before: NDArray, certain: float) -> Identification:
     """Labels that are probable enough against all rivals; where it may all be accident, only what two starts say."""
     count = len(found.labels)
     every = {node.table.index for node, _ in found.chosen}
@@ -130,6 +131,8 @@ def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
     pool = {labels_of(e, count).tobytes(): (dearer, e) for dearer, e in [*near, (0.0, chosen)]}
     labels = np.array([labels_of(e, count) for _, e in pool.values()])
     cost = np.array([dearer for dearer, _ in pool.values()]) + _moved(labels, found.search.frame.points, before)
+    if len(labels) > 1:
+        cost += unusual(model, found.search, labels)
     best = int(np.argmin(cost))
     chosen, guess = list(pool.values())[best][1], labels[best].copy()
     odds = (np.exp(cost[best] - cost)[:, None] * (labels != guess)).sum(0) + np.exp(-NEAR)
