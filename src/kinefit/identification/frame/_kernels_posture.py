@@ -1,4 +1,4 @@
-"""How usual the turns of a body's joints, and distances across two of them, are under an explanation: numba."""
+"""How usual the turns of a body's joints are under an explanation, from the root outwards: numba."""
 
 import math
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.identification.frame._kernels_evidence import rigid
-from kinefit.identification.frame._kernels_identify import MOST_EXCESS, apart
 
 ROUNDS = 8
 _LOOSE = 10.0  # [rad²] variance of a turn of which nothing is known
@@ -212,26 +211,3 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
             tv[s] = 1 / weight
             known[s] = True
         out[h] = total
-
-
-@jit
-def way_costs(labels, points, first, second, group, low, high, width, out):
-    """out (E,): how far explanations leave distances that training showed, as `range_cost` has it.
-
-    labels (E, M) the point of each label, -1 for none; points (N, 3); of pairs of labels first, second (K,): low, high,
-    width (K,) [m], and which pairs are of the same two segments, `group` (K,), in its order.
-    """
-    for h in range(len(labels)):
-        cost, total, count = 0.0, 0.0, 0
-        for k in range(len(first)):
-            p, q = labels[h, first[k]], labels[h, second[k]]
-            if p >= 0 and q >= 0 and p != q and width[k] > 0:
-                d = apart(points[p], points[q])
-                e = low[k] - d if d < low[k] else (d - high[k] if d > high[k] else 0.0)
-                e = 0.5 * (e / width[k]) ** 2
-                total += e if e < MOST_EXCESS else MOST_EXCESS
-                count += 1
-            if k + 1 == len(first) or group[k + 1] != group[k]:
-                cost += 3 * total / count if count > 0 else 0.0
-                total, count = 0.0, 0
-        out[h] = cost

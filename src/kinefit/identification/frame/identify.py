@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import place_joint
+from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification.frame.polish import NEAR, labels_of, rivals
 from kinefit.identification.frame.posture import unusual
@@ -81,6 +82,7 @@ def identify(
     points: ArrayLike,
     *,
     previous: ArrayLike | None = None,
+    beliefs: Beliefs | None = None,
     settings: IdentifySettings | None = None,
 ) -> Identification:
     """Which point of a frame is which of the model's labels; needs no pose, nor how many are missing or too many.
@@ -90,6 +92,7 @@ def identify(
     points : (N, 3) [m], finite
     previous : (M, 3) [m] or None
         Where the labels were a moment ago, NaN where not known; not used for what the frame itself makes certain.
+    beliefs : of this model, what other frames of the same take have shown: see `learn_beliefs`; default: nothing
 
     Raises
     ------
@@ -110,7 +113,7 @@ def identify(
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
     work = np.full(1, SEARCHING * settings.work)
-    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work)
+    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work, beliefs)
     best = explain(model, frame, settings.finest, settings.coarsest, settings.searches)
     work += (1 - SEARCHING) * settings.work
     best = refine(model, best)
@@ -181,7 +184,7 @@ def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
             at = np.empty(3)
             variance = place_joint(len(x), x, y, sigma, t.x[i], at)
             wide = OUTLYING**2 * search.sigma[t.index][i] ** 2 + variance
-            odds = search.frame.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
+            odds = search.gain[t.index][i] + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
             odds = odds - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
             best = int(np.argmax(odds))
             share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))

@@ -1,6 +1,7 @@
-"""What a body's posture says for and against explanations of a frame: turns of joints, distances across two joints.
+"""What the turns of a body's joints say for and against explanations of a frame: learnt axes and limits.
 
 The search looks at a segment beside its parent alone; here whole explanations that come near each other are compared.
+A turn that a segment's own points do not tell comes from its parent's, so that toes are held by the knee's axis.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.frame._kernels_posture import turn_costs, way_costs
+from kinefit.identification.frame._kernels_posture import turn_costs
 from kinefit.identification.frame.search import Search
-from kinefit.identification.frame.tables import SegmentTable, beyond, segment_tables
+from kinefit.identification.frame.tables import segment_tables
 from kinefit.identification.model.model import MarkerModel
 
 MOST = 6.0
@@ -22,13 +23,7 @@ MOST = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """A model's segments, parents first, and pairs of labels, as the kernels want them.
-
-    Parameters
-    ----------
-    order, starts, markers, x, parent, here, there, spread, middle, give : see `turn_costs`
-    first, second, group, low, high, width : see `way_costs`
-    """
+    """A model's segments, parents first, in this `order`, as the kernel wants them: see `turn_costs`."""
 
     order: NDArray
     starts: NDArray
@@ -40,12 +35,6 @@ class Posture:
     spread: NDArray
     middle: NDArray
     give: NDArray
-    first: NDArray
-    second: NDArray
-    group: NDArray
-    low: NDArray
-    high: NDArray
-    width: NDArray
 
 
 @lru_cache(maxsize=64)
@@ -63,9 +52,6 @@ def posture_of(model: MarkerModel) -> Posture | None:
         joint = joints.get(t.index)
         if joint is not None and joint.turn is not None and joint.give is not None:
             middle[i], give[i] = joint.turn, joint.give
-    pairs = np.array(list(_across_two(tables)), np.int64).reshape(-1, 3)
-    first, second = pairs[:, 0], pairs[:, 1]
-    low, high = model.low[first, second], model.high[first, second]
     zero = np.zeros(3)
     return Posture(
         order, np.concatenate([[0], np.cumsum([len(t.markers) for t in tables])]),
@@ -73,23 +59,8 @@ def posture_of(model: MarkerModel) -> Posture | None:
         np.array([place.get(t.parent, -1) for t in tables]),
         np.array([zero if t.joint_here is None else t.joint_here for t in tables]),
         np.array([zero if t.joint_there is None else t.joint_there for t in tables]),
-        np.array([t.spread for t in tables]), middle, give, first, second, pairs[:, 2], low, high, beyond(low, high),
+        np.array([t.spread for t in tables]), middle, give,
     )  # fmt: skip
-
-
-def _across_two(tables: tuple[SegmentTable, ...]) -> list[tuple[int, int, int]]:
-    """Labels of segments with one segment between them, and the number of these two segments, in its order."""
-    parent = {t.index: t.parent for t in tables}
-    out, number = [], 0
-    for a in tables:
-        for b in tables:
-            grand = parent.get(parent[a.index], -1) == b.index and parent[a.index] >= 0
-            beside = a.index < b.index and parent[a.index] == parent[b.index]
-            if grand or beside:
-                mine, theirs = a.markers.tolist(), b.markers.tolist()
-                out += [(i, j, number) for i in mine for j in theirs if i not in theirs and j not in mine]
-                number += 1
-    return out
 
 
 def unusual(model: MarkerModel, search: Search, labels: NDArray) -> NDArray:
@@ -97,11 +68,8 @@ def unusual(model: MarkerModel, search: Search, labels: NDArray) -> NDArray:
     known, out = posture_of(model), np.zeros(len(labels))
     if known is not None:
         sigma = np.concatenate([search.sigma[s] for s in known.order.tolist()])
-        labels, points, across = np.ascontiguousarray(labels), search.frame.points, np.zeros(len(labels))
         turn_costs(
-            labels, points, known.starts, known.markers, known.x, sigma, known.parent, known.here, known.there,
-            known.spread, known.middle, known.give, MOST, out,
+            np.ascontiguousarray(labels), search.frame.points, known.starts, known.markers, known.x, sigma,
+            known.parent, known.here, known.there, known.spread, known.middle, known.give, MOST, out,
         )  # fmt: skip
-        way_costs(labels, points, known.first, known.second, known.group, known.low, known.high, known.width, across)
-        out += across
     return out

@@ -75,7 +75,7 @@ def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
         shared = np.array([theirs.index(m) if m in theirs else -1 for m in markers], np.int64)
         pairs = np.ix_(np.array(theirs, np.int64), markers)
         low, high = model.low[pairs], model.high[pairs]
-        width = beyond(low, high) * learnt
+        width = (BEYOND + BEYOND_SHARE * (high - low)) * (learnt and np.isfinite(high - low))
         own = deviations(model.deviation[np.ix_(markers, markers)])
         D = np.linalg.norm(x[:, None] - x, axis=-1)
         found.append(
@@ -86,11 +86,6 @@ def segment_tables(model: MarkerModel, root: int) -> tuple[SegmentTable, ...]:
             )
         )  # fmt: skip
     return tuple(found)
-
-
-def beyond(low: NDArray, high: NDArray) -> NDArray:
-    """[m] scale of how far distances go beyond those of training; 0 where training did not tell."""
-    return np.where(np.isfinite(high - low), BEYOND + BEYOND_SHARE * (high - low), 0.0)
 
 
 def unseen(D: NDArray) -> NDArray:
