@@ -149,7 +149,7 @@ def fit_model(
             ranges = turned(Rs[p], R, enough)
             joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
             share = told(joint, skeleton.ranges[s])
-            turn, give = usual_turn(Rs[p], R, enough, share, skeleton.ranges[s])
+            turn, give = usual_turn(Rs[p], R, enough, skeleton.ranges[s])
             joint = replace(joint, turn=turn, give=give)
             usual = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
             joints.append(replace(joint, spread=float(np.sqrt(share * typical**2 + (1 - share) * usual**2))))

@@ -122,12 +122,13 @@ def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float
 
 
 def usual_turn(
-    Rp: NDArray, Rc: NDArray, good: NDArray, share: float, full: float
+    Rp: NDArray, Rc: NDArray, good: NDArray, full: float
 ) -> tuple[NDArray | None, NDArray | None]:
     """Middle of a joint's turns (3, 3) and their covariance (3, 3) [rad²], in the child's axes; None where not seen.
 
     The covariance is that of turns spread evenly over what training showed, MORE of it, and of turns that it did not
-    show: TURN of any joint, and of one of which `share` was exercised the rest of its range `full` [rad].
+    show: TURN about any axis; of one that went through little of its range `full` [rad] the rest of that about all
+    axes; and, of what joints may turn about a second axis, half of what it did not.
     """
     found = _turns(Rp, Rc, good)
     if found is None:
@@ -135,7 +136,10 @@ def usual_turn(
     mean, turns, axes = found
     low, high = np.quantile(turns, [0.005, 0.995], axis=0)
     middle_turn = mean @ exp_so3(axes @ (0.5 * (low + high)))
-    square = (MORE * (high - low)) ** 2 / 12 + TURN**2 + ((1 - share) * full) ** 2
+    seen = np.sort(high - low)[::-1]
+    open_first = max(full - seen[0], 0.0)
+    open_second = 0.5 * max(SECOND_RANGE * full - seen[1], 0.0)
+    square = (MORE * (high - low)) ** 2 / 12 + TURN**2 + open_first**2 + open_second**2
     return middle_turn, (axes * square) @ axes.T
 
 
