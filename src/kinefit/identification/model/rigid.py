@@ -47,7 +47,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
         away = local - a
         length = np.linalg.norm(away, axis=-1)
         typical = middle(length, axis=0)
-        J = -away / length[..., None]
+        J = -away / np.maximum(length, 1e-9)[..., None]
         r = typical - length
         ok = np.isfinite(r)
         if not ok.any():
@@ -60,7 +60,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
     for _ in range(10):
         away = b - x
         length = np.linalg.norm(away, axis=-1)
-        J, r = away / length[:, None], typical - length
+        J, r = away / np.maximum(length, 1e-9)[:, None], typical - length
         b = b + np.linalg.lstsq(J, r, rcond=1e-3)[0]
     return a, b
 
