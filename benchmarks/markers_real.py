@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.marker_takes import CASES, HELD, Case, broken, load, shuffled, training
@@ -35,12 +36,16 @@ VARIANTS: dict[str, dict[str, Any]] = {"all": {}, "10 % removed": {"missing": 0.
 
 @dataclass(frozen=True)
 class Score:
-    """Shares of the labels that were seen: right, wrong; of those not seen but named: counted as wrong."""
+    """Shares of the labels that were seen: right, wrong; of those not seen but named: counted as wrong.
+
+    `names` (N, 3): of every guess its probability, whether it is right, and how many points its segment has.
+    """
 
     right: float
     wrong: float
     median: float = np.nan
     slowest: float = np.nan
+    names: NDArray | None = None
 
 
 def prepare(case: Case) -> tuple[MarkerModel, Markers] | None:
@@ -55,17 +60,20 @@ def single_frames(
     """Frames one by one, spread over the take."""
     rng = np.random.default_rng(seed)
     right = wrong = seen = 0
-    times = []
+    times, names = [], []
     whole = np.flatnonzero(np.isfinite(take.positions[..., 0]).sum(1) >= 0.5 * take.positions.shape[1])
     for f in whole[np.unique(np.linspace(0, len(whole) - 1, frames).round().astype(int))]:
         points, truth = shuffled(take, model.labels, int(f), rng, missing, ghosts)
         start = time.process_time()
-        found = identify(model, points).assignment
+        told = identify(model, points)
         times.append(time.process_time() - start)
+        found, guess = told.assignment, told.assignment if told.guess is None else told.guess
+        held = [max(int((guess[list(s)] >= 0).sum()) for s in model.segments if m in s) for m in range(len(model))]
+        names.append(np.stack([told.confidence, guess == truth, held], axis=1)[guess >= 0])
         right += int(((found == truth) & (truth >= 0)).sum())
         wrong += int(((found != truth) & (found >= 0)).sum())
         seen += int((truth >= 0).sum())
-    return Score(right / seen, wrong / seen, float(np.median(times)), float(np.max(times)))
+    return Score(right / seen, wrong / seen, float(np.median(times)), float(np.max(times)), np.concatenate(names))
 
 
 def whole_take(model: MarkerModel, take: Markers, seed: int = 0, **breaking: float) -> Score:
@@ -94,8 +102,10 @@ def table(names: list[str]) -> dict[str, tuple[Case, dict[str, Score]]]:
         if ready is None:
             continue
         model, take = ready
-        scores = {name: single_frames(model, take, **options) for name, options in VARIANTS.items()}
-        scores["whole"] = whole_take(model, take)
+        whole = whole_take(model, take)
+        asked = VARIANTS if np.isfinite(whole.right) else {}  # a take that is refused has no names
+        scores = {name: single_frames(model, take, **VARIANTS[name]) if asked else whole for name in VARIANTS}
+        scores["whole"] = whole
         sign = "*" if case.chosen else "+" if case.held else " "
         line = f"{case.name:28s}{sign} {len(model):3d} in {len(model.segments):2d}"
         for s in scores.values():
@@ -110,9 +120,30 @@ def run(names: list[str] | None = None) -> None:
     found = table(names or [])
     told([row for row in found.values() if row[0].full and not row[0].chosen and not row[0].held], "markers_real")
     told([row for row in found.values() if row[0].held], "markers_held")
+    calibration([s for case, s in found.values() if not case.chosen])
     large = [s["all"].slowest for case, s in found.values() if case.name == "clusters 61"]
     reason = "" if large else "no recordings"
     figure("markers_real_clusters61", 1e3 * large[0] if large else None, "ms a frame, slowest", "<= 200", reason)
+
+
+def calibration(rows: list[dict[str, Score]]) -> None:
+    """How many names of each probability are right, in single frames of all kinds; and in segments of two points."""
+    kept = [s[kind].names for s in rows for kind in VARIANTS]
+    names = np.concatenate([n for n in kept if n is not None] or [np.empty((0, 3))])
+    print("probability: names, on average, right [%]; of segments with two points or one")
+    for low, high in ((0.3, 0.5), (0.5, 0.7), (0.7, 0.8), (0.8, 0.85), (0.85, 0.95), (0.95, 0.98), (0.98, 1.0)):
+        line = f"  {low:.2f} to {high:.2f}"
+        for own in (names, names[names[:, 2] <= 2]):
+            here = own[(own[:, 0] >= low) & (own[:, 0] < high)]
+            mean = here.mean(0) if len(here) else np.full(3, np.nan)
+            line += f" | {len(here):6d} {100 * mean[0]:6.1f} {100 * mean[1]:6.1f}"
+        print(line)
+    near = names[(names[:, 0] >= 0.85) & (names[:, 0] < 0.95)]
+    value = 100 * float(near[:, 1].mean()) if len(near) else None
+    figure("markers_real_calibration", value, f"% right of {len(near)} names given at 0.9", ">= 90", "no such names")
+    two = near[near[:, 2] <= 2]
+    value = 100 * float(two[:, 1].mean()) if len(two) else None
+    figure("markers_real_calibration_two_points", value, f"% right of {len(two)}", ">= 90", "no such names")
 
 
 def told(rows: list[tuple[Case, dict[str, Score]]], area: str) -> None:
@@ -126,7 +157,7 @@ def told(rows: list[tuple[Case, dict[str, Score]]], area: str) -> None:
         return max((100 * s[kind].wrong for _, s in rows if np.isfinite(s[kind].wrong)), default=None)
 
     moved = [100 * s["all"].right for case, s in rows if case.exercised]
-    mean = float(np.mean(moved)) if moved else None
+    mean = float(np.nanmean(moved)) if moved else None
     figure(f"{area}_single_least", least("all"), "% right", ">= 98.5", reason)
     figure(f"{area}_single_mean", mean, "% right", ">= 99.5", reason)
     figure(f"{area}_single_wrong", most_wrong("all"), "%", "<= 0.2", reason)
@@ -134,7 +165,7 @@ def told(rows: list[tuple[Case, dict[str, Score]]], area: str) -> None:
     figure(f"{area}_ghosts_least", least("ten ghosts"), "% right", ">= 98", reason)
     figure(f"{area}_whole_least", least("whole"), "% right", ">= 99.9", reason)
     figure(f"{area}_whole_wrong", most_wrong("whole"), "%", "<= 0.2", reason)
-    slowest = max((s[kind].slowest for _, s in rows for kind in VARIANTS), default=None)
+    slowest = max((s[kind].slowest for _, s in rows for kind in VARIANTS if np.isfinite(s[kind].slowest)), default=None)
     figure(f"{area}_slowest", slowest, "s a frame", "<= 1", reason)
 
 

@@ -90,6 +90,15 @@ def test_real_errors_are_found(data_dir):
     assert found and all(set(f.labels) == {"RTOE", "RMT5"} for f in found)
 
 
+@pytest.mark.parametrize(("file", "pairs"), [
+    ("markers/btkdata/Input__C3DSamples__c3d.org__sample13__golfswing.c3d", []),  # a club passes a hand at 25 m/s
+    ("markers_bmc_run/walk2.trc", [("L.MT1", "L.MT2")]),  # L.MT2 jumps by 35 mm beside the others of its foot
+])
+def test_labels_that_go_on_with_their_segments_did_not_change_places(data_dir, file, pairs):
+    folder, _, rest = file.partition("/")
+    assert [f.labels for f in wrong(audit_take(read_markers(data_dir(folder) / rest)))] == pairs
+
+
 def test_another_subject_with_another_placing_has_no_wrong_names(data_dir):
     folder = data_dir("markers") / "nimblephysics"
     other = learn_model(read_markers(folder / "data__grf__Subject4__MarkerData__squats1.trc"))

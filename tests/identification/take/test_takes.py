@@ -35,7 +35,7 @@ def truthful(model, labelled, wrong=()):
     truth = truth_of(labelled, model.labels)
     calls = []
 
-    def identify_frame(_, points):
+    def identify_frame(_, points, beliefs):
         d = np.linalg.norm(truth[:, :, None] - points, axis=-1)  # (F, M, N)
         frame = int(np.argmin(np.nansum(np.sort(np.nanmin(d, axis=2), axis=1)[:, :20], axis=1)))
         near = np.nanmin(d[frame], axis=1) < 1e-9
@@ -93,7 +93,7 @@ def test_columns_shuffled_in_every_frame(labelled, model):
 
 
 def test_another_subjects_model_is_told(labelled, model):
-    def nothing(_, points):
+    def nothing(_, points, beliefs):
         return Identification(np.full(len(model), -1), np.zeros(len(model)), 0.0, False, guess=np.full(len(model), -1))
 
     asked = []

@@ -16,6 +16,7 @@ from kinefit.identification.audit.plausible import elsewhere, places_of_model, p
 from kinefit.identification.audit.swaps import best_run, crossings, glitches, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.take.consistency import Consistency
 from kinefit.observations import Markers
 from kinefit.solvers.rigid_clusters import middle
 
@@ -44,6 +45,9 @@ FEW = 0.25
 
 LEAST_FRAMES = 3
 """Fewer frames are a glitch, not a label; a correction of so few is told only where jumps at both ends say so too."""
+
+LEAP = 0.02
+"""[m] by which a trajectory that changes over to another marker's jumps, at least."""
 
 JOIN = 10
 """Frames between two spans of one thing that are told as one span."""
@@ -163,18 +167,13 @@ def _fits(markers: Markers, model: MarkerModel) -> bool:
     """Whether a model is of this subject and session: most labels keep its distances."""
     names = _both(markers, model)
     step = max(1, len(markers) // MOST_FRAMES)
-    cost = misfits(markers.positions[::step][:, [markers.names.index(n) for n in names]], *partners(model, names))
+    cost = _judge(model, names).own(markers.positions[::step][:, [markers.names.index(n) for n in names]])
     return bool(np.mean(np.nan_to_num(middle(cost, axis=0)) > FINE) < FEW)
 
 
-def partners(model: MarkerModel, labels: Sequence[str]) -> tuple[NDArray, NDArray, NDArray]:
-    """(K, P) each: for every label its partners, their distance [m] (NaN where it is not firm), its deviation [m]."""
-    mean, deviation = _tables(model, labels)
-    firm = deviation + 0.02 * mean
-    np.fill_diagonal(firm, np.inf)
-    who = np.argsort(firm, axis=1)[:, : min(PARTNERS, len(labels) - 1)]
-    near = np.take_along_axis(deviation, who, 1)
-    return who, np.where(near > FIRM, np.nan, np.take_along_axis(mean, who, 1)), near
+def _judge(model: MarkerModel, labels: Sequence[str]) -> Consistency:
+    """What speaks for a label: the judgement of `identify_take`, by fewer partners and firmer ones."""
+    return Consistency(model, labels, count=PARTNERS, floor=FLOOR, firm=FIRM)
 
 
 def _tables(model: MarkerModel, labels: Sequence[str]) -> tuple[NDArray, NDArray]:
@@ -183,30 +182,23 @@ def _tables(model: MarkerModel, labels: Sequence[str]) -> tuple[NDArray, NDArray
     return model.mean[i], np.maximum(model.deviation[i], FLOOR)
 
 
-def misfits(positions: NDArray, who: NDArray, mean: NDArray, deviation: NDArray) -> NDArray:
-    """(F, K) deviations by which half of a label's distances are off; NaN where fewer than two are seen."""
-    d = np.linalg.norm(positions[:, :, None] - positions[:, who], axis=-1)
-    off = np.sort(np.abs(d - mean) / deviation, axis=-1)  # NaN last
-    seen = np.isfinite(off).sum(-1)
-    half = np.take_along_axis(off, np.maximum(seen - 1, 0)[..., None] // 2, axis=-1)[..., 0]
-    return np.where(seen >= 2, half, np.nan)
-
-
 def _swaps(
     positions: NDArray, model: MarkerModel, labels: Sequence[str]
 ) -> tuple[list[AuditFinding], NDArray]:
     """Exchanges of two labels, the clearest first, each undone before the next is looked for; the positions undone."""
     mean, deviation = _tables(model, labels)
-    who, near, give = partners(model, labels)
+    agree = _judge(model, labels)
     positions = np.array(positions)
     step = max(1, -(-len(positions) // MOST_FRAMES))
     found: list[AuditFinding] = []
-    for a, b, first, last in glitches(positions):
+    broken = crossings(positions, LEAP)[1]
+    for a, b, first, last in glitches(positions, least=LEAP):
         span = slice(first, last + 1)
-        if pair_gain(positions[span], a, b, mean, deviation).sum() > 0:
+        better = pair_gain(positions[span], a, b, mean, deviation).sum() > 0
+        if better and not _stay(agree, positions, broken, (a, b), first, last):
             found.append(_swap(positions[span], (a, b), labels, first, last, len(positions)))
             positions[span, a], positions[span, b] = positions[span, b].copy(), positions[span, a].copy()
-    met, broken = crossings(positions)
+    met, broken = crossings(positions, LEAP)
     refused: set[tuple[int, int, int, int]] = set()
     told = len(found)
     gains = swap_gains(positions[::step], mean, deviation)
@@ -218,9 +210,11 @@ def _swaps(
         _, a, b, first, last = max(spans)
         here = positions[first : last + 1].copy()
         here[:, [a, b]] = here[:, [b, a]]
-        before = misfits(positions[first : last + 1], who, near, give)[:, [a, b]]
-        after = misfits(here, who, near, give)[:, [a, b]]
-        if not _better(before, after, sum(c[0] in (first, last + 1) for c in met if {c[1], c[2]} == {a, b})):
+        now = positions[first : last + 1]
+        before = np.stack([agree.misfit(now[:, k], now, k) for k in (a, b)], axis=1)
+        after = np.stack([agree.misfit(here[:, k], here, k) for k in (a, b)], axis=1)
+        jumps = sum(c[0] in (first, last + 1) for c in met if {c[1], c[2]} == {a, b})
+        if not _better(before, after, jumps) or _stay(agree, positions, broken, (a, b), first, last):
             refused.add((a, b, first, last))
             continue
         found.append(_swap(positions[first : last + 1], (a, b), labels, first, last, len(positions)))
@@ -230,6 +224,27 @@ def _swaps(
         refused = {c for c in refused if c[3] < first or c[2] > last}
         met = [c for c in met if not ({c[1], c[2]} == {a, b} and c[0] in (first, last + 1))]
     return found, positions
+
+
+def _stay(
+    agree: Consistency, positions: NDArray, broken: NDArray, pair: tuple[int, int], first: int, last: int
+) -> bool:
+    """Whether at an end of a span both labels go on with their segments: then they did not change places there."""
+    for end in (first, last + 1):
+        near = range(max(end - JOIN, 1), min(end + JOIN + 1, len(positions)))
+        if 0 < end < len(positions) and not any(_leaves(agree, positions, broken, f, k) for f in near for k in pair):
+            return True
+    return False
+
+
+def _leaves(agree: Consistency, positions: NDArray, broken: NDArray, frame: int, label: int) -> bool:
+    """Whether a label's trajectory is broken at a frame, and not because its segment moves fast."""
+    if not broken[frame, label]:
+        return False
+    then, now = positions[frame - 1, label], positions[frame, label]
+    if not np.isfinite(then).all() or not np.isfinite(now).all():
+        return True
+    return agree.carried(positions, frame - 1, frame, now, label)[0] > LEAP
 
 
 def _better(before: NDArray, after: NDArray, jumps: int) -> bool:
@@ -289,8 +304,8 @@ def _snapped(frame: int, ends: Sequence[int]) -> tuple[int, bool]:
 
 def _strays(positions: NDArray, model: MarkerModel, labels: Sequence[str]) -> list[AuditFinding]:
     """Markers off their segment; of several that are off together the one that is off most."""
-    who, mean, deviation = partners(model, labels)
-    cost = misfits(positions, who, mean, deviation)
+    agree = _judge(model, labels)
+    cost = agree.own(positions)
     out = []
     for k, label in enumerate(labels):
         for first, last in runs(cost[:, k] > STRAY):
@@ -298,7 +313,7 @@ def _strays(positions: NDArray, model: MarkerModel, labels: Sequence[str]) -> li
             if last - first + 1 < LEAST_FRAMES or typical[k] < np.nanmax(typical):
                 continue
             x = positions[first : last + 1]
-            off = np.abs(np.linalg.norm(x[:, k, None] - x[:, who[k]], axis=-1) - mean[k])
+            off = np.abs(np.linalg.norm(x[:, k, None] - x[:, agree.who[k]], axis=-1) - agree.mean[k])
             size = float(np.nanmedian(off))
             if size < STRAYED:
                 continue

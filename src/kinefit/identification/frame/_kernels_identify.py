@@ -65,8 +65,8 @@ def enumerate_segment(
     sigma (k,) per coordinate;
     given (k,) the point of a marker that the parent has too, -1 where the parent misses it, -2 where it is to be found;
     pivot (3,) where the parent says that x_pivot is, with pivot_sigma (none where <= 0); without one, x_pivot may be
-    known to lie `reach` (A,) [m] from `anchors` (A, 3), A <= 2, else anywhere in the volume; gain: what a match earns
-    against a miss; slack: costs this much above the best are kept. A choice differs from the model's distances by
+    known to lie `reach` (A,) [m] from `anchors` (A, 3), A <= 2, else anywhere in the volume; gain (k,): what a match
+    earns against a miss; slack: costs this much above the best are kept. A choice differs from the model's distances by
     `gate` deviations at most; work_left (1,) float: tries that are left for the frame, here used up; at none the search
     ends with what it has. Fills out_*; returns how many there are (those beyond the room are dropped).
     """
@@ -127,7 +127,7 @@ def enumerate_segment(
     left = max(work_left[0] - CALL - N * (last - known), LEAST_WORK)
     rest = np.zeros(last + 1)  # what the markers still to come may earn
     for j in range(last - 1, known - 1, -1):
-        earn = gain - _HALF_LOG - 3 * math.log(sigma[order[j]])
+        earn = gain[order[j]] - _HALF_LOG - 3 * math.log(sigma[order[j]])
         rest[j] = rest[j + 1] + (earn if earn > 0 and many[j] > 0 else 0.0)
     # what is known without any choice
     n = 0
@@ -146,7 +146,7 @@ def enumerate_segment(
     count = 1
     best, best_crude = (-slack - LEAST if loose else 0.0), 0.0
     bound = np.zeros(last + 1)
-    matched = np.zeros(last + 1, np.int64)
+    matched, earned = np.zeros(last + 1, np.int64), np.zeros(last + 1)
     depth = known
     if depth < last:
         nxt[depth] = 0
@@ -166,7 +166,7 @@ def enumerate_segment(
                     n += 1
                 left -= LEAF * n
                 cost, rss = evidence(n, xs, ys, ss, work)
-                cost -= base + matched[depth] * gain
+                cost -= base + earned[depth]
                 if loose and (len(anchors) == 0 or n < 3):
                     cost += log_volume
                 elif loose:
@@ -178,7 +178,7 @@ def enumerate_segment(
                     crude = 0.5 * rss
                     for j in range(known, last):
                         if choice[order[j]] >= 0:
-                            crude -= gain - _HALF_LOG - 3 * math.log(sigma[order[j]])
+                            crude -= gain[order[j]] - _HALF_LOG - 3 * math.log(sigma[order[j]])
                     best_crude = crude if crude < best_crude else best_crude
                     if count < len(out_cost):
                         for i in range(k):
@@ -216,12 +216,13 @@ def enumerate_segment(
                             break
                         lb += e2 / (sigma[i] ** 2 * sigma[o] ** 2)
                 if ok:
-                    earn = gain - _HALF_LOG - 3 * math.log(sigma[i])
+                    earn = gain[i] - _HALF_LOG - 3 * math.log(sigma[i])
                     total = bound[depth] + 0.5 * lb / all_w - earn
                     if total - rest[depth + 1] <= best_crude + slack + 10:
                         found = True
                         bound[depth + 1] = total
                         matched[depth + 1] = matched[depth] + 1
+                        earned[depth + 1] = earned[depth] + gain[i]
             place += 1
         if found:
             nxt[depth] = place
@@ -235,6 +236,7 @@ def enumerate_segment(
             if bound[depth] - rest[depth + 1] <= best_crude + slack + 10:
                 bound[depth + 1] = bound[depth]
                 matched[depth + 1] = matched[depth]
+                earned[depth + 1] = earned[depth]
                 depth += 1
                 if depth < last:
                     nxt[depth] = 0

@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import place_joint
+from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification.frame.polish import NEAR, labels_of, rivals
+from kinefit.identification.frame.posture import unusual
 from kinefit.identification.frame.search import Frame
 from kinefit.identification.model.model import MarkerModel
 
@@ -80,6 +82,7 @@ def identify(
     points: ArrayLike,
     *,
     previous: ArrayLike | None = None,
+    beliefs: Beliefs | None = None,
     settings: IdentifySettings | None = None,
 ) -> Identification:
     """Which point of a frame is which of the model's labels; needs no pose, nor how many are missing or too many.
@@ -89,6 +92,7 @@ def identify(
     points : (N, 3) [m], finite
     previous : (M, 3) [m] or None
         Where the labels were a moment ago, NaN where not known; not used for what the frame itself makes certain.
+    beliefs : of this model, what other frames of the same take have shown: see `learn_beliefs`; default: nothing
 
     Raises
     ------
@@ -109,7 +113,7 @@ def identify(
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
     work = np.full(1, SEARCHING * settings.work)
-    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work)
+    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work, beliefs)
     best = explain(model, frame, settings.finest, settings.coarsest, settings.searches)
     work += (1 - SEARCHING) * settings.work
     best = refine(model, best)
@@ -119,10 +123,10 @@ def identify(
             f"previous positions of shape {before.shape} for {count} labels",
             remedy="Give (M, 3) [m], NaN if not known.",
         )
-    return _decide(best, before, settings.certain)
+    return _decide(model, best, before, settings.certain)
 
 
-def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
+def _decide(model: MarkerModel, found: Solution, before: NDArray, certain: float) -> Identification:
     """Labels that are probable enough against all rivals; where it may all be accident, only what two starts say."""
     count = len(found.labels)
     every = {node.table.index for node, _ in found.chosen}
@@ -130,6 +134,8 @@ def _decide(found: Solution, before: NDArray, certain: float) -> Identification:
     pool = {labels_of(e, count).tobytes(): (dearer, e) for dearer, e in [*near, (0.0, chosen)]}
     labels = np.array([labels_of(e, count) for _, e in pool.values()])
     cost = np.array([dearer for dearer, _ in pool.values()]) + _moved(labels, found.search.frame.points, before)
+    if len(labels) > 1:
+        cost += unusual(model, found.search, labels)
     best = int(np.argmin(cost))
     chosen, guess = list(pool.values())[best][1], labels[best].copy()
     odds = (np.exp(cost[best] - cost)[:, None] * (labels != guess)).sum(0) + np.exp(-NEAR)
@@ -178,7 +184,7 @@ def _complete(found: Solution, guess: NDArray, confidence: NDArray) -> None:
             at = np.empty(3)
             variance = place_joint(len(x), x, y, sigma, t.x[i], at)
             wide = OUTLYING**2 * search.sigma[t.index][i] ** 2 + variance
-            odds = search.frame.gain + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
+            odds = search.gain[t.index][i] + np.log(OUTLIERS) - 1.5 * np.log(2 * np.pi * wide)
             odds = odds - 0.5 * ((points[free] - at) ** 2).sum(1) / wide
             best = int(np.argmax(odds))
             share = float(np.exp(odds[best]) / (1 + np.exp(odds).sum()))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit.identification.frame._kernels_evidence import place_joint
 from kinefit.identification.frame._kernels_identify import range_cost
 from kinefit.identification.frame._kernels_nodes import cheapest_beside, expand_segment
+from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.tables import SegmentTable
 
 LOOSE = 0.15
@@ -35,6 +36,7 @@ class Frame:
     points : (N, 3) [m]; gaps : (N, N) [m] their distances
     volume : [m³] of the box they are in
     gain : what a matched marker earns against a missing one, log(1/m³)
+    beliefs : what other frames of the take have shown of presence and noise
     gate : deviations by which a distance may differ
     work : (1,) tries that are left for all searches of the frame together; they use it up
     """
@@ -45,6 +47,7 @@ class Frame:
     gain: float
     gate: float
     work: NDArray = field(default_factory=lambda: np.full(1, np.inf))
+    beliefs: Beliefs | None = None
 
     @property
     def idle(self) -> bool:
@@ -119,7 +122,9 @@ class Search:
     ):
         self.tables, self.frame, self.scale = tables, frame, scale
         self.by_index = {t.index: t for t in tables}
-        self.sigma = {t.index: t.sigma * scale for t in tables}
+        told = frame.beliefs
+        self.sigma = {t.index: t.sigma * scale * (told.noise[t.index] if told else 1.0) for t in tables}
+        self.gain = {t.index: frame.gain + (told.odds[t.markers] if told else np.zeros(len(t.markers))) for t in tables}
         self.tells = {t.index: bool((t.width > 0).any()) for t in tables}
         count = len(frame.points)
         self.bits = np.zeros((count + 1, (count + 63) // 64), np.uint64)  # the last row: no point
@@ -232,7 +237,7 @@ class Search:
         index, cost, squares, new, every, union, empty = expand_segment(
             frame.points, frame.gaps, self.bits, taken | self.outside, table.x, table.D, self.sigma[table.index], given,
             joint, hold.pivot, hold.sigma, hold.anchors, hold.reach, hold.deviation, float(np.log(volume)),
-            frame.gate, frame.gain, self.slack, 2 if free else 1, frame.work, ROOM,
+            frame.gate, self.gain[table.index], self.slack, 2 if free else 1, frame.work, ROOM,
             self.slack if kept is None else kept,
         )  # fmt: skip
         self.cut |= frame.idle

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError, FileError, ObservationError
+from kinefit.geometry.se3 import exp_so3, log_so3
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 
 FORMAT = "kinefit marker model 1"
 _TABLES = ("mean", "deviation", "low", "high")
+_UPPER = np.triu_indices(3)
 
 
 class _Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -27,6 +29,8 @@ class _Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     marker: str | None = None
     exercised: float = 0.0
     ranges: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] | None = None
+    give: tuple[float, float, float, float, float, float] | None = None
 
 
 class _Segment(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -66,6 +70,8 @@ def save_model(model: MarkerModel, path: str | PathLike[str]) -> None:
                 in_child=tuple(_rounded(j.in_child)), spread=float(j.spread),
                 marker=None if j.marker is None else model.labels[j.marker], exercised=float(j.exercised),
                 ranges=tuple(float(r) for r in j.ranges),  # type: ignore[arg-type]
+                turn=None if j.turn is None else tuple(_rounded(log_so3(j.turn))),
+                give=None if j.give is None else tuple(_rounded(j.give[_UPPER])),
             )
             for j in model.joints
         ],
@@ -123,7 +129,8 @@ def _model(record: _File) -> MarkerModel:
     for joint in record.joints:
         if joint.parent not in reached or not 0 < joint.child < segments or joint.child in reached:
             raise ValueError(f"joint of segments {joint.parent} and {joint.child}: parents come before children")
-        if not joint.spread >= 0 or not np.isfinite([*joint.in_parent, *joint.in_child, joint.spread]).all():
+        turn = joint.turn or (0.0, 0.0, 0.0)
+        if not joint.spread >= 0 or not np.isfinite([*joint.in_parent, *joint.in_child, joint.spread, *turn]).all():
             raise ValueError(f"joint of segments {joint.parent} and {joint.child}: a number is not finite")
         reached.add(joint.child)
     upper = np.triu_indices(count, 1)
@@ -139,6 +146,7 @@ def _model(record: _File) -> MarkerModel:
         MarkerJoint(
             j.parent, j.child, np.array(j.in_parent), np.array(j.in_child), j.spread,
             None if j.marker is None else number[j.marker], j.exercised, j.ranges,
+            None if j.turn is None else exp_so3(np.array(j.turn)), None if j.give is None else _symmetric(j.give),
         )
         for j in record.joints
     )
@@ -147,6 +155,16 @@ def _model(record: _File) -> MarkerModel:
         tuple(tuple(number[m] for m in s.markers) for s in record.segments), tuple(s.name for s in record.segments),
         joints, tables["mean"], tables["deviation"], tables["low"], tables["high"], tuple(record.gaps),
     )
+
+
+def _symmetric(upper: tuple[float, ...]) -> NDArray:
+    """(3, 3) from its upper half; positive definite, else a ValueError."""
+    out = np.zeros((3, 3))
+    out[_UPPER] = upper
+    out = out + np.triu(out, 1).T
+    if not np.isfinite(out).all() or np.linalg.eigvalsh(out)[0] <= 0:
+        raise ValueError("`give` of a joint is no covariance")
+    return out
 
 
 def _rounded(values: NDArray) -> list:

@@ -25,7 +25,7 @@ from kinefit.identification.model.from_frame import (
     skeleton_of,
 )
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
-from kinefit.identification.model.rigid import meet, told, turned
+from kinefit.identification.model.rigid import meet, told, turned, usual_turn
 from kinefit.observations import Markers
 from kinefit.solvers.rigid_clusters import middle, rigid_frames
 
@@ -145,9 +145,12 @@ def fit_model(
             spread = np.linalg.norm(known - (R @ b + t), axis=-1)
             spread = spread[np.isfinite(spread)]
             typical = float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD
-            ranges = turned(Rs[p], R, np.isfinite(y[..., 0]).sum(1) >= min(3, len(x)))
+            enough = np.isfinite(y[..., 0]).sum(1) >= min(3, len(x))
+            ranges = turned(Rs[p], R, enough)
             joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
             share = told(joint, skeleton.ranges[s])
+            turn, give = usual_turn(Rs[p], R, enough, skeleton.ranges[s])
+            joint = replace(joint, turn=turn, give=give)
             usual = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
             joints.append(replace(joint, spread=float(np.sqrt(share * typical**2 + (1 - share) * usual**2))))
         Rs.append(R)

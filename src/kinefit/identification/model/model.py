@@ -27,6 +27,9 @@ class MarkerJoint:
         Range that the joint went through in training; 0 where the model comes from one frame.
     ranges : 3 floats [rad]
         The same about each of three axes at right angles, the most turned about first.
+    turn, give : (3, 3), (3, 3) [rad²], or None where no motion taught it
+        Middle of the child's turns in the parent's frame, and the covariance of its turns about that, in the child's
+        axes; a hinge's is small across its axis.
     """
 
     parent: int
@@ -37,6 +40,8 @@ class MarkerJoint:
     marker: int | None = None
     exercised: float = 0.0
     ranges: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: NDArray | None = None
+    give: NDArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.se3 import log_so3
+from kinefit.geometry.se3 import exp_so3, log_so3
 from kinefit.identification.model.model import MarkerJoint
 from kinefit.solvers.rigid_clusters import local, middle
 
 SECOND_RANGE = 0.35
 """Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
 and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
+
+MORE, TURN = 1.3, 0.15
+"""Turns of a joint go beyond those of training by this factor, and this [rad]."""
 
 
 def meet(
@@ -44,7 +47,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
         away = local - a
         length = np.linalg.norm(away, axis=-1)
         typical = middle(length, axis=0)
-        J = -away / length[..., None]
+        J = -away / np.maximum(length, 1e-9)[..., None]
         r = typical - length
         ok = np.isfinite(r)
         if not ok.any():
@@ -57,7 +60,7 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
     for _ in range(10):
         away = b - x
         length = np.linalg.norm(away, axis=-1)
-        J, r = away / length[:, None], typical - length
+        J, r = away / np.maximum(length, 1e-9)[:, None], typical - length
         b = b + np.linalg.lstsq(J, r, rcond=1e-3)[0]
     return a, b
 
@@ -95,19 +98,49 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
     return float(np.sqrt(np.nanmedian((length - middle(length, axis=0)) ** 2))) if len(length) else np.inf
 
 
-def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
-    """[rad] range of a joint about three axes at right angles, largest first: what 90 % of the frames lie within."""
+def _turns(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[NDArray, NDArray, NDArray] | None:
+    """Mean turn (3, 3) of a child in its parent's frame, turns about it (F, 3) [rad] along their own axes (3, 3)."""
     relative = np.einsum("fji,fjk->fik", Rp[good], Rc[good])
     relative = relative[np.isfinite(relative).all((1, 2))]
     if not len(relative):
-        return 0.0, 0.0, 0.0
+        return None
     u, _, vt = np.linalg.svd(relative.mean(0))
     mean = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     turns = log_so3(np.einsum("ji,fjk->fik", mean, relative))
     _, axes = np.linalg.eigh(turns.T @ turns)
-    low, high = np.quantile(turns @ axes, [0.05, 0.95], axis=0)
+    return mean, turns @ axes, axes
+
+
+def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
+    """[rad] range of a joint about three axes at right angles, largest first: what 90 % of the frames lie within."""
+    found = _turns(Rp, Rc, good)
+    if found is None:
+        return 0.0, 0.0, 0.0
+    low, high = np.quantile(found[1], [0.05, 0.95], axis=0)
     first, second, third = np.sort(high - low)[::-1].tolist()
     return first, second, third
+
+
+def usual_turn(
+    Rp: NDArray, Rc: NDArray, good: NDArray, full: float
+) -> tuple[NDArray | None, NDArray | None]:
+    """Middle of a joint's turns (3, 3) and their covariance (3, 3) [rad²], in the child's axes; None where not seen.
+
+    The covariance is that of turns spread evenly over what training showed, MORE of it, and of turns that it did not
+    show: TURN about any axis; of one that went through little of its range `full` [rad] the rest of that about all
+    axes; and, of what joints may turn about a second axis, half of what it did not.
+    """
+    found = _turns(Rp, Rc, good)
+    if found is None:
+        return None, None
+    mean, turns, axes = found
+    low, high = np.quantile(turns, [0.005, 0.995], axis=0)
+    middle_turn = mean @ exp_so3(axes @ (0.5 * (low + high)))
+    seen = np.sort(high - low)[::-1]
+    open_first = max(full - seen[0], 0.0)
+    open_second = 0.5 * max(SECOND_RANGE * full - seen[1], 0.0)
+    square = (MORE * (high - low)) ** 2 / 12 + TURN**2 + open_first**2 + open_second**2
+    return middle_turn, (axes * square) @ axes.T
 
 
 def told(joint: MarkerJoint, full: float) -> float:

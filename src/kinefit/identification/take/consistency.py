@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -21,27 +22,35 @@ LEVER = 0.03
 
 
 class Consistency:
-    """Distances of each label to those that hold them best.
+    """Distances of each label to those that hold them best; takes are identified and audited by it.
 
     Parameters
     ----------
+    names : labels of the model, in the order of the positions that are judged; default: all, as they are
     count : of partners of each label
+    floor, firm : [m] least deviation of a distance; deviation beyond which it says nothing
     """
 
-    def __init__(self, model: MarkerModel, count: int = 8):
-        labels = len(model)
+    def __init__(
+        self, model: MarkerModel, names: Sequence[str] | None = None, *, count: int = 8, floor: float = FLOOR,
+        firm: float = FIRM,
+    ):
+        keep = [model.labels.index(n) for n in (model.labels if names is None else names)]
+        place = {m: i for i, m in enumerate(keep)}
+        segments = [tuple(place[m] for m in s if m in place) for s in model.segments]
+        labels, square = len(keep), np.ix_(keep, keep)
         within = np.zeros((labels, labels), bool)
-        for s in model.segments:
+        for s in segments:
             within[np.ix_(s, s)] = True
-        sigma = np.hypot(model.deviation, FLOOR)
-        rank = np.where(within, sigma, sigma + FLOOR)  # of a segment first, if as firm
+        sigma = np.hypot(model.deviation[square], floor)
+        rank = np.where(within, sigma, sigma + floor)  # of a segment first, if as firm
         np.fill_diagonal(rank, np.inf)
         self.spread = np.hypot(FLOOR, 0.5 * sigma)
-        self.homes = [tuple(s for s in model.segments if m in s) for m in range(labels)]
+        self.homes = [tuple(s for s in segments if m in s) for m in range(labels)]
         self.who = np.argsort(rank, axis=1)[:, : min(count, labels - 1)]
-        self.mean = np.take_along_axis(np.asarray(model.mean), self.who, 1)
+        self.mean = np.take_along_axis(np.asarray(model.mean)[square], self.who, 1)
         self.sigma = np.take_along_axis(sigma, self.who, 1)
-        self.mean[self.sigma > FIRM] = np.nan
+        self.mean[self.sigma > firm] = np.nan
 
     def misfit(self, points: NDArray, positions: NDArray, label: int) -> NDArray:
         """(F,) deviations by which half of the distances of points (F, 3) as `label` are off; NaN where none tells."""
@@ -72,9 +81,8 @@ class Consistency:
         off = []
         for then, end in pairs:
             now = int(frames[end])
-            rigid = [self._carried(positions, then, now, points[end], label, home) for home in self.homes[label]]
-            told = min((o for o in rigid if o is not None), default=None)
-            if told is None:
+            _, told = self.carried(positions, then, now, points[end], label)
+            if not np.isfinite(told):
                 usual = np.linalg.norm(positions[then, who] - positions[then, label], axis=-1)
                 away = np.linalg.norm(positions[now, who] - points[end], axis=-1)
                 told = float(_lower_middle(np.abs(away - usual) / sigma))
@@ -82,17 +90,22 @@ class Consistency:
         off = [o for o in off if np.isfinite(o)]
         return float(np.mean(off)) if off else np.nan
 
-    def _carried(
-        self, positions: NDArray, then: int, now: int, point: NDArray, label: int, home: tuple[int, ...]
-    ) -> float | None:
-        """Deviations by which a point is off where a segment carried the label; None where it has too few markers."""
-        peers = [k for k in home if k != label and np.isfinite(positions[[then, now], k]).all()]
-        x, y = positions[then, peers], positions[now, peers]
-        if len(peers) < 3 or np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < LEVER:
-            return None
-        R, t = rigid_frames(x, y[None])
-        away = np.linalg.norm(R[0] @ positions[then, label] + t[0] - point)
-        return float(away / np.median(self.spread[label, peers]) / np.sqrt(3.0))
+    def carried(self, positions: NDArray, then: int, now: int, point: NDArray, label: int) -> tuple[float, float]:
+        """How far a point (3,) is off where a segment carried the label from one frame to another: [m], deviations.
+
+        Of several segments, the one that it is least off; inf where none shows three other markers in both frames.
+        """
+        best = (np.inf, np.inf)
+        for home in self.homes[label]:
+            peers = [k for k in home if k != label and np.isfinite(positions[[then, now], k]).all()]
+            x, y = positions[then, peers], positions[now, peers]
+            if len(peers) < 3 or np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < LEVER:
+                continue
+            R, t = rigid_frames(x, y[None])
+            away = float(np.linalg.norm(R[0] @ positions[then, label] + t[0] - point))
+            off = away / float(np.median(self.spread[label, peers]) * np.sqrt(3.0))
+            best = (away, off) if off < best[1] else best
+        return best
 
     def own(self, positions: NDArray) -> NDArray:
         """(F, M) misfit of every label where it is."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.identification.frame.beliefs import Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import Identification
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import Consistency
@@ -33,27 +34,37 @@ class Naming:
 
     def __init__(
         self, model: MarkerModel, pieces: Pieces, rate: float, step: Step,
-        identify_frame: Callable[[MarkerModel, NDArray], Identification],
+        identify_frame: Callable[[MarkerModel, NDArray, Beliefs | None], Identification],
     ):
         self.reach = max(1, round(LATELY * rate))
         self.model, self.pieces, self.step, self.identify_frame = model, pieces, step, identify_frame
+        self.beliefs: Beliefs | None = None
         self.votes = Votes(len(model))
         self.agree = Consistency(model)
         self.rows = pieces.rows()
         self.label = np.full(pieces.count, -1)
         self.sure = np.zeros(pieces.count)
         self.named: list[float] = []  # share of labels found, of each frame asked
+        self.found: dict[int, tuple[NDArray, Identification]] = {}
 
     def ask(self, frames: list[int]) -> None:
         """Identify frames, one by one."""
         done, total = len(self.votes.asked), len(self.votes.asked) + len(frames)
         for f in frames:
             points = self.pieces.points[self.pieces.starts[f] : self.pieces.starts[f + 1]]
-            found = self.identify_frame(self.model, points)
+            found = self.identify_frame(self.model, points, self.beliefs)
             self.votes.add(self.pieces, f, found)
+            self.found[f] = points, found
             self.named.append(float((found.assignment >= 0).sum() / min(len(self.model), len(points))))
             done += 1
             self.step("identifying", done, total)
+
+    def believe(self) -> None:
+        """Learn presence and noise from the frames asked so far, and ask them again with that."""
+        asked = sorted(self.found)
+        self.beliefs = learn_beliefs(self.model, list(self.found.values()))
+        self.votes, self.named = Votes(len(self.model)), []
+        self.ask(asked)
 
     def cut_changes(self) -> None:
         """Cut pieces whose name changes, asking frames between until it is known when, and where it jumps there."""

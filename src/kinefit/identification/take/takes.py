@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.errors import ObservationError
+from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import fill_gaps
@@ -104,15 +105,15 @@ class TakeIdentification:
         return replace(like, names=self.labels, positions=self.positions, residual=residual)
 
 
-def identify_anchor(model: MarkerModel, points: NDArray) -> Identification:
-    """An anchor frame on its own, as `identify`, but not for long."""
-    return identify(model, points, settings=ANCHOR)
+def identify_anchor(model: MarkerModel, points: NDArray, beliefs: Beliefs | None = None) -> Identification:
+    """An anchor frame, as `identify`, but not for long."""
+    return identify(model, points, beliefs=beliefs, settings=ANCHOR)
 
 
 @checked
 def identify_take(
     model: MarkerModel, markers: Markers, *, settings: TakeSettings | None = None, progress: Step | None = None,
-    identify_frame: Callable[[MarkerModel, NDArray], Identification] = identify_anchor,
+    identify_frame: Callable[[MarkerModel, NDArray, Beliefs | None], Identification] = identify_anchor,
 ) -> TakeIdentification:
     """Names for all points of a take, whatever its columns are called and wherever they break.
 
@@ -123,7 +124,7 @@ def identify_take(
     Parameters
     ----------
     progress : (what, done, total) -> None
-    identify_frame : model, points (N, 3) [m] -> Identification
+    identify_frame : model, points (N, 3) [m], what frames have told so far -> Identification
 
     Raises
     ------
@@ -150,6 +151,7 @@ def identify_take(
             f"the take does not fit the model of {model.name}: {_refusal(work, share)}", file=markers.source or None,
             remedy="Is it the same subject, with the same markers, and the right unit?" + _unknown_set(model),
         )
+    work.believe()
     work.ask(sorted(set(anchors) - set(first)))
     budget = max(20, int(settings.most * len(markers)))
     for _ in range(settings.rounds):
