@@ -1,12 +1,12 @@
 """The experiment of P2 (Knoop, Vacek, Dillmann 2006) on simulated sequences, graded by the truth.
 
-    python -m benchmarks.depth_voodoo
+    python -m benchmarks.depth depth_voodoo
 
 A hundred sequences: ten movements by ten people of 1.50 to 2.00 m, a time-of-flight camera at 10 Hz, and face and hands
 by their colour in rendered pictures. The method as printed, and the fusion tracker, each with depth alone, the features
 alone, and both. Published: 5 lost, 32 acceptable, 63 good, mean 1.58, graded by eye. What the method's settings do is
-looked at on the people and errors of seed 0 (`VARIANTS`), the figures are of seed 1. The Kinect-like sensor: twenty
-sequences.
+looked at on the people and errors of seeds 0 and 2 (`VARIANTS`), the figures are of seed 1. `fusion` is smoothed, as
+`kinefit track` does; `live` is the same tracker frame by frame. The Kinect-like sensor: twenty sequences.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ from kinefit.recipes.voodoo import Settings
 from kinefit.simulation.sensors import KINECT, TOF
 
 KINECT_COUNT = amount(20, 1)  # each movement and each person twice: images of 640 x 480 take long to simulate
-TUNED, HELD_OUT = 0, 1  # seeds of people and errors
+TUNED, HELD_OUT = 2, 1  # seeds of people and errors
 FLOOR = (0.0, 1.0, 0.0, 0.0)
-_TOGETHER = Settings(floor=FLOOR, overlap="nearest", band=1.0, band_rule="points")
+_WAS = Settings(overlap="exclusive", maximum=100)
 VARIANTS = {
-    "as it was: all limbs at once in the world": Settings(down=False),
-    "motions handed down the tree (the default)": Settings(),
-    "floor removed": Settings(down=False, floor=FLOOR),
-    "one cylinder a part": Settings(down=False),
-    "overlap adjacent": Settings(down=False, overlap="adjacent"),
-    "overlap shared": Settings(down=False, overlap="shared"),
-    "overlap by distance to the surface": Settings(down=False, overlap="nearest"),
-    "bands in proportion to points": Settings(down=False, band=1.0, band_rule="points"),
-    "ICP's own stop rule": Settings(down=False, stop=1e-6, steps=(5, 15)),
-    "noise of 3 cm everywhere": Settings(down=False),
-    "floor, distance, bands, down the tree": _TOGETHER,
-    "the same, noise of 3 cm everywhere": _TOGETHER,
+    "boxes by depth, at most 100 points a limb, all limbs at once in the world": replace(_WAS, down=False),
+    "motions handed down the tree": _WAS,
+    "floor removed": replace(_WAS, floor=FLOOR),
+    "one cylinder a part": _WAS,
+    "overlap adjacent": replace(_WAS, overlap="adjacent"),
+    "overlap shared": replace(_WAS, overlap="shared"),
+    "overlap by distance to the surface": replace(_WAS, overlap="nearest"),
+    "bands in proportion to points": replace(_WAS, band=1.0, band_rule="points"),
+    "ICP's own stop rule": replace(_WAS, stop=1e-6, steps=(5, 15)),
+    "noise of 3 cm everywhere": _WAS,
+    "floor removed, overlap by distance": Settings(floor=FLOOR, maximum=100),
+    "overlap by distance, at most 400 points (the default)": Settings(),
+    "floor removed, overlap by distance, at most 400 points (the experiment)": Settings(floor=FLOOR),
 }
 _NEAR = replace(TOF, noise=(0.03, 0.0, 0.0))  # what the sensor has at 2.5 m: "a few centimetres" (P2 3.1)
 
@@ -96,7 +97,7 @@ def run() -> None:
         figure(f"{name}_conclusions", float(sum(holds.values())), "of 3", "== 3")
         figure(f"{name}_minutes", spent, "min CPU for all three choices of sensors", "<= 10")
         if not published:
-            figure("fusion_tof_mm", 1e3 * both.error, "mm, mean of all joints", "<= 25")
+            figure(f"{name}_tof_mm", 1e3 * both.error, "mm, mean of all joints", "<= 25")
     kinect = sequences(KINECT_COUNT, sensor=KINECT, seed=HELD_OUT)
     near = evaluate(kinect, METHODS["fusion"], inputs=("fusion",))["fusion"]
     figure("fusion_kinect_mm", 1e3 * near.error, "mm, mean of all joints", "<= 12")

@@ -11,6 +11,7 @@ PARTS = {
     "silhouettes_torso": "a man's torso into a woman's, with local morphs on top",
     "silhouettes_track": "the real trial by silhouettes alone",
     "silhouettes_anny": "the real trial on a realistic skin of the person's shape",
+    "silhouettes_refined": "the realistic skin refined by accurate poses, and with morphs, in a camera held out",
     "silhouettes_speed": "time a frame; the renderer beside others",
     "silhouettes_basin": "from how far off a pose is found, with and without coarse to fine",
     "silhouettes_car": "a car on a turntable",

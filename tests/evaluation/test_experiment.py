@@ -17,7 +17,9 @@ from kinefit.evaluation.voodoo import (
     Summary,
     conclusions,
     evaluate,
+    fusion_method,
     grade,
+    live_method,
     point_errors,
     stretched_share,
     voodoo_method,
@@ -151,6 +153,18 @@ def test_the_published_method_follows_arms_stretched_at_the_sensor(run):
     found = evaluate([run], voodoo_method)
     assert found["fusion"].graded[0].grade.grade >= 1 and found["fusion"].error < 0.06
     assert found["fusion"].error < found["3d"].error < found["2d"].error
+
+
+def test_an_arm_stretched_at_the_sensor_is_not_found_behind_the_back():
+    """Both lie on one line of sight; a hand whose skin is seen stands before what depth shows there."""
+    run = sequence("arms_at_sensor", people()[0], number=19)
+    for method in (live_method, fusion_method):
+        assert grade(run.truth, method(run, "fusion", run.truth.state(0))).grade == 2
+
+
+def test_the_smoothed_motion_is_closer_than_the_live_one(run):
+    live, smooth = (point_errors(run.truth, m(run, "fusion", run.truth.state(0))) for m in (live_method, fusion_method))
+    assert smooth.mean() < live.mean() < 0.05
 
 
 def test_the_command_prints_the_table():

@@ -7,6 +7,7 @@ import pytest
 from kinefit.errors import ObservationError
 from kinefit.images.skin import WRISTS, SkinTracker
 from kinefit.readers.video import Video
+from kinefit.sensors.occlusion import SEEN
 
 SKIN, WOOD, WALL, SHIRT = (205, 150, 125), (190, 140, 110), (130, 150, 140), (40, 60, 120)
 FACE = (285.0, 80.0, 70.0, 100.0)
@@ -45,10 +46,21 @@ def test_hands_are_found_followed_and_told_apart():
         face, l_hand, r_hand = seen[k]
         assert np.linalg.norm(face.centre - (320, 130)) < 6
         assert np.linalg.norm(l_hand.centre - left[k]) < 10 and np.linalg.norm(r_hand.centre - right[k]) < 10
-        assert l_hand.confidence > 0.5
+        assert min(l_hand.confidence, r_hand.confidence) >= SEEN  # what has been followed is no guess
     frame = tracker.frame("cam", 1.5, WRISTS)
     assert frame.names == WRISTS and frame.confidence.min() > 0.3
     np.testing.assert_array_equal(frame.uv[1], seen[-1][1].centre)
+
+
+def test_hanging_hands_are_within_reach():
+    """As far below the face as an arm reaches, of a face that is found a fifth too small."""
+    left, right = path(30)
+    tracker = SkinTracker(drawn(), (292.0, 94.0, 56.0, 72.0))  # the hands are up to 4.7 of these heights away
+    off = np.array([0.0, 100.0])
+    assert np.linalg.norm(left + off - (320, 130), axis=1).max() > 4.5 * 72.0
+    seen = [tracker.update(drawn(left[k] + off, right[k] + off, seed=k)) for k in range(30)]
+    for k in range(10, 30):
+        assert np.linalg.norm(seen[k][1].centre - left[k] - off) < 12
 
 
 def test_light_may_fade():

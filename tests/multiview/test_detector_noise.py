@@ -72,3 +72,10 @@ def test_nothing_seen_gives_no_noise_and_no_nan():
     channels, values = residuals()
     noise = estimate_noise(channels, np.full_like(values, np.nan), np.zeros(values.shape[:2]), MOTION.rate)
     assert not np.isnan(noise.white).any() and not np.isnan(noise.drift).any() and noise.memory > 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_residuals_that_never_change_have_no_memory_of_their_own():
+    channels, values = residuals()
+    noise = estimate_noise(channels, np.zeros_like(values), factors(np.zeros_like(values)), MOTION.rate)
+    assert np.isfinite(noise.memory) and noise.memory > 0 and not np.isnan(noise.drift).any()

@@ -16,6 +16,7 @@ from kinefit.evaluation.sequences import FEATURES, INPUTS, Inputs, Sequence
 from kinefit.motion import Motion
 from kinefit.recipes.voodoo import Settings, voodoo
 from kinefit.simulation.retarget import known_motion
+from kinefit.tracking.tracker import Tracker
 
 Method = Callable[[Sequence, Inputs, BodyState], Motion]
 """Tracks a sequence with some of its sensors from a given pose; its body has the true one's landmarks."""
@@ -27,6 +28,7 @@ LOST_POINT = 0.250  # [m] length of a forearm: the limb is somewhere else
 LOST_SHARE = 0.5  # of the frames: what is off for longer than it is not was not lost for a while
 _AT_THE_END = 0.2  # [s] what is off until the end has not been found again
 _NAMED = ("point", "walk", "wave", "shake_hands", "bow", "clap")
+_FLOOR = (0.0, 1.0, 0.0, 0.0)  # plane of the simulated room's
 _STRETCHED = np.radians(25.0)  # between an arm and the direction to the sensor
 
 POINTS = (
@@ -220,23 +222,34 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
 def voodoo_method(
     run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
 ) -> Motion:
-    """P2 as printed: parts that move freely, tied by bands; `model` has the true body's tree, default: that body."""
+    """P2 as printed: parts that move freely, tied by bands; `model` has the true body's tree, default: that body.
+
+    The room's floor is known, unless `settings` say otherwise.
+    """
     parts = free_parts(run.truth.body)
-    fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings)
+    fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings or Settings(floor=_FLOOR))
     return _motion(run, parts, [parts_state(parts, fit.frames) for fit in fits])
 
 
 def fusion_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
-    """The fusion tracker: a tree of hard joints, limits, robust weights, visibility."""
-    from kinefit.tracking.tracker import Tracker
+    """The fusion tracker: a tree of hard joints, limits, robust weights, visibility; smoothed, as `kinefit track`."""
+    return _tracked(run, inputs, start).motion(name=run.truth.name)
 
-    tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy)
+
+def live_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
+    """The fusion tracker as it goes, each frame from what was seen until then."""
+    return _tracked(run, inputs, start).motion(smooth=False, name=run.truth.name)
+
+
+def _tracked(run: Sequence, inputs: Inputs, start: BodyState) -> Tracker:
+    tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy, keep=True)
     tracker.start_at(start)
-    found = [tracker.update(seen) for seen in run.seen(inputs)]
-    return _motion(run, run.truth.body, [result.state for result in found if result is not None])
+    for seen in run.seen(inputs):
+        tracker.update(seen)
+    return tracker
 
 
-METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_method}
+METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_method, "live": live_method}
 
 
 def found_start(run: Sequence) -> BodyState:

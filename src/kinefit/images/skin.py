@@ -37,7 +37,8 @@ _MOVED = 10  # [grey levels] by which a pixel differs between pictures where som
 _NOBODY = 0.6  # in favour of seeing no hand: less than a hand where it was, more than a patch elsewhere that is still
 _BOWED = 16.0  # square of the face's half size within which it is sought where it is not: bows between two pictures
 _BESIDE = 0.8  # [heights of the face] from its middle to its corners, and to the chin's neck
-_REACH = 4.5  # [heights of the face] an arm's length and half the shoulders' width
+_REACH = 5.5  # [heights of the face] an arm's length and half the shoulders' width; faces are found a fifth too small
+_SURE = 0.8  # confidence at least of a patch that was followed: it is seen (`sensors.occlusion`), no guess
 _KEPT = 0.3  # of the first colour stays for good: what is learnt cannot drift away altogether
 
 
@@ -255,10 +256,11 @@ class SkinTracker:
         shape = old.covariance if patch.crowded else 0.7 * old.covariance + 0.3 * patch.covariance
         limit = (0.5 * self._height) ** 2
         shape = shape * min(1.0, limit / max(float(np.linalg.eigvalsh(shape)[-1]), 1e-9))
-        size = patch.size / (0.35 * self._height**2)  # of a hand seen flat
+        size = min(1.0, patch.size / (0.35 * self._height**2))  # of a hand seen flat
+        sure = _SURE + (1.0 - _SURE) * size  # what was there before and has the colour is seen, also from the side
         share, gain = 0.8, 0.3  # of an alpha-beta filter for brisk movements
         speed = old.velocity + gain * off / self._step
-        self.blobs[k] = Blob(old.centre + share * off, shape, speed, min(1.0, size) * (0.5 if patch.crowded else 1.0))
+        self.blobs[k] = Blob(old.centre + share * off, shape, speed, 0.5 * size if patch.crowded else sure)
 
     def _learn(self, bins: NDArray, mask: NDArray) -> None:
         """Follow the light: skin's colour from what is taken for the face, the rest's from what is no skin."""

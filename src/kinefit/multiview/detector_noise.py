@@ -115,7 +115,7 @@ def _memory(r: NDArray, rate: float) -> tuple[float, bool]:
     if len(lags) < 2:
         return _SPAN, False
     growth = np.array([0.5 * _variance(r[lag:] - r[:-lag]) for lag in lags])
-    if not np.isfinite(growth).all() or growth[-1] - growth[0] < 0.05 * growth[-1]:
+    if not np.isfinite(growth).all() or growth[-1] - growth[0] <= 0.05 * growth[-1]:
         return _SPAN, False
     share = (growth - growth[0]) / (growth[-1] - growth[0])
     reached = float(np.interp(1.0 - np.exp(-1.0), share, lags))

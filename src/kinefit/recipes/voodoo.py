@@ -39,7 +39,8 @@ class Settings:
     body_box, limb_box : float
         Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
     overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
-        The first three are the paper's; "nearest" gives a point to the limb whose surface is nearest.
+        The first three are the paper's, "exclusive" by depth in the boxes; "nearest" is exclusive by distance: a point
+        belongs to the limb whose surface is nearest.
     factor, minimum, maximum : sampling factor, and points of a limb at least and at most.
     bound : float
         Pairs that are farther apart do not count.
@@ -62,10 +63,10 @@ class Settings:
     weights: Mapping[str, float] = field(default_factory=lambda: dict(_WEIGHTS))
     body_box: float = 0.1
     limb_box: float = 0.1
-    overlap: boxing.Overlap | Literal["nearest"] = "exclusive"
+    overlap: boxing.Overlap | Literal["nearest"] = "nearest"
     factor: float = 1.0
     minimum: int = 40
-    maximum: int = 100
+    maximum: int = 400
     bound: float = 0.15
     band: float = 30.0
     band_rule: Literal["each", "points"] = "each"
