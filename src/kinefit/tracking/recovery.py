@@ -64,8 +64,8 @@ class Recovery:
             if not seek.any():
                 self._lost_since = time
                 return result
-        waited = result is None or time - self._lost_since >= s.search_after
-        if not s.search or not waited or time - self._sought < s.search_every - 0.25 / self.rate:
+        waited = result is None or abs(time - self._lost_since) >= s.search_after  # a track may run backwards
+        if not s.search or not waited or abs(time - self._sought) < s.search_every - 0.25 / self.rate:
             return result
         self._sought = time
         if result is None or result.lost[0] or result.quality < s.poor:
@@ -135,7 +135,7 @@ class Recovery:
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
         """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
-        elapsed = time - float(self._good[seek].min())
+        elapsed = float(np.abs(time - self._good[seek]).max())
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)
         return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)
