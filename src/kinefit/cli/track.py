@@ -13,7 +13,7 @@ from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
-    from kinefit.tracking.take import InView
+    from kinefit.tracking.in_view import InView
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
@@ -107,7 +107,7 @@ def run(
     from kinefit.preparing.take import prepared
     from kinefit.readers.take.checks import check_enough, check_take
     from kinefit.readers.take.file import read_take
-    from kinefit.tracking.take import people_in_view
+    from kinefit.tracking.in_view import people_in_view
 
     take = read_take(path)
     if person is not None:
