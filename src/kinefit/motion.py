@@ -29,7 +29,9 @@ UP_AXES = {
 
 BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
 _AT_ONCE = 2000  # frames of which all segments' poses are made at once
-_ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
+ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
+"""Of a motion, one entry a frame each."""
+
 
 
 def rotation_between_up(source: str, target: str) -> NDArray:
@@ -138,7 +140,7 @@ class Motion:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
+        for name in ARRAYS:
             array = getattr(self, name)
             mine = isinstance(array, np.ndarray) and array.dtype == float and array.base is None
             if not mine or array.flags.writeable:
@@ -186,7 +188,7 @@ class Motion:
     def parts(self, frames: int = _AT_ONCE) -> Iterator[Motion]:
         """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
         for start in range(0, max(len(self), 1), frames):
-            arrays = {name: getattr(self, name)[start : start + frames] for name in _ARRAYS}
+            arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
             yield replace(self, residuals={}, **arrays)
 
     def state(self, frame: int) -> BodyState:

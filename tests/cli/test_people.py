@@ -42,10 +42,11 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
     from kinefit.multiview import followed
+    from kinefit.tracking import in_view
     from kinefit.tracking import take as module
 
     calls = []
-    for of, name in ((module, "load_observations"), (followed, "people_of")):
+    for of, name in ((module, "load_observations"), (in_view, "load_observations"), (followed, "people_of")):
         original = getattr(of, name)
         monkeypatch.setattr(of, name, lambda *a, f=original, n=name, **more: (calls.append(n), f(*a, **more))[1])
     assert run("track", take, *QUIET, "--out", tmp_path).exit_code == 0

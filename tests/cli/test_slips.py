@@ -73,6 +73,13 @@ def test_another_file_than_a_take_is_answered_with_its_command(take, monkeypatch
     assert answer.exit_code == 2 and told in answer.stderr
 
 
+@pytest.mark.parametrize("words", [("check",), ("calibrate", "people")])
+def test_a_video_is_answered_with_the_command_that_was_asked_for(take, monkeypatch, words):
+    monkeypatch.chdir(take.parent)
+    answer = run(*words, "cam01.mp4")
+    assert answer.exit_code == 2 and f"kinefit {' '.join(words)} take.toml" in answer.stderr
+
+
 def test_a_video_alone_is_answered_with_init(take, monkeypatch):
     take.unlink()
     monkeypatch.chdir(take.parent)

@@ -32,6 +32,7 @@ from kinefit.errors import BodyError, CalibrationError, KinefitError, Observatio
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking import recovery
 from kinefit.tracking.tracker import FrameResult, Tracker
 
 FEW = ("neck", "r_wrist", "l_ankle")
@@ -209,6 +210,16 @@ def test_a_limb_that_is_somewhere_else_is_sought_and_found():
                 assert result.lost[BODY.tree.segment("forearm_l")]
         found[search] = off(result.state, 7)[wrist]
     assert found[True] < 0.05 < 0.15 < found[False]
+
+
+def test_a_track_backwards_seeks_as_often_as_one_forwards(monkeypatch):
+    wrong, sought = turned(a_motion().state(9), arm_add_l=-80, elbow_flex_l=60), []
+    monkeypatch.setattr(recovery, "find_limbs", lambda *_: sought.append(1) or [])
+    tracker = a_tracker(start=None, settings=TrackSettings()).backwards(wrong)
+    tracker._prediction.start(wrong, np.full(N, 0.02))
+    for i in (9, 5, 1):
+        tracker.update([depth_frame(i)])
+    assert len(sought) == 3
 
 
 def test_a_body_that_has_gone_is_lost():

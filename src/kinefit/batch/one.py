@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.preparing.detecting import Tell
     from kinefit.readers.take.file import Take
-    from kinefit.tracking.take import InView
+    from kinefit.tracking.in_view import InView
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
     Keypoints are detected and bodies fetched first, where the take needs them.
     """
     from kinefit.preparing.take import prepared
-    from kinefit.tracking.take import people_in_view
+    from kinefit.tracking.in_view import people_in_view
 
     take = prepared(take, step, tell)
     view = people_in_view(take) if take.person is None else None

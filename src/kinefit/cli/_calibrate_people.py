@@ -42,7 +42,7 @@ def people(
     from kinefit.readers.take.find import find_take
     from kinefit.tracking.take import load_keypoints
 
-    take = find_take(take)
+    take = find_take(take, wanted=("calibrate", "people"))
     out = out or take.with_name(f"{take.stem}-people.toml")
     check_new(out, remedy="Name another one with --out.")
     entry = read_take(take)

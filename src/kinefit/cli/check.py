@@ -60,7 +60,7 @@ def check(
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import find_take
 
-    take = find_take(take)
+    take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")
     check_file(out)
     entry = read_take(take)

@@ -51,11 +51,12 @@ def starts_from_points(
 
 def starts_from_views(
     body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3,
-    *, backgrounds: Mapping[str, NDArray] | None = None,
+    *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
 ) -> list[BodyState]:  # fmt: skip
     """States to begin with from one depth image or cloud; those that known points agree with come first.
 
-    `backgrounds`: {depth camera: (H, W) [m]} of the empty scene, where it is known.
+    `backgrounds`: {depth camera: (H, W) [m]} of the empty scene, where it is known; `forward`: (3,) where the body
+    faced before.
     """
     starts: list[Start] = []
     for frame in frames:
@@ -63,7 +64,7 @@ def starts_from_views(
         if view is not None and not starts:
             try:
                 empty = (backgrounds or {}).get(view[1].name)
-                starts = start_from_points(body, *view, background=empty, up=up, count=count)
+                starts = start_from_points(body, *view, background=empty, up=up, count=count, forward=forward)
             except KinefitError:
                 continue
     points, x = known_points(frames, (), scene, keypoints)

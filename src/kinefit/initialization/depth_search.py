@@ -20,6 +20,7 @@ from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_mar
 POINTS = 700  # measured points that take part in a fit: more do not distinguish postures better
 FACING = 0.02  # of the score: a person rather faces the sensor (twice that for one turned away) ...
 UPRIGHT = 0.05  # ... and stands or sits upright (that for one who lies); for what is alike from both sides
+AS_BEFORE = 0.1  # instead, where it is known how a body faced a moment ago: twice that for one that has turned about
 YAWS, LEANS = np.arange(0.0, 2 * np.pi, np.pi / 6), ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg]
 TRIES = 200  # random poses of a limb
 STEP = (0.04, 0.2, 0.35)  # [m, rad, rad] first random steps of the root's place and turn, and of angles
@@ -35,12 +36,14 @@ class Search:
     view : DepthView
     up : (3,) unit, in the world
     rng : what random tries are drawn from
+    forward : (3,) unit, where the root faced a moment ago; None where that is not known
     """
 
     body: Body
     view: DepthView
     up: NDArray
     rng: np.random.Generator
+    forward: NDArray | None = None
 
     @cached_property
     def score(self) -> Score:
@@ -63,12 +66,14 @@ class Search:
         return self.score.of(state) - float(self.stance(state.T_world_root[None])[0])
 
     def stance(self, roots: NDArray) -> NDArray:
-        """(B,) what it costs to turn the back on the sensor, and to lie."""
+        """(B,) what it costs to turn the back on the sensor, or on where one faced before, and to lie."""
         sight = self.view.viewpoint - roots[:, :3, 3]
         sight = sight - (sight @ self.up)[:, None] * self.up
         sight /= np.linalg.norm(sight, axis=1, keepdims=True) + 1e-9
-        facing = np.einsum("ij,ij->i", roots[:, :3, 0], sight)
-        cost: NDArray = FACING * (1 - facing) + UPRIGHT * (1 - roots[:, :3, 1] @ self.up)
+        weight, facing = FACING, np.einsum("ij,ij->i", roots[:, :3, 0], sight)
+        if self.forward is not None:
+            weight, facing = AS_BEFORE, roots[:, :3, 0] @ self.forward
+        cost: NDArray = weight * (1 - facing) + UPRIGHT * (1 - roots[:, :3, 1] @ self.up)
         return cost
 
     def trunks(self, count: int) -> list[BodyState]:

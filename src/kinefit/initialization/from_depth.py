@@ -64,6 +64,7 @@ def start_from_points(
     count: int = 5,
     attempts: int = 2,
     seed: int = 0,
+    forward: ArrayLike | None = None,
 ) -> list[Start]:
     """Poses of a body in one depth image or cloud, the best first.
 
@@ -83,6 +84,7 @@ def start_from_points(
     attempts : int
         How often all is tried at most, until a good pose is found: about two and a half seconds of one core each.
     seed : int of the random tries; the same gives the same poses.
+    forward : (3,) where the root faced a moment ago, optional; a person seldom turns about in a second.
 
     Raises
     ------
@@ -98,7 +100,7 @@ def start_from_points(
     more = _views(body, points, camera, depth, up, background)
     for attempt in range(max(attempts, 1)):
         views += next(more, [])
-        searches = _searches(body, views, up, seed + attempt)
+        searches = _searches(body, views, up, seed + attempt, forward)
         found += [(search, state) for search in searches for state in search.best(count)]
         if max(_meant(*f) for f in found) > _GOOD:
             break
@@ -164,8 +166,11 @@ def _unit(up: ArrayLike) -> NDArray:
     return vector / np.linalg.norm(vector)
 
 
-def _searches(body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int) -> list[Search]:
-    return [Search(body, view, _unit(up), np.random.default_rng(seed)) for view in views]
+def _searches(
+    body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int, forward: ArrayLike | None = None
+) -> list[Search]:
+    ahead = None if forward is None else np.asarray(forward, float)
+    return [Search(body, view, _unit(up), np.random.default_rng(seed), ahead) for view in views]
 
 
 def _views(

@@ -67,24 +67,28 @@ def follow(
     TrackingError
         A number that is more than there are people.
     """
-    wanted = PersonChoice.of(person)
+    PersonChoice.of(person)
     if people is None:
         lifted = lifted_alone(keypoints)
         people = () if not may_be_several(keypoints) else (
             people_of(rig, keypoints) if lifted is None else people_before(rig, keypoints, lifted)
         )
     people = tuple(people)
-    if wanted.way == "number" and wanted.number > max(len(people), 1):
-        there = f"{len(people)} people are" if len(people) > 1 else "one person is"
-        raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")
+    number = choose(people, person)
     if len(people) < 2:
         return Followed(tuple(keypoints), people)
-    number = _number(people, wanted)
     one = people[number]
     return Followed(tuple(k.of_one(chosen) for k, chosen in zip(keypoints, one.chosen)), people, number + 1)
 
 
-def _number(people: Sequence[Person], wanted: PersonChoice) -> int:
+def choose(people: Sequence[Person], person: int | str | None) -> int:
+    """Which of the people in view is meant, from 0; errors and forms as of `follow`."""
+    wanted = PersonChoice.of(person)
+    if wanted.way == "number" and wanted.number > max(len(people), 1):
+        there = f"{len(people)} people are" if len(people) > 1 else "one person is"
+        raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")
+    if not people:
+        return 0
     if wanted.way == "moving":
         return int(np.argmax([one.speed for one in people]))
     if wanted.way == "largest":

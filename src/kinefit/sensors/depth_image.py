@@ -23,6 +23,7 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, 
 from kinefit.sensors.depth_gate import gathered, person_view, window_of
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.occlusion import DepthSeen
+from kinefit.sensors.parting import drawn_together, of_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surface_match import FreePairs, SurfacePairs, along
@@ -114,6 +115,9 @@ class DepthImageMeasurement(Measurement):
         depth = without_speckles(frame.depth, camera, self.sigma)
         self._kept = depth if of.background is None else of.background.marked(depth, first, last)
         self._shown: NDArray | None = surface.depth(vertices, camera).copy()
+        if scene.others:
+            theirs = of_others(self._kept, self._shown, drawn_together(scene.others, camera), camera)
+            self._kept = np.where(theirs, -self._kept, self._kept)
         self._space = self._free(self._shown)
         self._matches, self.is_compact = 0, False
         self._judged: tuple[BodyState, NDArray] | None = None

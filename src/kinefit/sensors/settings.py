@@ -80,7 +80,7 @@ class TrackSettings:
     support : float in 0..1
         Share of the evidence that agrees below which a start from points that are known in space is tried.
     poor : float in 0..1
-        Mean quality below which the whole body counts as lost, and is sought as at the start.
+        Mean quality of what is seen, below which the whole body counts as lost, and is sought as at the start.
     doubtful : float in 0..1
         Quality of a segment below which its limb is sought together with one that is lost.
     search_after, search_every : float [s]

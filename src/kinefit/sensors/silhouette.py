@@ -23,6 +23,7 @@ from kinefit.rendering import scaled
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.parting import drawn_together, outside_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
@@ -104,11 +105,25 @@ class SilhouetteMeasurement(Measurement):
         self.rim(scene, stale=0.0)
         size = 2 * int(np.ceil(of.settings.reach * self.pixels_per_metre)) + 1  # as far about it as it may have moved
         seen = scene.surface.rims(scene.placed(self.camera)).drawn(self.camera) >= 0
-        self.mask = choose_person(mask, cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
-        self.outline = np.ascontiguousarray(outline(self.mask)[:, :: max(round(1.3 * _SPACING), 1)])
+        own = cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+        theirs = self._parted(mask, scene)
+        self.mask = choose_person(np.where(theirs, 0, mask).astype(np.uint8), own)
+        points = outline(self.mask)[:, :: max(round(1.3 * _SPACING), 1)]
+        if theirs.any():  # where one person is cut off from another, no contour was seen
+            beside = cv2.dilate(theirs.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+            column, row = (np.clip(np.rint(points[k]).astype(int), 0, n - 1) for k, n in enumerate(mask.shape[::-1]))
+            points = points[:, ~beside[row, column]]
+        self.outline = np.ascontiguousarray(points)
         # Over a patch of the surface the errors of an outline are alike, and every place is measured from both sides.
         share = min(_SPACING / (of.settings.patch * self.pixels_per_metre), 1.0)
         self._row_sigma = self.sigma / np.sqrt(share / 2.0)
+
+    def _parted(self, mask: NDArray, scene: Scene) -> NDArray:
+        """(h, w) bool, where the silhouette is another person's."""
+        own, others = (drawn_together(several, self.camera) for several in ([scene], scene.others))
+        if own is None or others is None:
+            return np.zeros(mask.shape, bool)
+        return outside_others(mask, own, others)
 
     def rim(self, scene: Scene, stale: float = _STALE) -> Rim:
         """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import UP_AXES
+from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
 from kinefit.multiview.followed import Followed, follow
 from kinefit.multiview.one_camera import lifted_alone
@@ -59,6 +59,8 @@ class Recording:
     on_body : depth cameras whose images show nothing but the body
     backgrounds : {depth camera: (H, W) [m]} of the empty scene
     start : step and state to begin with
+    others : motions of other people in view, in the same world and time, by whom depth images, masks and colours are
+        parted
     up : vertical axis of the world
     name : str
     """
@@ -79,6 +81,7 @@ class Recording:
     on_body: tuple[str, ...] = ()
     backgrounds: Mapping[str, NDArray] = field(default_factory=dict)
     start: tuple[int, BodyState] | None = None
+    others: tuple[Motion, ...] = ()
     up: str = "z"
     name: str = "motion"
 

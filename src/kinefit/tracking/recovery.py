@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, BodyState
 from kinefit.frame.prediction import forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from kinefit.tracking.tracker import Tracker
 
 _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than that must be the more certain
+_ANEW = 0.3  # [s] between frames in which a pose becomes any other: what limbs are not found is sought with the whole
+_TURN = 1.0  # [s] for which a person still faces about where it faced
+_STRIDE = 0.5  # [m] by which a root is found elsewhere without a step
 _GAIN = 0.1  # of the support, by which a start must be better than what was tracked
 
 
@@ -36,11 +39,16 @@ class Recovery:
     def __init__(self, body: Body, rig: Rig, up: NDArray, settings: TrackSettings, rate: float) -> None:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
+        self._root: NDArray | None = None  # (4, 4) where the root was then
         self.forget()
 
     def forget(self) -> None:
         """Of the time before a pause."""
         self._sought = self._lost_since = -np.inf
+
+    def started(self, state: BodyState) -> None:
+        """A state that is known for the time of the next search."""
+        self._root, self._good[0] = state.T_world_root, np.nan
 
     def clocks(self) -> tuple[float, float]:
         """When the last search was, and since when something is lost [s]."""
@@ -56,21 +64,28 @@ class Recovery:
     ) -> FrameResult | None:  # fmt: skip
         """The result of one time, or a better one that was found."""
         s = self.settings
+        if np.isnan(self._good[0]):
+            self._good[0] = time
         if result is None or result.support < s.support:
             result = self._from_points(tracker, time, frames, measurements, result)
         if result is not None:
             seek = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
             self._good[~seek] = time
+            if not seek[0]:
+                self._root = result.state.T_world_root
             if not seek.any():
                 self._lost_since = time
                 return result
-        waited = result is None or time - self._lost_since >= s.search_after
-        if not s.search or not waited or time - self._sought < s.search_every - 0.25 / self.rate:
+        waited = result is None or abs(time - self._lost_since) >= s.search_after  # a track may run backwards
+        if not s.search or not waited or abs(time - self._sought) < s.search_every - 0.25 / self.rate:
             return result
         self._sought = time
-        if result is None or result.lost[0] or result.quality < s.poor:
+        if result is None or _astray(result, s.poor):
             return self._from_views(tracker, time, frames, result)
-        return self._limbs(tracker, time, frames, measurements, result, seek)
+        result = self._limbs(tracker, time, frames, measurements, result, seek)
+        if result.lost.any() and self.rate < 1.0 / _ANEW:
+            return self._from_views(tracker, time, frames, result)
+        return result
 
     def _from_points(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
@@ -91,12 +106,18 @@ class Recovery:
         """A start from what shows a whole person."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
         own = tracker.sensors
+        elapsed = abs(time - self._good[0])
+        known = self._root if elapsed <= _TURN + 1e-6 else None
         for state in starts_from_views(
-            self.body, self.rig, frames, self.up, scene, own.keypoints, backgrounds=own.stated
-        ):
+            self.body, self.rig, tracker.alone(frames), self.up, scene, own.keypoints, backgrounds=own.stated,
+            forward=None if known is None else known[:3, 0],
+        ):  # fmt: skip
+            if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
+                continue  # somebody else
             found = tracker.fitted(time, frames, state).result
-            poor = found.lost[0] or found.quality < self.settings.poor
-            if not poor and (result is None or _better(found, result)):
+            poor = _astray(found, self.settings.poor)
+            allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
+            if allowed and (result is None or _better(found, result)):
                 result, self._lost_since = found, time
                 tracker.restart(found)
         return result
@@ -135,7 +156,7 @@ class Recovery:
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
         """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
-        elapsed = time - float(self._good[seek].min())
+        elapsed = float(np.abs(time - self._good[seek]).max())
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)
         return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)
@@ -148,8 +169,18 @@ def _against(tracker: Tracker, result: FrameResult) -> float:
     return float(np.sum(1.0 - 100.0 / (square + 100.0)))
 
 
-def _better(new: FrameResult, old: FrameResult) -> bool:
-    """Fewer segments are lost, or as many and more speaks for those that are seen."""
-    lost = int(new.lost.sum()), int(old.lost.sum())
-    return lost[0] < lost[1] or (lost[0] == lost[1] and new.quality > old.quality + 0.05)
+def _gone(new: NDArray, old: NDArray) -> float:
+    """[m] between two roots (4, 4)."""
+    return float(np.linalg.norm(new[:3, 3] - old[:3, 3]))
 
+
+def _astray(result: FrameResult, poor: float) -> bool:
+    """Whether the whole body is lost: its root is, or too little of what is seen of it agrees."""
+    seen = result.segment_quality[~result.hidden]
+    return bool(result.lost[0]) or float(seen.mean() if len(seen) else 0.0) < poor
+
+
+def _better(new: FrameResult, old: FrameResult) -> bool:
+    """More segments are seen where they are thought to be, less those that are lost; or as many, and more agrees."""
+    found = [int((~r.hidden & ~r.lost).sum()) - int(r.lost.sum()) for r in (new, old)]
+    return found[0] > found[1] or (found[0] == found[1] and new.quality > old.quality + 0.05)

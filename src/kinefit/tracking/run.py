@@ -18,6 +18,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool, SpoolState
 from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.others import OtherPeople
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.so_far import append_rows
@@ -160,6 +161,7 @@ def run(
         begin, state = start
         tracker.start_at(state)
     frames, at = _Frames(checkpoint), begin
+    others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
     if checkpoint is not None:
         checkpoint.know(layout=layout, channels=channels, body=body, found_rig=recording.rig, settings=settings)
         tracker, at = frames.go_on(checkpoint, tracker, at)
@@ -169,7 +171,7 @@ def run(
         if len(layout.points) and (channels.confidence[i] > 0).any():
             pixels = channels.uv[i], channels.confidence[i]
             seen.append(KeypointMeasurement(tracker.sensors.keypoints, layout, *pixels, time))
-        found = tracker.update(seen, time)
+        found = tracker.update(seen, time, others=others.at(time))
         if found is not None:
             moving = {"measurements": found.measurements, "velocity": tracker.speed}
             frames.add(i, KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving)))

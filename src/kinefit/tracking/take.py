@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 
 import numpy as np
@@ -14,7 +14,6 @@ from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
 from kinefit.multiview.followed import follow
-from kinefit.multiview.people import Person
 from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
@@ -27,6 +26,7 @@ from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.in_view import InView, people_in_view
 from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
@@ -55,6 +55,7 @@ def track_take(
     take = take if isinstance(take, Take) else read_take(take)
     check_enough(take)
     take = prepared(take, progress)
+    view = view or people_in_view(take)
     seen = with_names(take, view.seen if view else load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
@@ -80,6 +81,8 @@ def track_take(
         )  # fmt: skip
     recording, body = recording_of(take, seen, body, view.people if view else None)
     settings = settings_of(take, settings)
+    if view is not None:
+        recording = view.recording(recording, body, take.person, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings)
     motion = track(
@@ -88,32 +91,6 @@ def track_take(
         checkpoint=checkpoint,
     )  # fmt: skip
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
-
-
-@dataclass(frozen=True, eq=False)
-class InView:
-    """What the cameras of a take saw, and everybody in it.
-
-    Parameters
-    ----------
-    seen : Observations
-    people : the one of whom most is seen first; empty where nobody but one was ever detected
-    """
-
-    seen: Observations
-    people: tuple[Person, ...]
-
-
-def people_in_view(take: Take) -> InView | None:
-    """Everybody whom a take's keypoints show; None where other sensors take part, which are not parted by people."""
-    beside = (
-        take.markers, take.depth, take.stereo, take.silhouettes, take.regions, take.skin, take.lines,
-        take.surface_points,
-    )  # fmt: skip
-    if any(beside) or not take.keypoints:
-        return None
-    seen = load_observations(take)
-    return None if seen.rig is None else InView(seen, follow(seen.rig, seen.keypoints).people)
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:

@@ -20,11 +20,13 @@ from kinefit.frame.results import FrameResult
 from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
+from kinefit.observations import DepthFrame
 from kinefit.observations.arrays import is_number, numbers
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.depth_image import DepthImageSensor
+from kinefit.sensors.parting import without_others
 from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -134,13 +136,7 @@ class Tracker:
         self.sensors.know_background(sensor, depth)
 
     def set_sigma(self, sensor: str, sigma: float) -> None:
-        """Another standard deviation of a sensor from the next frame on: [px] of keypoints, [m] of depth and markers.
-
-        Raises
-        ------
-        ObservationError
-            No positive number, or a sensor of one's own.
-        """
+        """Another standard deviation of a sensor from the next frame on, see `Sensors.set_sigma`."""
         self.sensors.set_sigma(sensor, sigma)
 
     def start_at(self, state: BodyState) -> None:
@@ -150,6 +146,7 @@ class Tracker:
             problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
+        self._recovery.started(state)
         self._seen[:] = -np.inf
 
     def backwards(self, state: BodyState) -> Tracker:
@@ -242,6 +239,8 @@ class Tracker:
             self._recovery.set_clocks(clocks)
             self.sensors.unlearn(learnt)
             raise
+        finally:
+            self._others = ()
 
     def _updated(self, frames: Sequence[Any], time: float) -> FrameResult | None:
         steps = self._steps(time)
@@ -284,6 +283,10 @@ class Tracker:
     def apart(self, scene: Scene) -> list[AnyRows]:
         """Rows that keep parts of the body from running into each other."""
         return self._fit.apart(scene)
+
+    def alone(self, frames: Sequence[Any]) -> list[Any]:
+        """Frames in which this body may be sought: depth images without the other bodies of the update at hand."""
+        return [without_others(f, self._others, self.rig[f.sensor]) if isinstance(f, DepthFrame) else f for f in frames]
 
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
         scene = self._scene.at(state, time=time, velocity=self.speed, others=self._others)

@@ -38,7 +38,7 @@ class TimeOffsets:
         Their median is zero, as nobody can see what all share (of two cameras the first is taken to be right). NaN
         where nothing shows it.
     std : (C,) [s]
-        Standard error, from the scatter over time; infinite where nothing shows it.
+        Standard error, from the scatter over time and between points; infinite where nothing shows it.
     rate : float [Hz]
     curves : {(camera, camera): (shifts (S,) [frames], cost (S,) [px])}
         How well the rays of two cameras meet when the second is taken so many frames later.
@@ -128,21 +128,26 @@ def _fractions(views: Views, delays: NDArray) -> tuple[NDArray, NDArray]:
     cameras = len(views.rig)
     for _ in range(_ROUNDS):
         system = _delay_equations(shifted(views, delays))
-        if system is None:
+        if not system:
             return np.full(cameras, np.nan), np.full(cameras, np.inf)
-        matrix, right = system
+        matrix, right = system[0]
         step = _solve(matrix.sum(0), right.sum(0))
         delays = delays + np.clip(step, -1.0, 1.0)
         delays -= np.median(delays)
         if np.abs(step).max() < 0.01:
             break
-    whole = _solve(matrix.sum(0), right.sum(0))
-    left = [_solve(matrix.sum(0) - m, right.sum(0) - r) for m, r in zip(matrix, right, strict=True)]
-    n = len(left)
-    std = np.sqrt((n - 1) / n * np.sum(np.square(np.stack(left) - whole), axis=0))  # jackknife
+    std = np.hypot(*(_jackknife(*blocks) for blocks in system))
     diagonal = np.diag(matrix.sum(0))
     unseen = diagonal < 1e-6 * max(diagonal.max(), 1e-300)
     return np.where(unseen, np.nan, delays), np.where(unseen | ~np.isfinite(std), np.inf, std)
+
+
+def _jackknife(matrix: NDArray, right: NDArray) -> NDArray:
+    """(C,) standard errors of the delays from normal equations (B, C, C), (B, C) of blocks whose errors are alike."""
+    used = np.flatnonzero(np.trace(matrix, axis1=1, axis2=2) > 0.0)
+    whole, n = _solve(matrix.sum(0), right.sum(0)), len(used)
+    left = [_solve(matrix.sum(0) - matrix[b], right.sum(0) - right[b]) for b in used]
+    return np.sqrt((n - 1) / n * np.sum(np.square(np.stack(left) - whole), axis=0))
 
 
 def _solve(matrix: NDArray, right: NDArray) -> NDArray:
@@ -151,15 +156,18 @@ def _solve(matrix: NDArray, right: NDArray) -> NDArray:
     return np.linalg.lstsq(matrix + weight * np.ones_like(matrix), right, rcond=1e-9)[0]
 
 
-def _delay_equations(views: Views) -> tuple[NDArray, NDArray] | None:
-    """Normal equations (B, C, C), (B, C) of the cameras' delays [frames], one for each block of time."""
+def _delay_equations(views: Views) -> list[tuple[NDArray, NDArray]]:
+    """Normal equations (B, C, C), (B, C) of the cameras' delays [frames]: of blocks of time, and of single points.
+
+    None of either where too little is seen.
+    """
     cameras, (frames, points) = len(views.rig), views.uv.shape[:2]
     x, agree = meet(views)
     speed = _speed(x, max(2, round(_STEP * views.rate)))  # of the points in space: strays of one camera do not make it
     agree &= np.isfinite(speed).all(-1)[..., None]
     use = agree.sum(axis=2) >= 2
     if use.sum() < MIN_FRAMES:
-        return None
+        return []
     residual, velocity = np.full(views.uv.shape, np.nan), np.full(views.uv.shape, np.nan)
     jacobian = np.zeros((frames, points, cameras, 2, 3))
     for c, camera in enumerate(views.rig):
@@ -183,11 +191,14 @@ def _delay_equations(views: Views) -> tuple[NDArray, NDArray] | None:
         (design * rows[..., None])[use].reshape(n, -1, cameras),
         np.nan_to_num(residual * rows)[use].reshape(n, -1),
     )
-    block = (np.nonzero(use)[0] * _BLOCKS) // frames
-    sums = np.zeros((_BLOCKS, cameras, cameras)), np.zeros((_BLOCKS, cameras))
-    np.add.at(sums[0], block, matrix)
-    np.add.at(sums[1], block, right)
-    return sums
+    frame, point = np.nonzero(use)
+    out = []
+    for block, count in (((frame * _BLOCKS) // frames, _BLOCKS), (point, points)):
+        sums = np.zeros((count, cameras, cameras)), np.zeros((count, cameras))
+        np.add.at(sums[0], block, matrix)
+        np.add.at(sums[1], block, right)
+        out.append(sums)
+    return out
 
 
 def _speed(x: NDArray, reach: int) -> NDArray:

@@ -24,6 +24,7 @@ _TENTH, _FIFTH, _WRONG = (
 )  # [frames] from which an offset is told, is a doubt, puts frames together wrongly
 _UNSURE = 0.5  # [frames] standard error beyond which an offset cannot be told
 _NEARLY_ALL = 0.9  # of the squared disagreement
+_CLEARLY = 0.5  # of what the second best explanation leaves of it, that the best one leaves at most
 _OUTLIERS = 0.15  # share of a camera's points that agree with nobody: detectors stay well below
 
 
@@ -110,7 +111,7 @@ def _who_moved(parts: Disagreement, accuracy: float, take: Path, noticed: bool) 
             continue
         names = tuple(parts.cameras[c] for c in best)
         lines = "; ".join(_how(parts, c, values) for c, values in zip(best, parts.solve(*best), strict=True))
-        clear = shares[second] < 0.9 * shares[best]
+        clear = 1.0 - shares[best] < _CLEARLY * (1.0 - shares[second])
         others = listed(parts.cameras[c] for c in second)
         sure = (
             f"{'Likely' if clear else 'A guess'}: it would explain {100 * shares[best]:.0f} % of the squared "

@@ -90,8 +90,8 @@ def _values(take: Take) -> None:
             PersonChoice.of(take.person)
         except ObservationError as error:
             refuse(error.problem, "[take] person", error.remedy or "")
-        if not take.keypoints and (take.depth or take.stereo or take.markers or take.silhouettes or take.skin):
-            refuse("'person' has no use without [[keypoints]]", "[take] person", "Leave it out.")
+        if not (take.keypoints or take.depth) and (take.stereo or take.markers or take.silhouettes or take.skin):
+            refuse("'person' has no use without [[keypoints]] or [[depth]]", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -11,8 +12,10 @@ from kinefit.readers.guess.files import MARKERS, VIDEOS
 from kinefit.readers.take.entries import TABLES
 
 
-def find_take(path: str | PathLike[str]) -> Path:
+def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) -> Path:
     """The take file at a path: the file itself, or the take file in a folder.
+
+    `wanted`: words of the command that takes it, for what is advised where a video is given.
 
     Raises
     ------
@@ -34,7 +37,7 @@ def find_take(path: str | PathLike[str]) -> Path:
     if kind in VIDEOS:
         there = next(iter(takes_in(path.parent)), None)
         first = f"Run {command('init', path.parent)}, which writes the take file of all videos and their calibration."
-        what = first if there is None else f"The take file beside it: {command('track', there)}."
+        what = first if there is None else f"The take file beside it: {command(*wanted, there)}."
         remedy = f"{what} For keypoints of this video alone: {command('detect', path)}"
         raise FileError("a video, not a take file", file=path, remedy=remedy)
     if kind in MARKERS:

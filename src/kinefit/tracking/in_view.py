@@ -1,0 +1,188 @@
+"""Everybody in view of a take's sensors, and each of them apart from the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, load_body
+from kinefit.errors import KinefitError, TrackingError
+from kinefit.images.depth import to_points
+from kinefit.images.depth_noise import denoised, without_speckles
+from kinefit.images.depth_scene import Blob, find_floor, foreground, people
+from kinefit.initialization.from_depth import start_from_points
+from kinefit.motion import ARRAYS, Motion
+from kinefit.multiview.followed import Followed, choose, follow
+from kinefit.multiview.people import Person
+from kinefit.observations import DepthFrame
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations, load_observations
+from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.video import track
+
+_LIKE = 0.4  # score of a start in a thing that is a person: 0.45 and more of people of another size than the body's
+_MOST = 4  # things in a depth image that are looked at
+_SAME = 0.3  # [m] two roots that are nearer are of one person
+_WALK = 3.0  # [m/s]
+_STRIDE = 0.5  # [m] by which the middle of what is seen of a person moves without a step
+
+
+@dataclass(frozen=True, eq=False)
+class InView:
+    """What the sensors of a take saw, and everybody in it.
+
+    Parameters
+    ----------
+    seen : Observations
+    people : the one of whom most is seen first; empty where nobody but one was ever detected
+    depth : of each of them, some depth images by step that show nobody else; empty where keypoints tell who is there
+    starts : of each of them step and state to begin with, likewise
+    """
+
+    seen: Observations
+    people: tuple[Person, ...]
+    depth: tuple[Mapping[int, DepthFrame], ...] = ()
+    starts: tuple[tuple[int, BodyState], ...] = ()
+    _motions: dict[int, Motion] = field(default_factory=dict)
+
+    def recording(
+        self, recording: Recording, body: Body, person: int | str | None, settings: TrackSettings
+    ) -> Recording:
+        """The recording of one person, with the motions of all others, by which its sensors are parted.
+
+        Raises
+        ------
+        ObservationError, TrackingError
+            A person in no known form; a number that is more than there are people.
+        """
+        number = choose(self.people, person)
+        if len(self.people) < 2:
+            return recording
+        shared = self.depth or any(len(recording.steps(i)) for i in range(min(len(recording), 100)))
+        if not shared:
+            return recording
+        motions = [self._motion(k, recording, body, settings) for k in range(len(self.people))]
+        own = motions[number]
+        others = tuple(
+            m if own is None or k < number else _elsewhere(m, own)
+            for k, m in enumerate(motions) if k != number and m is not None
+        )  # fmt: skip
+        return replace(self._of(number, recording), others=tuple(m for m in others if len(m)))
+
+    def _of(self, number: int, recording: Recording) -> Recording:
+        if not self.depth:
+            return recording
+        who = Followed((), self.people, number + 1)
+        return replace(recording, depth=self.depth[number], start=self.starts[number], followed=who)
+
+    def _motion(self, k: int, recording: Recording, body: Body, settings: TrackSettings) -> Motion | None:
+        """Of one person, roughly: from keypoints alone, or from depth as if nobody else were there; None if lost."""
+        if k not in self._motions:
+            try:
+                if self.depth:
+                    self._motions[k] = track(self._of(k, recording), body, settings=settings, smooth=False)
+                else:
+                    own = Recording.of_keypoints(
+                        recording.rig, self.seen.keypoints, person=k + 1, people=self.people, up=recording.up
+                    )
+                    self._motions[k] = track(own, body, settings=settings)
+            except KinefitError:
+                return None
+        return self._motions[k]
+
+
+def _elsewhere(motion: Motion, own: Motion) -> Motion:
+    """The frames of a motion in which it is not where one's own is: there both follow one person, the first listed."""
+    k = np.abs(motion.times[:, None] - own.times).argmin(axis=1)
+    apart = motion.Ts_world_root[:, :3, 3] - own.Ts_world_root[k, :3, 3]
+    use = np.linalg.norm(apart, axis=1) > _SAME
+    arrays = {name: getattr(motion, name)[use] for name in ARRAYS}
+    return replace(motion, **arrays, residuals={})
+
+
+def people_in_view(take: Take) -> InView | None:
+    """Everybody whom a take's keypoints show, or the first depth images where it has none.
+
+    None where markers, lines or other points take part, which are not parted by people, or where the take tells itself
+    where a body is.
+    """
+    points = take.markers or take.lines or take.skin or take.surface_points
+    if points or not (take.keypoints or ((take.depth or take.stereo) and not (take.start or take.pose))):
+        return None
+    seen = load_observations(take)
+    if take.keypoints:
+        return None if seen.rig is None else InView(seen, follow(seen.rig, seen.keypoints).people)
+    body = load_body(take.body)
+    return people_in_depth(seen, recording_of(take, seen, body)[0], body)
+
+
+def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InView:
+    """Everybody who stands apart from the others in one of the first depth images, the one best explained first.
+
+    Things of a person's size count as people where the body explains them.
+    """
+    found = {step: _blobs(frame, recording) for step, frame in recording.depth.items()}
+    step = max(found, key=lambda s: (len(found[s]), -s), default=-1)
+    if step < 0 or len(found[step]) < 2:
+        return InView(seen, ())
+    frame = recording.depth[step]
+    camera = recording.rig[frame.sensor]
+    scored: list[tuple[float, Blob, BodyState]] = []
+    for blob in found[step][:_MOST]:
+        alone = np.where(blob.mask, frame.depth, 0.0)
+        try:
+            start = start_from_points(body, None, camera, alone, up=recording.up_axis, count=1, attempts=1)[0]
+        except TrackingError:
+            continue
+        if start.score > _LIKE:
+            scored.append((start.score * float(blob.mask.sum()), blob, start.state))
+    scored.sort(key=lambda one: -one[0])
+    every = [blob for _, blob, _ in scored]
+    if len(every) < 2:
+        return InView(seen, ())
+    images = tuple(_of_blob(k, every, step, found, recording) for k in range(len(every)))
+    persons = tuple(_person(blob, surety, len(recording)) for surety, blob, _ in scored)
+    return InView(seen, persons, images, tuple((step, state) for *_, state in scored))
+
+
+def _blobs(frame: DepthFrame, recording: Recording) -> list[Blob]:
+    """Things of a person's size in a depth image, the largest first."""
+    camera = recording.rig[frame.sensor]
+    depth = denoised(without_speckles(frame.depth, camera, closed=True), camera)
+    empty = recording.backgrounds.get(frame.sensor)
+    floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), recording.up_axis)
+    return list(people(depth, camera, mask=None if empty is None else foreground(depth, empty), floor=floor))
+
+
+def _of_blob(
+    k: int, every: Sequence[Blob], step: int, found: Mapping[int, Sequence[Blob]], recording: Recording
+) -> dict[int, DepthFrame]:
+    """Depth images by step without the other people: where each is a thing by itself, near to where it was."""
+    out = {}
+    for at, frame in recording.depth.items():
+        reach = _STRIDE + _WALK * abs(at - step) / recording.rate
+        near = [_nearest(blob, found[at], reach) for blob in every]
+        if near[k] is None or any(near[k] is other for j, other in enumerate(near) if j != k):
+            continue
+        theirs = [b.mask for j, b in enumerate(near) if b is not None and j != k]
+        hidden = np.logical_or.reduce(theirs) if theirs else np.zeros(frame.depth.shape, bool)
+        out[at] = replace(frame, depth=np.where(hidden, 0.0, frame.depth).astype(np.float32))
+    return out
+
+
+def _nearest(blob: Blob, among: Sequence[Blob], reach: float) -> Blob | None:
+    if not among:
+        return None
+    away = [float(np.linalg.norm(other.centre - blob.centre)) for other in among]
+    best = int(np.argmin(away))
+    return among[best] if away[best] < reach else None
+
+
+def _person(blob: Blob, surety: float, steps: int) -> Person:
+    rows: NDArray = np.flatnonzero(blob.mask.any(axis=1))
+    return Person((), np.ones(steps, int), surety, 0.0, float(np.ptp(rows)), np.asarray(blob.centre))
