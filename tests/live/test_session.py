@@ -46,7 +46,7 @@ def test_packets_say_what_the_protocol_says(scene, collected):
     assert pose["type"] == "pose" and len(pose["segments"]) == len(tree.segments)
     assert np.allclose(np.linalg.norm(np.array(pose["segments"])[:, 3:], axis=1), 1.0, atol=1e-4)
     r = collected.poses[-1].result
-    assert pose["angle_std"] == [round(s, 5) if np.isfinite(s) else None for s in r.dof_std[6:]]
+    assert pose["angle_std"] == [round(s, 6) if np.isfinite(s) else None for s in r.dof_std[6:]]
     assert None in pose["angle_std"]  # fingers that no keypoint shows
 
 

@@ -17,7 +17,7 @@ Step = Callable[[str, int, int], None]
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
-    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd",
+    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd", "jsonl": "motion.jsonl",
 }  # fmt: skip
 """What each format is called in a folder of results."""
 
@@ -38,6 +38,7 @@ ABOUT = {
     "x3d": "animated H-Anim figure for browsers and archives",
     "nwb": "joint centres with confidence for neuroscience",
     "mcap": "joint states and transforms for ROS 2",
+    "jsonl": "poses as JSON lines, as kinefit live sends them; for the Blender add-on",
     "rrd": "joints, error bars and angles for the viewer of Rerun",
     "overlays": "videos with the skeleton drawn on them",
     "montage": "one picture of all cameras",
@@ -55,6 +56,7 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
         "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
         "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot, "x3d": exporters.write_x3d,
         "nwb": exporters.write_nwb, "mcap": exporters.write_mcap, "rrd": exporters.write_rrd,
+        "jsonl": exporters.write_jsonl,
         "osim": lambda motion, path: exporters.write_osim(motion.body, path),
     }  # fmt: skip
     writers[format](motion, path, **options)

@@ -44,6 +44,7 @@ FREEDOM = {
     "nwb": Freedom((), _UPS, _NAMES, (), "NWB is in metres here"),
     "mcap": Freedom((), _Z_UPS, _NAMES, (), "ROS is in metres"),
     "rrd": Freedom((), _UPS, _NAMES, (), "RRD is in metres here"),
+    "jsonl": Freedom((), _UPS, (), (), "JSON lines are in metres, under the names of the body's segments"),
     "mot": Freedom(why=_OPENSIM),
     "osim": Freedom(why=_OPENSIM),
 }
@@ -63,7 +64,7 @@ Examples:
   kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
 
 \b
-Choices, the default first (csv, parquet, c3d, nwb and rrd keep the take's vertical axis; --names mixamo rests as t):
+Choices, the default first (csv, parquet, c3d, nwb, rrd, jsonl keep the take's vertical axis; --names mixamo rests as t):
 """ + "".join(
     f"  {format:<8} "
     + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))

@@ -8,6 +8,7 @@ from kinefit.exporters.nwb import write_nwb
 from kinefit.exporters.opensim.files import write_mot, write_osim, write_trc
 from kinefit.exporters.pictures.depth import depth_picture, write_depth_overlay
 from kinefit.exporters.pictures.overlay import draw_overlay, write_montage, write_overlay
+from kinefit.exporters.pose_lines import write_jsonl
 from kinefit.exporters.report.report import write_report
 from kinefit.exporters.rrd import write_rrd
 from kinefit.exporters.skeletons.bvh import write_bvh
@@ -19,7 +20,7 @@ from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [
     "depth_picture", "draw_overlay", "tables", "write_bvh", "write_c3d", "write_character", "write_csv",
-    "write_depth_overlay", "write_glb", "write_markers", "write_mcap", "write_montage", "write_mot", "write_motion",
-    "write_nwb", "write_osim", "write_overlay", "write_parquet", "write_report", "write_rrd", "write_trc",
-    "write_usd", "write_x3d",
+    "write_depth_overlay", "write_glb", "write_jsonl", "write_markers", "write_mcap", "write_montage", "write_mot",
+    "write_motion", "write_nwb", "write_osim", "write_overlay", "write_parquet", "write_report", "write_rrd",
+    "write_trc", "write_usd", "write_x3d",
 ]  # fmt: skip

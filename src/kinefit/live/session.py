@@ -12,10 +12,11 @@ import numpy as np
 
 from kinefit.bodies import Body, catalogue, load_body
 from kinefit.errors import BodyError, KinefitError, ObservationError, choices
+from kinefit.exporters.pose_lines import hello
 from kinefit.frame.results import FrameResult
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.inbox import Arrived, Inbox
-from kinefit.live.packets import Posed, hello
+from kinefit.live.packets import Posed
 from kinefit.live.people import LivePerson
 from kinefit.live.replay import REPLAY
 from kinefit.live.seen import SeenRecord
