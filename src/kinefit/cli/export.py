@@ -64,7 +64,7 @@ Examples:
   kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
 
 \b
-Choices, the default first (csv, parquet, c3d, nwb, rrd, jsonl keep the take's vertical axis; --names mixamo rests as t):
+Choices, the default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo rests as t):
 """ + "".join(
     f"  {format:<8} "
     + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
