@@ -31,7 +31,6 @@ _NEAR, _FAR = 1.5, 5.0  # [m] of the grey levels
 _BODY, _RIGHT, _LEFT = (125, 150, 90), (60, 110, 200), (170, 110, 50)  # BGR
 _SIZE = 1.25  # of a cell, in pixels of the depth camera
 _FOUND = (60, 220, 240)
-_ROWS = slice(6, 124)  # of the depth image that are shown
 
 
 def drawn(body: Body, state: BodyState, camera: Camera, back: NDArray) -> NDArray:
@@ -62,7 +61,7 @@ def row(run: Sequence, share: float, fitted: list) -> NDArray:
         cv2.circle(seen, (round(uv[0]), round(uv[1])), 7, _FOUND, 2, cv2.LINE_AA)
     seen = cv2.resize(seen, camera.size, interpolation=cv2.INTER_AREA)
     cells = [back, seen] + [drawn(m.body, m.state(frame), camera, back) for m in (*fitted, run.truth)]
-    cells = [cv2.resize(c[_ROWS], None, fx=_SIZE, fy=_SIZE, interpolation=cv2.INTER_CUBIC) for c in cells]
+    cells = [cv2.resize(c, None, fx=_SIZE, fy=_SIZE, interpolation=cv2.INTER_CUBIC) for c in cells]
     return np.concatenate(cells, axis=1)
 
 

@@ -39,8 +39,7 @@ class Settings:
     body_box, limb_box : float
         Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
     overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
-        The first three are the paper's, "exclusive" by depth in the boxes; "nearest" is exclusive by distance: a point
-        belongs to the limb whose surface is nearest.
+        "exclusive" is by depth in the boxes, "nearest" by distance to the surface; the paper leaves open which.
     factor, minimum, maximum : sampling factor, and points of a limb at least and at most.
     bound : float
         Pairs that are farther apart do not count.
