@@ -18,6 +18,7 @@ from kinefit.photogrammetry.intersection import intersect
 _BESIDE = 0.08  # [m] at the point: in a thick limb a joint is clicked 2 to 4 cm beside another view's; no more
 _FEWEST = 3  # points that fix a pose
 _CLICK = 3.0  # [px] by which a person misses a joint
+_VAGUE = 0.5  # [m] of a point whose rays are all but parallel
 _SIGMA = 0.005  # [m] of a clicked joint: they agree already, and no posture prior is to move them
 _TURNS = 30  # of placing a fixed root and fitting the angles
 _LISTED = 4  # joints that a message names
@@ -75,7 +76,9 @@ def clicked_points(rig: Rig, names: Sequence[str], uv: NDArray) -> tuple[NDArray
             f"clicked points do not meet: {'; '.join(told[:_LISTED])}" + "; ..." * (len(told) > _LISTED),
             remedy=_remedy(rig, blamed, len(x)),
         )
-    return x, intersect(rig, uv, np.tile(_CLICK**2 * np.eye(2), (*uv.shape[:2], 1, 1))).covariance
+    covariance = intersect(rig, uv, np.tile(_CLICK**2 * np.eye(2), (*uv.shape[:2], 1, 1))).covariance
+    vague = np.isfinite(x).all(axis=1) & ~np.isfinite(covariance).all(axis=(1, 2))  # rays that are all but parallel
+    return x, np.where(vague[:, None, None], _VAGUE**2 * np.eye(3), covariance)
 
 
 def _missed(rig: Rig, x: NDArray, uv: NDArray) -> tuple[NDArray, NDArray]:
