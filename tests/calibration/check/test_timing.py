@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.calibration.check.check import check_keypoints
-from kinefit.calibration.check.timing import _speed, fast_pixels, shifted, time_offsets
+from kinefit.calibration.check.timing import _jackknife, _speed, fast_pixels, shifted, time_offsets
 from kinefit.calibration.check.views import make_views
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
@@ -34,6 +34,14 @@ def test_offsets_are_found_to_a_tenth_of_a_frame(late):
     assert found.frames == pytest.approx(np.array(late) - np.median(late), abs=0.1)
     assert np.all(found.std * found.rate < 0.1)
     assert found.offsets == pytest.approx(found.frames / 30.0)
+
+
+def test_points_that_disagree_make_an_offset_unsure():
+    """Each block tells the delay of one camera against another: the standard error is that of their mean."""
+    told, row = np.array([0.1, -0.3, 2.0, 0.4, 0.3]), np.array([1.0, -1.0])
+    matrix, right = np.tile(np.outer(row, row), (5, 1, 1)), told[:, None] * row
+    std = _jackknife(np.concatenate([matrix, np.zeros((3, 2, 2))]), np.concatenate([right, np.zeros((3, 2))]))
+    assert std == pytest.approx(np.full(2, 0.5 * told.std(ddof=1) / np.sqrt(5)))  # half of it on either camera
 
 
 def test_two_cameras_are_told_against_the_first():
