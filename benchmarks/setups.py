@@ -25,7 +25,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import studio_rig
 
-FIRST, DRAWS, SURE = 7000, 12, 10.0  # [degrees]
+FIRST, DRAWS, SURE = 7000, 8, 10.0  # [degrees]
 CAMERAS = (2, 3, 4, 6, 8)
 SENSORS = ("cameras", "cameras_silhouettes", "cameras_depth", "cameras_markers", "depth_alone", "markers_sparse",
            "markers_alone")  # fmt: skip
