@@ -53,7 +53,12 @@ def test_restart_begins_anew(take, tmp_path, monkeypatch):
         assert CliRunner().invoke(main, words).exit_code != 0
     counted = []
     update = Tracker.update
-    monkeypatch.setattr(Tracker, "update", lambda self, *given: counted.append(1) or update(self, *given))
+
+    def counting(self, *given, **more):
+        counted.append(1)
+        return update(self, *given, **more)
+
+    monkeypatch.setattr(Tracker, "update", counting)
     told = CliRunner().invoke(main, [*words, "--restart"])
     assert told.exit_code == 0 and "going on" not in told.output
     assert len(counted) == 60

@@ -328,7 +328,7 @@ def test_ctrl_c_before_the_first_frame_is_only_that(monkeypatch):
     motion = cut(squat_and_wave(), 0, 3)
     rig = studio_rig(motion)
 
-    def interrupted(*args):
+    def interrupted(*args, **more):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("kinefit.tracking.tracker.Tracker.update", interrupted)

@@ -90,8 +90,12 @@ def _values(take: Take) -> None:
             PersonChoice.of(take.person)
         except ObservationError as error:
             refuse(error.problem, "[take] person", error.remedy or "")
-        if not (take.keypoints or take.depth) and (take.stereo or take.markers or take.silhouettes or take.skin):
-            refuse("'person' has no use without [[keypoints]] or [[depth]]", "[take] person", "Leave it out.")
+        told = take.start is not None or take.pose is not None  # where the body is, and so who
+        if not (take.keypoints or (take.depth and not told)) and (
+            take.depth or take.stereo or take.markers or take.silhouettes or take.skin
+        ):
+            what = "[[keypoints]], beside a start" if told else "[[keypoints]] or [[depth]]"
+            refuse(f"'person' has no use without {what}", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
