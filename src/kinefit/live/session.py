@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import queue
 import time
 from collections import deque
@@ -114,15 +115,18 @@ class LiveSession:
         """
         until = None if seconds is None else time.monotonic() + seconds
         self._hello()
-        for source in self.sources:
-            source.start(self.inbox)
+        gc.collect()
+        gc.freeze()  # what is there lasts: looking through it again and again would hold up poses
         try:
+            for source in self.sources:
+                source.start(self.inbox)
             while not (self._over or self.inbox.over) and (until is None or time.monotonic() < until):
                 arrived = self.inbox.take(_WAIT)
                 self._listen()
                 if arrived:
                     self.step(arrived)
         finally:
+            gc.unfreeze()
             self.close()
 
     def close(self) -> None:

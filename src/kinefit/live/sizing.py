@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -64,7 +65,7 @@ class LiveSize:
             self._steps.append(seen)
             self._next = result.time + _BETWEEN
             if self._pool is None:  # its start takes seconds, and is over when the steps are there
-                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_behind)
                 self._pool.submit(warm_keypoints)
         if len(self._steps) == _STEPS:
             assert self._pool is not None
@@ -83,8 +84,9 @@ class LiveSize:
         try:
             body = self._future.result()
             lengths = body.segment_lengths()
-            bones = ", ".join(f"{name} {lengths[name]:.3f}" for name in ("thigh_r", "shank_r") if name in lengths)
-            self.told = f"the person's size was found: {bones} m" if bones else "the person's size was found"
+            bones = {"thigh": "thigh_r-shank_r", "shank": "shank_r-foot_r", "forearm": "forearm_r-hand_r"}
+            told = ", ".join(f"{what} {100 * lengths[bone]:.1f}" for what, bone in bones.items() if bone in lengths)
+            self.told = f"the person's size was found ({told} cm)" if told else "the person's size was found"
             return body
         except KinefitError as error:
             self.told = f"the person's size was not found, it is taken to be as usual ({error.problem})"
@@ -93,6 +95,12 @@ class LiveSize:
         finally:
             self.close()
         return None
+
+
+def _behind() -> None:
+    """Let the session go before this process."""
+    if hasattr(os, "nice"):
+        os.nice(10)
 
 
 def fitted_body(

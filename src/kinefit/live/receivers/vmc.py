@@ -60,7 +60,8 @@ class Vmc:
         self._socket.setblocking(False)
         self._turn = se3.transform(rotation_between_up(up, "y"), np.zeros(3))
         self._rest: Rest | None = None
-        self._bones: list[tuple[int, int, str]] = []
+        self._bones: list[str] = []
+        self._segments = self._above = np.zeros(0, int)
         self.unsent = 0
 
     def hello(self, body: Body, packet: bytes) -> None:
@@ -69,13 +70,14 @@ class Vmc:
         segments, parents = body.tree.segments, body.tree.parents
         if "pelvis" not in segments:
             raise BodyError(f"body '{body.name}' has no pelvis", place="VMC", remedy="Follow a person: humanoid.")
-        self._bones = []
-        for s, name in enumerate(segments):
+        kept, lowest = [s for s, name in enumerate(segments) if name in BONES], []
+        for s in kept:
             above = int(parents[s])
             while above >= 0 and segments[above] not in BONES:
                 above = int(parents[above])
-            if name in BONES:
-                self._bones.append((s, above, BONES[name]))
+            lowest.append(above)
+        self._bones = [BONES[segments[s]] for s in kept]
+        self._segments, self._above = np.array(kept), np.array(lowest)
 
     def pose(self, posed: Posed, packet: bytes) -> None:
         """Send a pose; where the network is busy, it is left out and counted in `unsent`."""
@@ -88,21 +90,18 @@ class Vmc:
     def packets(self, Ts_world_segment: NDArray, time: float) -> list[bytes]:
         """OSC bundles of one pose, none larger than a network's packet."""
         assert self._rest is not None
+        segments, above = self._segments, self._above
         T = self._turn @ Ts_world_segment
-        R = T[:, :3, :3] @ self._rest.turns.swapaxes(-1, -2)
+        T[:, :3, :3] = T[:, :3, :3] @ self._rest.turns.swapaxes(-1, -2)
+        parents = np.where((above >= 0)[:, None, None], T[np.maximum(above, 0)], np.eye(4))
+        local = se3.inverse(parents) @ T[segments]
+        q = se3.quaternion(local[:, :3, :3])
+        numbers = np.concatenate([local[:, :3, 3] * (-1, 1, 1), q[:, 1:] * (1, -1, -1), q[:, :1]], axis=1).tolist()
         out: list[tuple[str | int | float, ...]] = [
             ("/VMC/Ext/OK", 1), ("/VMC/Ext/T", float(time)),
             ("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
         ]  # fmt: skip
-        for s, above, bone in self._bones:
-            if above < 0:
-                place, turn = T[s, :3, 3], R[s]
-            else:
-                place, turn = R[above].T @ (T[s, :3, 3] - T[above, :3, 3]), R[above].T @ R[s]
-            w, x, y, z = se3.quaternion(turn)
-            px, py, pz = place
-            numbers = (-px, py, pz, x, -y, -z, w)
-            out.append(("/VMC/Ext/Bone/Pos", bone, *(float(v) for v in numbers)))
+        out += [("/VMC/Ext/Bone/Pos", bone, *own) for bone, own in zip(self._bones, numbers)]
         return _parts(out)
 
     def close(self) -> None:
