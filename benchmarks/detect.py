@@ -37,7 +37,7 @@ def run() -> None:
     """Print every figure of the built-in detector."""
     trial, seated = data("video_balancing_4cam"), data("mv4_upperbody_caliscope")
     try:
-        detecting._networks(None, print)
+        detecting.networks(None, print)
         missing = "" if trial else "no recording"
     except (AssetError, ObservationError) as error:
         missing = error.problem
