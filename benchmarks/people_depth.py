@@ -80,7 +80,7 @@ def run() -> None:
 
 def _kinect() -> None:
     folder = data("depth_skeltrack_kinect1")
-    names = list(KINECT)[: amount(len(KINECT), 2)]
+    names = list(KINECT)[amount(slice(None), slice(1, 3))]  # in the first image are two people
     if folder is None:
         return _none("people_kinect")
     with tempfile.TemporaryDirectory() as work:

@@ -1,20 +1,24 @@
 """What an uncertain shape does to a pose is what fitting the pose anew in other worlds shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.subject import measured
 from tests.subject.measured import ARM, RIG
 
 from kinefit.frame.fit import weaker
+from kinefit.geometry.camera import Rig
 from kinefit.rows import ParameterRows
 from kinefit.sensors.base import matched_by, rows_at
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.shape_errors import ShapeErrors, shape_errors
 from kinefit.solvers.equations import inverse, normal_equations
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.matched_frames import Worlds
-from kinefit.subject.parameters import PointOffsets, SegmentScales
+from kinefit.subject.parameters import PointOffsets, SegmentScales, World
 
 PRIOR = 0.3  # [rad] of every angle
 
@@ -75,6 +79,24 @@ def test_answers_are_those_of_poses_fitted_anew(found, scale):
     assert joints.max() > 0.001**2
     np.testing.assert_allclose(np.sqrt(errors.joints[0]), np.sqrt(joints), rtol=0.05, atol=1e-4)
     np.testing.assert_allclose(np.sqrt(errors.dofs[0]), np.sqrt(dofs), rtol=0.1, atol=1e-3)
+
+
+def test_a_shape_found_without_cameras_answers_to_pixels_too(found):
+    subject, _ = found
+    world = Worlds(subject.prior_world, subject.parameters).at(subject.mean)
+    state = subject.states[4]
+    scene = Scene(world.body, state, RIG)
+    points = world.body.keypoints("COCO_17")
+    uv = RIG.cameras[1].project(scene.positions(points)) + 3.0
+    matched = matched_by(measured.Seen(RIG.names[1], 0.0, "COCO_17", uv), scene, 0.05)
+    alone = 1e-4 * np.eye(world.body.tree.n_dofs)
+
+    def errors(one):
+        return shape_errors(one, TrackSettings(), lambda f: (scene, [matched]), [4], [alone])
+
+    blind = errors(replace(subject, prior_world=World(ARM, Rig(()))))
+    np.testing.assert_array_equal(blind.dofs, errors(subject).dofs)
+    assert blind.dofs.max() > 0.0
 
 
 def test_between_frames_variances_are_interpolated():

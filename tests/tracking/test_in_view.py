@@ -36,6 +36,7 @@ def seen(k):
     return np.where(shown, depth + 0.004 * rng.normal(size=depth.shape), 0.0).astype(np.float32)
 
 
+@pytest.mark.slow
 def test_two_people_before_a_depth_camera():
     rig = Rig((camera(),))
     steps = [[DepthFrame("depth", k / RATE, seen(k))] for k in range(COUNT)]
@@ -64,3 +65,21 @@ def test_one_person_before_a_depth_camera_is_nobody_else():
     recording = Recording.of_frames([[frame]], Rig((cam,)), rate=RATE, up="y")
     view = people_in_depth(None, recording, BODY)
     assert view.people == () and view.recording(recording, BODY, None, TrackSettings()) is recording
+
+
+def test_furniture_is_nobody():
+    rig = Rig((camera(),))
+    steps = [[DepthFrame("depth", k / RATE, with_a_box(k))] for k in (0, COUNT - 1)]
+    recording = Recording.of_frames(steps, rig, rate=RATE, up="y")
+    assert people_in_depth(None, replace(recording, depth={0: steps[0][0], 1: steps[1][0]}), BODY).people == ()
+
+
+def with_a_box(k):
+    """One person, and a thing of a person's size and distance that stands still."""
+    cam = camera()
+    depth = render_body(BODY, at(facing(yaw=0.2), -0.4 + 0.02 * k, 0.3), cam).depth
+    depth = np.where(np.isfinite(depth), depth, 0.0)
+    height, width = depth.shape
+    box = (slice(height // 3, int(0.9 * height)), slice(int(0.75 * width), int(0.95 * width)))
+    depth[box] = np.where(depth[box] > 0, depth[box], np.median(depth[depth > 0]))
+    return depth.astype(np.float32)

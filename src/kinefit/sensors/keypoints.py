@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
+from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.losses import Loss
@@ -236,6 +237,9 @@ class KeypointMatched(Matched):
         """Two rows a keypoint; one more where it lies too deep behind what was measured in front of it."""
         layout = self.measurement.layout
         points, channels = layout.points_of(scene.body), layout.channels
+        if len(scene.rig) < len(channels.rig):
+            problem = f"keypoints of {len(channels.rig)} cameras in a scene of {len(scene.rig)}"
+            raise ObservationError(problem, remedy="Give the scene the rig that the keypoints' sensor has.")
         rows = scene.rows_of(
             _kernels.pixel_rows, 2, points, scene.rig.packed, channels.camera, self.uv, self.weight
         )

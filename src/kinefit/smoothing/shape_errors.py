@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of, rows_of_points, weaker
+from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -171,7 +172,15 @@ class _Frame:
     def _scene(self, values: NDArray) -> Scene:
         s, world = self.scene, self.worlds.at(self._all(values))
         scene = self.worlds.scene(world, s.state)
-        return scene.at(s.state, time=s.time, velocity=s.velocity, measurements=s.measurements)
+        rig = _moved(s.rig, world.rig)
+        return scene.at(s.state, rig=rig, time=s.time, velocity=s.velocity, measurements=s.measurements)
+
+
+def _moved(rig: Rig, known: Rig) -> Rig:
+    """A scene's cameras, in their order, where a world has those that it knows: a fit to points alone knows none."""
+    if known.names == rig.names:
+        return known
+    return Rig(tuple(known[c.name] if c.name in known else c for c in rig.cameras))
 
 
 def _centres(body: Body, state: BodyState) -> NDArray:

@@ -26,6 +26,8 @@ from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import track
 
 _LIKE = 0.4  # score of a start in a thing that is a person: 0.45 and more of people of another size than the body's
+_SURELY = 0.6  # the same of one that no furniture reaches: boxes come to 0.5, so below it a person has to move
+_STILL = 0.8  # overlap of the pixels of a thing that stands still: 0.95 and more of furniture, its noisy edges included
 _MOST = 4  # things in a depth image that are looked at
 _SAME = 0.3  # [m] two roots that are nearer are of one person
 _WALK = 3.0  # [m/s]
@@ -124,7 +126,7 @@ def people_in_view(take: Take) -> InView | None:
 def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InView:
     """Everybody who stands apart from the others in one of the first depth images, the one best explained first.
 
-    Things of a person's size count as people where the body explains them.
+    Things of a person's size count as people where the body explains them, surely or while they move.
     """
     found = {step: _blobs(frame, recording) for step, frame in recording.depth.items()}
     step = max(found, key=lambda s: (len(found[s]), -s), default=-1)
@@ -139,7 +141,7 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
             start = start_from_points(body, None, camera, alone, up=recording.up_axis, count=1, attempts=1)[0]
         except TrackingError:
             continue
-        if start.score > _LIKE:
+        if start.score > (_LIKE if _moves(blob, step, found) else _SURELY):
             scored.append((start.score * float(blob.mask.sum()), blob, start.state))
     scored.sort(key=lambda one: -one[0])
     every = [blob for _, blob, _ in scored]
@@ -173,6 +175,17 @@ def _of_blob(
         hidden = np.logical_or.reduce(theirs) if theirs else np.zeros(frame.depth.shape, bool)
         out[at] = replace(frame, depth=np.where(hidden, 0.0, frame.depth).astype(np.float32))
     return out
+
+
+def _moves(blob: Blob, step: int, found: Mapping[int, Sequence[Blob]]) -> bool:
+    """Whether a thing covers other pixels in another image; furniture does not, nor does one image tell."""
+    others = [found[at] for at in found if at != step]
+    overlaps = [max((_overlap(blob.mask, b.mask) for b in among), default=0.0) for among in others]
+    return min(overlaps, default=1.0) < _STILL
+
+
+def _overlap(one: NDArray, other: NDArray) -> float:
+    return float((one & other).sum() / max((one | other).sum(), 1))
 
 
 def _nearest(blob: Blob, among: Sequence[Blob], reach: float) -> Blob | None:

@@ -69,8 +69,9 @@ def test_all_limbs_are_one_closed_net_without_holes_or_handles():
 def test_it_does_not_run_through_itself():
     x, triangles, _ = SKIN.mesh()
     assert len(crossings(x, triangles)) == 0
+    x, triangles, _ = SKIN.mesh(0)
     pushed = np.where(x[:, 1:2] > 0.75, x - (0.0, 0.4, 0.0), x)  # the head into the chest: the test can fail
-    assert len(crossings(pushed, triangles)) > 10
+    assert len(crossings(pushed, triangles)) > 10  # of few triangles: some become half a metre long
 
 
 def test_the_normal_is_continuous_over_every_branch():
