@@ -9,6 +9,7 @@ PARTS = {
     "install": "what a fresh installation takes on disk, with the viewer and without",
     "long": "long takes: memory by length, going on after a kill, the page of an hour",
     "live": "live sessions of the balancing trial: latency, an hour's memory and drift",
+    "speed": "frames a second by sensor and number of cameras",
     "setups": "which sensor set-up is how exact, simulated: cameras by number, and sensors",
     "batch": "many takes: two workers against one, what Dask adds to a take, equal after a kill",
     "formats": "every format, read back by a program that others wrote",

@@ -54,18 +54,18 @@ def quaternion(rotation: NDArray) -> NDArray:
     """Unit quaternion (..., 4) as (w, x, y, z), w ≥ 0, of a rotation matrix (..., 3, 3); always stable (Shepperd)."""
     r = np.asarray(rotation, float)
     m00, m11, m22 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    squares = np.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1)
-    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
-    table = np.stack(
-        [
-            np.stack([squares[..., 0], wx, wy, wz], -1),
-            np.stack([wx, squares[..., 1], xy, xz], -1),
-            np.stack([wy, xy, squares[..., 2], yz], -1),
-            np.stack([wz, xz, yz, squares[..., 3]], -1),
-        ],
-        -2,
-    )
+    table = np.empty((*r.shape[:-2], 4, 4))
+    table[..., 0, 0] = 1 + m00 + m11 + m22
+    table[..., 1, 1] = 1 + m00 - m11 - m22
+    table[..., 2, 2] = 1 - m00 + m11 - m22
+    table[..., 3, 3] = 1 - m00 - m11 + m22
+    table[..., 0, 1] = table[..., 1, 0] = r[..., 2, 1] - r[..., 1, 2]
+    table[..., 0, 2] = table[..., 2, 0] = r[..., 0, 2] - r[..., 2, 0]
+    table[..., 0, 3] = table[..., 3, 0] = r[..., 1, 0] - r[..., 0, 1]
+    table[..., 1, 2] = table[..., 2, 1] = r[..., 0, 1] + r[..., 1, 0]
+    table[..., 1, 3] = table[..., 3, 1] = r[..., 0, 2] + r[..., 2, 0]
+    table[..., 2, 3] = table[..., 3, 2] = r[..., 1, 2] + r[..., 2, 1]
+    squares = np.diagonal(table, axis1=-2, axis2=-1)
     best = np.argmax(squares, axis=-1)
     q = np.take_along_axis(table, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)

@@ -58,7 +58,9 @@ class LivePerson:
         seen = [k for k in records if surety_of(k, 1).any()]
         chosen = [-1] * len(seen)
         if state is not None:
-            chosen = [self._fitting(k, body, state) for k in seen]
+            sets = {k.keypoint_set: known_points(body, k.keypoint_set) for k in seen}
+            places = {name: (points.names, body.positions(state, points)) for name, points in sets.items()}
+            chosen = [self._fitting(k, *places[k.keypoint_set]) for k in seen]
         if seen and not any(p >= 0 for p in chosen):
             chosen = self._anew(seen)
         out: list[KeypointFrame | LiftedFrame] = [_frame(k, p) for k, p in zip(seen, chosen) if p >= 0]
@@ -66,14 +68,14 @@ class LivePerson:
             out += [_lifted(k, k.lifted, p) for k, p in zip(seen, chosen) if p >= 0 and k.lifted is not None]
         return out
 
-    def _fitting(self, record: Keypoints, body: Body, state: BodyState) -> int:
-        """Who of a record is where the body was last; -1 for none."""
-        points = known_points(body, record.keypoint_set)
-        columns = [(record.names.index(n), k) for k, n in enumerate(points.names) if n in record.names]
+    def _fitting(self, record: Keypoints, names: Sequence[str], places: NDArray) -> int:
+        """Who of a record is where the body was last, its points by name and place (K, 3) [m]; -1 for none."""
+        at = {name: k for k, name in enumerate(record.names)}
+        columns = [(at[n], k) for k, n in enumerate(names) if n in at]
         if len(columns) < _FEW:
             return 0 if record.points.shape[1] == 1 else -1
         own, mine = np.array(columns).T
-        expected = self.rig[record.camera].project(body.positions(state, points)[mine])
+        expected = self.rig[record.camera].project(places[mine])
         uv = np.where(record.confidence[0, :, own].T[..., None] > 0.1, record.points[0][:, own], np.nan)  # (P, K, 2)
         cost = np.array([_apart(one, expected) for one in uv])
         best = int(np.argmin(cost)) if len(cost) else -1
@@ -122,7 +124,8 @@ def _apart(uv: NDArray, expected: NDArray) -> float:
     if seen.sum() < _FEW:
         return np.inf
     height = float(np.ptp(expected[seen], axis=0).max())
-    return float(np.median(np.linalg.norm(uv[seen] - expected[seen], axis=1))) / max(height, 1.0)
+    far = np.sort(np.linalg.norm(uv[seen] - expected[seen], axis=1))  # in place of np.median: a tenth of its time
+    return 0.5 * float(far[(len(far) - 1) // 2] + far[len(far) // 2]) / max(height, 1.0)
 
 
 def _height(uv: NDArray) -> float:

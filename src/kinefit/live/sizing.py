@@ -69,7 +69,10 @@ class LiveSize:
                 self._pool.submit(warm_keypoints)
         if len(self._steps) == _STEPS:
             assert self._pool is not None
-            self._future = self._pool.submit(fitted_body, self._steps, **self._task)
+            try:
+                self._future = self._pool.submit(fitted_body, self._steps, **self._task)
+            except BrokenProcessPool:
+                self._give_up()
             self._steps = []
         return None
 
@@ -91,10 +94,15 @@ class LiveSize:
         except KinefitError as error:
             self.told = f"the person's size was not found, it is taken to be as usual ({error.problem})"
         except BrokenProcessPool:
-            self.told = "the person's size was not found, it is taken to be as usual (its process ended)"
+            self._give_up()
         finally:
             self.close()
         return None
+
+    def _give_up(self) -> None:
+        """The session goes on without: a process that was ended, by whomever, holds up no pose."""
+        self.told = "the person's size was not found, it is taken to be as usual (its process ended)"
+        self.close()
 
 
 def _behind() -> None:

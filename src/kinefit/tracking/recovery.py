@@ -127,7 +127,8 @@ class Recovery:
         result: FrameResult, seek: NDArray,
     ) -> FrameResult:  # fmt: skip
         scene = tracker.scene_of(result.state, time)
-        view = next((v for m in measurements if (v := m.hints(scene).view) is not None), None)
+        surfaces = [m for m in measurements if not m.settled]  # points by name show no limb that could be sought
+        view = next((v for m in surfaces if (v := m.hints(scene).view) is not None), None)
         if view is None:
             return result
         search = Search(self.body, view, self.up, np.random.default_rng(0))

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 
 _AT_ONCE = struct.pack(">Q", 1)  # the time tag that says: now
 
 
 def message(address: str, *values: str | int | float) -> bytes:
     """One message with its arguments."""
-    tags, data = ",", b""
-    for value in values:
-        if isinstance(value, str):
-            tags, data = tags + "s", data + _text(value)
-        elif isinstance(value, int):
-            tags, data = tags + "i", data + struct.pack(">i", value)
-        else:
-            tags, data = tags + "f", data + struct.pack(">f", value)
-    return _text(address) + _text(tags) + data
+    kinds = "".join("s" if isinstance(v, str) else "i" if isinstance(v, int) else "f" for v in values)
+    data = b"".join([
+        _text(v) if kind == "s" else struct.pack(">" + kind, v) for kind, v in zip(kinds, values)
+    ])  # fmt: skip
+    return _text(address) + _text("," + kinds) + data
 
 
 def bundle(messages: Sequence[bytes]) -> bytes:
@@ -26,6 +23,7 @@ def bundle(messages: Sequence[bytes]) -> bytes:
     return b"".join([b"#bundle\0", _AT_ONCE, *(struct.pack(">i", len(one)) + one for one in messages)])
 
 
+@lru_cache(maxsize=1000)  # the same addresses and bones in every pose
 def _text(value: str) -> bytes:
     """A string, ended by a zero and filled up to a multiple of four bytes."""
     data = value.encode() + b"\0"
