@@ -13,6 +13,7 @@ PARTS = {
     "setups": "which sensor set-up is how exact, simulated: cameras by number, and sensors",
     "batch": "many takes: two workers against one, what Dask adds to a take, equal after a kill",
     "formats": "every format, read back by a program that others wrote",
+    "coverage": "how much of the source the tests run",
     "fuzz": "every reader on damaged files: a typed error or a valid result, soon and in little memory",
 }
 
