@@ -13,7 +13,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
 LEVELS = [
     {"errors", "_jit"},
-    {"_arguments", "_files", "_mapped"},
+    {"_arguments", "_files", "_mapped", "_threads"},
     {"geometry", "_pictures", "_kernels_rendering", "_kernels_losses"},
     {"bodies", "observations", "motion", "motion_columns"},
     {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},

@@ -140,7 +140,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
 
 
 def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
-    monkeypatch.setattr(detecting, "_cores", lambda: 1)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
 
     def stop(camera, done, total):
         if camera == "cam02" and done == 6:
@@ -158,7 +158,7 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
         futures[0].result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(detecting, "_cores", lambda: 1)
+    monkeypatch.setattr(detecting, "cores", lambda: 1)
     monkeypatch.setattr(detecting, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done and kept"):
         ensure_detections(read_take(take))

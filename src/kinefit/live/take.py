@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from kinefit._threads import cores
 from kinefit.bodies import Body, load_body
 from kinefit.errors import TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -71,7 +71,7 @@ def live_session(
     """
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     streams = [entry for entry in take.cameras if entry.stream is not None]
-    threads = threads or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) or 1
+    threads = threads or cores()
     if streams:
         opened = _streams(take, body, threads, tell)
     elif take.cameras and not (take.keypoints or take.skin or take.lines or take.depth or take.stereo or take.markers

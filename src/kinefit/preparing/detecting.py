@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kinefit._threads import cores
 from kinefit.errors import TakeError
 
 if TYPE_CHECKING:
@@ -118,14 +119,14 @@ def detect(
             with lock:
                 progress(camera, done, total)
 
-    threads = max(_cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
+    threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: Job) -> None:
         key = f"{keys[job]} {_settings(number, outlines, job.seconds)}"
         _look_through(job, folder, number, outlines, key, step, threads)
 
     hush(folder)
-    with _one_thread_each(), ThreadPoolExecutor(min(len(todo), _cores())) as pool:
+    with _one_thread_each(), ThreadPoolExecutor(min(len(todo), cores())) as pool:
         futures = [pool.submit(work, job) for job in todo]
         try:
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
@@ -247,11 +248,6 @@ def _fits(
     if not first <= start <= stop <= last:
         return False
     return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
-
-
-def _cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def hush(networks: Path) -> None:

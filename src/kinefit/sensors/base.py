@@ -284,13 +284,14 @@ def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
     """Residuals (N,) of points on segments (N,), segment by segment."""
     count = np.bincount(segment, minlength=len(body.tree.segments))
+    some, before = count > 0, np.cumsum(count) - count
+    line = residual[np.lexsort((residual, segment))]
     median, rms = np.full(len(count), np.nan), np.full(len(count), np.nan)
-    for s in np.flatnonzero(count):
-        own = residual[segment == s]
-        median[s], rms[s] = np.median(own), np.sqrt(np.mean(own**2))
+    median[some] = 0.5 * (line[(before + (count - 1) // 2)[some]] + line[(before + count // 2)[some]])
+    rms[some] = np.sqrt(np.bincount(segment, residual**2, len(count))[some] / count[some])
     names, nothing = body.tree.segments, np.full((len(count), 1), np.nan)
     every = np.arange(len(count))
-    weights = (count > 0).astype(float)
+    weights = some.astype(float)
     return Leftover(label, names, every, median[:, None], weights, unit, nothing, rms=rms, count=count)
 
 

@@ -104,7 +104,9 @@ class LiftedMeasurement(Measurement):
         bones = _on(body, self.keypoint_set, self.names)
         if not len(bones.length):
             return 1.0
-        return float(np.median(bones.length / np.linalg.norm(self.x[bones.first] - self.x[bones.second], axis=1)))
+        apart = self.x[bones.first] - self.x[bones.second]
+        ratio = np.sort(bones.length / np.sqrt((apart * apart).sum(axis=1)))  # a median, several times as fast
+        return 0.5 * float(ratio[(len(ratio) - 1) // 2] + ratio[len(ratio) // 2])
 
     def match(self, scene: Scene, reach: float) -> LiftedMatched:
         """As they are named."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release, room
+from kinefit._threads import side_by_side
 from kinefit.bodies import Body, PointSet
 from kinefit.losses import Loss
 from kinefit.sensors.base import Matched, rows_at
@@ -172,8 +174,8 @@ def estimate(
         count += 1
         squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
         takes = [take.renewed(keep=True) for take in takes]
-        for i, take in enumerate(takes):
-            fit, post = take.fit(strength, tolerance=1e-3)
+        for i, (fit, post) in enumerate(side_by_side(partial(_roughly, strength), list(takes))):
+            take = takes[i]
             of_r, of_gamma = _changes(take, fit, post)
             squares, informed = squares + (of_r / np.square(take.live)).sum(axis=0), informed + of_gamma.sum(axis=0)
             live = _liveliness(body, take.dt, of_r, of_gamma)
@@ -197,11 +199,15 @@ def estimate(
     return strength, takes, count
 
 
+def _roughly(strength: Strength, take: SmoothTake) -> tuple[Smoothed, Posterior]:
+    return take.fit(strength, tolerance=1e-3)
+
+
 def enliven(take: SmoothTake, strength: Strength, rounds: int = 3) -> SmoothTake:
     """The same take with its liveliness, where the rest is known."""
     for _ in range(rounds):
         take = take.renewed()
-        fit, post = take.fit(strength, tolerance=1e-3)
+        fit, post = _roughly(strength, take)
         live = _liveliness(take.body, take.dt, *_changes(take, fit, post))
         take = replace(take, roots=fit.roots, angles=fit.angles, live=live)
     return take
@@ -214,13 +220,18 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
     deviation is never made smaller.
     """
     squares: dict[str, list[NDArray]] = {}
+    silent: set[str] = set()  # sensors whose rows, of one kind in all frames, have no noise that could be estimated
     for take in takes:
         assert take.others is not None and take.linear is not None
         for f, matched in enumerate(take.linear.matched):
             scene = take.others.scene(f, take.roots, take.angles)
             for m in matched:
-                for rows in rows_at(m, scene):
-                    square, factor = squares_of(rows)
+                if m.sensor in silent:
+                    continue
+                made = [(len(rows), *squares_of(rows)) for rows in rows_at(m, scene)]
+                if any(count for count, _, _ in made) and not any(len(square) for _, square, _ in made):
+                    silent.add(m.sensor)
+                for _, square, factor in made:
                     squares.setdefault(m.sensor, []).append(square[factor > INLIER])
     told = {name: np.concatenate(parts) for name, parts in squares.items()}
     return {

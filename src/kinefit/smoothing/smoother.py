@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release, room
+from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
@@ -22,7 +23,7 @@ from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
-from kinefit.smoothing.linearised import OtherSensors, SceneOf
+from kinefit.smoothing.linearised import Linearised, OtherSensors, SceneOf
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
@@ -266,19 +267,26 @@ def _solve(
             matched = Spool[tuple[Matched, ...]]()
             spans = [whole for whole, _ in windows]
             linear = others.windows(take.body, take.roots, take.angles, spans, matched, judge=last)
-        for whole, kept in windows:
-            part = take.part(whole)
-            fit, post = (part if linear is None else replace(part, linear=next(linear))).fit(strength)
+        fits = side_by_side(lambda part: part.fit(strength), _linear_parts(take, windows, linear))
+        for (whole, kept), (fit, post) in zip(windows, fits, strict=True):
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
             release(take.uv, take.confidence)
-            speeds.append(_speed_std(post, part.dt)[max(inside.start - 1, 0) : inside.stop - 1])
+            speeds.append(_speed_std(post, take.dt)[max(inside.start - 1, 0) : inside.stop - 1])
             for covariance in post.frames[inside]:
                 covariances.append(covariance[packed])
         moving = np.concatenate(speeds)
         speed_std = np.percentile(moving, 90.0, axis=0) if len(moving) else None
         take = replace(take, roots=roots, angles=angles, speed_std=speed_std)
     return take, covariances, matched
+
+
+def _linear_parts(
+    take: SmoothTake, windows: Sequence[tuple[slice, slice]], linear: Iterator[Linearised] | None
+) -> Iterator[SmoothTake]:  # fmt: skip
+    for whole, _ in windows:
+        part = take.part(whole)
+        yield part if linear is None else replace(part, linear=next(linear))
 
 
 def _speed_std(post: Posterior, dt: float) -> NDArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from fractions import Fraction
 from os import PathLike
 from typing import Any
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._threads import ahead
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, write_lines
@@ -66,17 +67,21 @@ def write_overlay(
         The file cannot be written.
     """
     width, height = (side - side % 2 for side in video.size)  # the encoder wants even sides
-    with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
-        span = frames_of(motion, np.arange(len(video)) / video.rate + time_offset)
+    span = frames_of(motion, np.arange(len(video)) / video.rate + time_offset)
+
+    def drawn() -> Iterator[NDArray[np.uint8]]:
         for i, image in zip(span, video.frames(span.start, span.stop)):
             frame = nearest_frame(motion, i / video.rate + time_offset)
-            drawn = draw_overlay(
-                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=f"frame {i}",
-                blur=blur,
-            )  # fmt: skip
-            encode(drawn[:height, :width])
+            label = f"frame {i}"
+            yield draw_overlay(
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, blur=blur
+            )[:height, :width]
+
+    with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
+        for done, image in enumerate(ahead(drawn()), start=1):
+            encode(image)
             if progress:
-                progress(i + 1 - span.start)
+                progress(done)
 
 
 def frames_of(motion: Motion, times: NDArray) -> range:
