@@ -66,7 +66,7 @@ def _trial(trial: Path, folder: Path) -> None:
         walls.append(time.perf_counter() - wall)
         processor.append(time.process_time() - cpu)
     frames = len(found[CAMERAS[0]])
-    cores = min(detecting._cores(), len(CAMERAS))
+    cores = min(detecting.cores(), len(CAMERAS))
     print(f"  {frames} frames of {len(CAMERAS)} cameras in {min(walls):.2f} s on {cores} cores, everything included")
     _figure("detect_speed", frames / min(walls))
     _figure("detect_processor_time", 1000 * min(processor) / (frames * len(CAMERAS)))  # 12 frames/s on two cores
