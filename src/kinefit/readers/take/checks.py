@@ -13,6 +13,7 @@ from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
 from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 from kinefit.readers.units import LENGTHS, worth
 
@@ -339,7 +340,9 @@ def _files(take: Take) -> None:
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:
-        if file is not None and not file.exists() and not ("*" in file.name and listed(file)):
+        if file is None or file.exists() or inside(file) is not None:
+            continue
+        if not ("*" in file.name and listed(file)):
             raise FileError(
                 f"no such file or folder: {file}", file=take.path, place=place,
                 remedy="Correct the path; a relative one starts at the take file.",

@@ -68,6 +68,7 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
 
     name: str
     video: Path | None = None
+    topic: str | None = None  # of a video that is an MCAP recording of ROS 2: "/front/color/image_raw"
     stream: str | None = None  # of `kinefit live`: a webcam's number, an address, or a folder that fills up
     size: tuple[int, int] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
@@ -155,6 +156,7 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     name: str
     camera: str | None = None  # its camera in the calibration; default: of its own name
     file: Path  # or folder, or pattern (frames/depth_*.png)
+    topic: str | None = None  # of a file that is an MCAP recording of ROS 2: "/front/depth/image_raw"
     unit: float | None = None  # [m] of one count; default: what the file states, else millimetres
     size: tuple[int, int] | None = None  # [px] (width, height), of raw files
     range: tuple[float, float] | None = None  # [m] (near, far): what is measured outside of it is dropped
