@@ -71,7 +71,7 @@ def write_take(folder, *, videos=False, name="take.toml"):
 
 def board_videos(folder, frames=14):
     """A ChArUco board that is waved before two cameras, and lies on the floor in frame 12."""
-    board, rig = Board.parse("charuco:5x7:0.04:0.03"), boards.studio(2, distortion=())
+    board, rig = Board.parse("charuco:5x7:0.04:0.03:4X4_50"), boards.studio(2, distortion=())
     folder.mkdir(exist_ok=True)
     Ts = boards.waved(board, frames, tilt=0.4)
     Ts[:, :3, 3] *= 0.4

@@ -6,7 +6,7 @@ from tests.docs.python_pages import AFTER, NETWORK, PREPARED, SLOW
 
 ELSEWHERE = {
     "cga": "its examples are run, and their results compared, by tests/geometry/test_cga_docs.py",
-    **dict.fromkeys([page for page in PAGES if page.startswith("tutorials/")], "tests/test_tutorials.py runs them whole"),
+    **{page: "tests/test_tutorials.py runs them whole" for page in PAGES if page.startswith("tutorials/")},
 }
 """{page: where its blocks are run}."""
 

@@ -82,6 +82,7 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
 
     camera: str
     file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
     format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
@@ -155,7 +156,8 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
 
     name: str
     camera: str | None = None  # its camera in the calibration; default: of its own name
-    file: Path  # or folder, or pattern (frames/depth_*.png)
+    file: Path | None = None  # or folder, or pattern (frames/depth_*.png)
+    stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that depth images come into
     topic: str | None = None  # of a file that is an MCAP recording of ROS 2: "/front/depth/image_raw"
     unit: float | None = None  # [m] of one count; default: what the file states, else millimetres
     size: tuple[int, int] | None = None  # [px] (width, height), of raw files
