@@ -15,7 +15,7 @@ from tests.docs import drawn
 from tests.docs.blocks import blocks
 from tests.docs.world import world
 
-from kinefit.exporters import write_bvh, write_markers, write_motion
+from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave
@@ -36,7 +36,10 @@ NOT_RUN = {
     ("surfaces", "kinefit surface calib.toml left=left.mp4"): "the same",
     ("surfaces", "kinefit surface calib.toml 201"): "the same, with states",
     ("surfaces", "kinefit track"): "tests/tracking/test_surface_takes.py tracks such takes",
-    ("voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
+    ("sensors", "kinefit track"): "a minute; the robot's tutorial does it with ten images",
+    ("simulate", "kinefit track"): "the same",
+    ("which-setup", "kinefit track"): "the same",
+    ("recipes/voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
 }
 """{(page, how a line begins): why it is not run}; of the page `one-camera` nothing is."""
 
@@ -85,7 +88,7 @@ def nothing(folder):
     yield
 
 
-def comparison(folder):
+def comparison(folder, recordings):
     project = folder / "pose2sim_project"
     motion, rig = drawn.write_recording(project / "videos", calibration=False)
     for leftover in (project / "videos").glob("*.npy"):
@@ -97,8 +100,7 @@ def comparison(folder):
     w = world()
     write_markers(w.markers(20), folder / "static.c3d")
     write_markers(w.markers(40), folder / "trial.c3d")
-    write_bvh(w.motion, folder / "walk.bvh", names="mixamo")
-    yield
+    yield from walk(folder, recordings, 10)
 
 
 def first_recording(folder):
@@ -142,10 +144,21 @@ def depth_fusion(folder):
     yield
 
 
-def walk(folder):
-    motion = squat_and_wave()
-    write_bvh(cut(motion, 0, 30), folder / "walk.bvh", names="mixamo")
-    write_motion(cut(motion, 0, 4), folder / "motion.npz")
+def walk(folder, recordings, frames=30):
+    """The first frames of a recorded walk."""
+    lines = (recordings / "cmu_12_01_walk.bvh").read_text().splitlines()
+    begin = next(i for i, line in enumerate(lines) if line.startswith("Frames:"))
+    lines[begin] = f"Frames: {frames}"
+    (folder / "walk.bvh").write_text("\n".join(lines[: begin + 2 + frames]) + "\n")
+    yield
+
+
+def simulate(folder, recordings):
+    return walk(folder, recordings, 4)
+
+
+def which_setup(folder):
+    write_motion(cut(squat_and_wave(), 0, 4), folder / "motion.npz")
     yield
 
 
@@ -169,10 +182,14 @@ PREPARED = {
     "README": readme, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "init": init, "live": take, "one-camera": nothing, "recipes/depth-fusion": depth_fusion,
-    "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": walk, "surfaces": surfaces,
-    "view": motion, "voodoo": nothing, "which-setup": walk,
+    "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
+    "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""
+
+
+RECORDED = dict.fromkeys(("comparison", "sensors", "simulate"), "motion_cmu_bvh")
+"""{page: the folder of real recordings that its function is given}."""
 
 
 def reason(page, line):

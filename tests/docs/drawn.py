@@ -69,30 +69,35 @@ def write_take(folder, *, videos=False, name="take.toml"):
     return folder / name
 
 
-def board_videos(folder, frames=14):
-    """A ChArUco board that is waved before two cameras, and lies on the floor in frame 12."""
-    board, rig = Board.parse("charuco:5x7:0.04:0.03:4X4_50"), boards.studio(2, distortion=())
+def board_videos(folder, frames=18):
+    """A ChArUco board that is waved a metre before two cameras, and lies on the floor in frame 12."""
+    board = Board.parse("charuco:5x7:0.04:0.03:4X4_50")
     folder.mkdir(exist_ok=True)
-    Ts = boards.waved(board, frames, tilt=0.4)
+    Ts = boards.waved(board, frames, tilt=0.7)
     Ts[:, :3, 3] *= 0.4
-    Ts[12] = se3.transform(np.eye(3), np.array([-0.1, -0.1, -0.1]))
-    for i, camera in enumerate(rig):
-        near = replace(camera, matrix=np.array(camera.matrix) * [[1.6, 1, 1], [1, 1.6, 1], [1, 1, 1]])
+    Ts[12] = se3.transform(np.eye(3), np.array([-0.1, -0.1, -0.15]))
+    for i, camera in enumerate(boards.studio(2, distortion=())):
+        T_camera_world = np.array(camera.T_camera_world)
+        T_camera_world[:3, 3] *= 0.42
         for f, T in enumerate(Ts):
-            T_camera_board = near.T_camera_world @ T
-            H = near.matrix @ T_camera_board[:3, [0, 1, 3]]
+            H = camera.matrix @ (T_camera_world @ T)[:3, [0, 1, 3]]
             cv2.imwrite(str(folder / f"cam{i + 1:02d}_{f:03d}.png"), boards.drawn(board, H))
-    return rig
 
 
 def bar_videos(folder, floor=(0, 1)):
     """A bar of 0.9 m with two lights, waved before three cameras; on the floor in two frames."""
     rig = bar_rig(3, (640, 480))
+    apart = np.linalg.norm(rig["cam0"].centre_world - rig["cam2"].centre_world)
+    nearer = 4.21 / apart  # the page's distance between the first and the last
+    rig = Rig(tuple(
+        replace(c, T_camera_world=se3.transform(c.T_camera_world[:3, :3], c.T_camera_world[:3, 3] * nearer))
+        for c in rig
+    ))  # fmt: skip
     folder.mkdir(exist_ok=True)
     for old in folder.iterdir():
         old.unlink()
-    ends = wave_bar(0.9, max(40, *floor), low=(-0.6, -0.6, 0.5), high=(0.6, 0.6, 1.6), seed=8)
-    ends[floor[0]], ends[floor[1]] = [[0.0, 0, 0.2], [0.9, 0, 0.2]], [[0.1, 0.3, 0.2], [0.1, -0.6, 0.2]]
+    ends = wave_bar(0.9, max(40, 1 + max(floor)), low=(-0.3, -0.3, 0.3), high=(0.3, 0.3, 0.9), seed=8)
+    ends[floor[0]], ends[floor[1]] = [[-0.3, 0, 0.2], [0.6, 0, 0.2]], [[0.1, 0.4, 0.2], [0.1, -0.5, 0.2]]
     for f, places in enumerate(ends):
         for c, camera in enumerate(rig):
             image = draw_bar(camera, places, radius=0.03, seed=3 * f + c)

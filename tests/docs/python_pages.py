@@ -116,13 +116,29 @@ def depth_fusion(folder):
     rig = Rig((w.depth_camera, replace(w.colour, name="colour")))
     k = simulate_keypoints(w.motion, Rig((rig["colour"],)), "BODY_25B")[0]
     seen = []
-    for i, t in enumerate(w.motion.times[:4]):
+    for i, t in enumerate(w.motion.times[:2]):
         frame = KeypointFrame("colour", float(t), k.names, k.points[i, 0], k.confidence[i, 0], k.keypoint_set)
         seen.append((float(t), w.depth.frame(i).depth, frame))
     yield {"body": w.body, "rig": rig, "stream": seen}
     yield {}
     steps = [[DepthFrame("kinect", t, depth), keypoints] for t, depth, keypoints in seen]
     yield {"kinefit": kinefit, "steps": steps}
+
+
+def printed_regions(folder):
+    from tests.sensors import region_scenes as scenes
+
+    start, true = scenes.state((0.006, 0.0, 0.0), (0.0, 0.1, 0.0)), scenes.state()
+    image = scenes.image(true)
+    given = {"body": scenes.thing(), "rig": scenes.RIG, "state": start}
+    space = yield {**given, "image": image, "images": [{"cam": image}]}
+    assert np.linalg.norm(space["fit"].state.T_world_root[:3, 3] - true.T_world_root[:3, 3]) < 0.01
+
+
+def printed_metaballs(folder):
+    body = load_body("arm_metaballs")
+    states = [body.rest_state()]
+    yield {"points": [drawn.skin_points(body, states[0], 600)], "states": states}
 
 
 def regions(folder):
@@ -229,9 +245,11 @@ def voodoo(folder):
 PREPARED = {
     "anny": anny, "batch": batch, "calibration": calibration, "check": check, "depth-start": depth_start,
     "files": files, "live": live, "marker-fitting": marker_fitting, "markers": markers, "morphing": morphing,
-    "motion": motion, "own-sensor": own_sensor, "recipes/depth-fusion": depth_fusion, "regions": regions,
+    "motion": motion, "own-sensor": own_sensor, "recipes/depth-fusion": depth_fusion,
+    "recipes/metaballs": printed_metaballs, "recipes/regions": printed_regions, "regions": regions,
     "report": report, "rows": rows, "recipes/sapm": sapm, "recipes/silhouettes": silhouettes, "simulate": simulate,
-    "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces, "view": view, "voodoo": voodoo,
+    "smoothing": smoothing, "solvers": solvers, "stereo": stereo, "surfaces": surfaces, "view": view,
+    "recipes/voodoo": voodoo,
 }  # fmt: skip
 """{page: its function}."""
 

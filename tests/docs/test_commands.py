@@ -8,7 +8,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 from tests.docs.blocks import PAGES, blocks, pages
-from tests.docs.command_pages import ADDED, NOT_RUN, PREPARED, SLOW, reason
+from tests.docs.command_pages import ADDED, NOT_RUN, PREPARED, RECORDED, SLOW, reason
 
 from kinefit.cli import main
 
@@ -48,9 +48,9 @@ def test_every_page_with_commands_is_run_and_every_reason_has_its_line():
 
 
 @pytest.mark.parametrize("page", [pytest.param(p, marks=[pytest.mark.slow] * (p in SLOW)) for p in RUN])
-def test_commands_run_as_they_stand(page, tmp_path, monkeypatch):
+def test_commands_run_as_they_stand(page, tmp_path, monkeypatch, data_dir):
     monkeypatch.chdir(tmp_path)
-    prepared = PREPARED[page](tmp_path)
+    prepared = PREPARED[page](tmp_path, *([data_dir(RECORDED[page])] if page in RECORDED else []))
     for block in blocks(page, "bash"):
         next(prepared, None)
         for line in lines(block.text):

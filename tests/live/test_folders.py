@@ -174,9 +174,10 @@ def test_depth_images_that_a_program_writes_are_followed(collected, tmp_path):
         cv2.imwrite(str(path), np.rint(1000 * video.frame(i).depth).astype(np.uint16))
         recorded.append([(path, tmp_path / "new")])
     write_calibration(Rig((camera,)), tmp_path / "calibration.toml")
+    root = motion.Ts_world_root[0]
     (tmp_path / "take.toml").write_text(
         f'[take]\nrate = 10.0\nup = "{motion.up}"\nsize = false\n[calibration]\nfile = "calibration.toml"\n'
-        f"[start]\nat = {motion.Ts_world_root[0, :3, 3].tolist()}\nforward = {motion.Ts_world_root[0, :3, 0].tolist()}\n"
+        f"[start]\nat = {root[:3, 3].tolist()}\nforward = {root[:3, 0].tolist()}\n"
         f'[[depth]]\nname = "tof"\ncamera = "{camera.name}"\nstream = "new"\nsigma = 0.02\n'
     )
     writer = Writer(recorded, 4.0)
