@@ -155,7 +155,7 @@ def speckles(shape, stretch=0.001):
     speckle = cv2.GaussianBlur(random.normal(size=shape), (0, 0), 2.0)
     before = np.clip(128 + 60 * speckle / speckle.std(), 0, 255).astype(np.float32)
     v, u = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
-    after = cv2.remap(before, u - np.float32(stretch) * (u - shape[1] / 2) + 2, v - 1, cv2.INTER_CUBIC)
+    after = cv2.remap(before, u - np.float32(stretch) * (u - shape[1] / 2) - 2, v + 1, cv2.INTER_CUBIC)
     return before, after
 
 
