@@ -1,4 +1,4 @@
-"""The picture of `docs/voodoo.md`: the method as printed in three movements, with depth, with features, with both.
+"""The picture of `docs/recipes/voodoo.md`: three movements by depth, by features, by both.
 
     python -m benchmarks.depth_voodoo_picture
 

@@ -2,6 +2,8 @@
 
 import ast
 import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -201,3 +203,26 @@ def test_the_readme_has_the_two_commands_that_the_checks_run():
         command = re.match(r"\s*```bash\n([^\n]+)\n```", after)
         assert command, f"README.md: no single shell line after <!-- {name} -->"
         assert command[1].startswith("python3 -m venv")
+
+
+_PACKAGES = {
+    "cv2": "opencv-python-headless", "ai_edge_litert": "ai-edge-litert", "mcap_ros2": "mcap-ros2-support",
+    "rerun": "rerun-sdk", "ndx_pose": "ndx-pose", "pxr": "usd-core",
+}  # fmt: skip
+
+
+def test_only_packages_that_are_declared_are_imported():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    told = list(stated["dependencies"])
+    for extra, packages in stated["optional-dependencies"].items():
+        told += packages if extra not in ("test", "docs") else []
+    declared, own = {re.match(r"[\w-]+", one)[0] for one in told}, {"kinefit", "", *sys.stdlib_module_names}
+    wrong = []
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            modules += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            for top in {module.split(".")[0] for module in modules} - own:
+                if _PACKAGES.get(top, top) not in declared:
+                    wrong.append(f"{path.relative_to(ROOT)}:{node.lineno}: {top}")
+    assert not wrong, "\n".join(wrong)

@@ -1,13 +1,20 @@
 """Jobs on a Dask cluster; skipped where it is not installed."""
 
+import os
+import signal
 import sys
 
 import pytest
 from tests.batch import jobs
+from tests.batch.test_many import CHOICES, contents, drawn_sessions, sessions
 
+from kinefit import track_takes
 from kinefit.batch.cluster import run_there
+from kinefit.batch.find import RECORD
 from kinefit.batch.processes import Failure
 from kinefit.errors import ExportError
+
+__all__ = ["drawn_sessions", "sessions"]
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch):
@@ -54,3 +61,50 @@ def test_no_scheduler_is_told(monkeypatch):
         results(jobs.square, [1], "tcp://127.0.0.1:9")
     with pytest.raises(ExportError, match="no scheduler answers"):
         results(jobs.square, [1], "nonsense://x")
+
+
+@pytest.fixture
+def processes():
+    """A cluster of two worker processes, each with a nanny that starts it anew."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
+    ) as made:
+        yield made
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+@pytest.mark.filterwarnings("default::ResourceWarning")
+def test_a_worker_that_dies_is_tried_again_then_told(processes, tmp_path):
+    address = processes.scheduler_address
+    assert results(jobs.dies_once, [str(tmp_path / "mark")], address, retries=1) == {0: "alive"}
+    found = results(jobs.killed, [0, 1, 2, 3], address, retries=1)
+    assert [found[k] for k in (0, 2, 3)] == [0, 2, 3]
+    assert isinstance(found[1], Failure) and found[1] == "the worker died, again and again"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+@pytest.mark.filterwarnings("default::ResourceWarning")
+def test_a_study_goes_on_where_a_worker_was_killed(processes, sessions, tmp_path):
+    from distributed import Client
+
+    pattern, out, address = f"{sessions}/**/take.toml", tmp_path / "out", processes.scheduler_address
+    with Client(address, set_as_default=False) as client:
+        pids = list(client.run(os.getpid).values())
+
+    def kill(done, count, rows):
+        if done == 1:  # both workers, one of them at work on another take
+            for pid in pids:
+                os.kill(pid, signal.SIGKILL)
+
+    rows = track_takes(pattern, out, choices=CHOICES, cluster=address, progress=kill)
+    assert [row.status for row in rows] == ["done"] * 3
+    alone = track_takes(pattern, tmp_path / "alone", choices=CHOICES)
+    assert alone == rows and contents(out) == contents(tmp_path / "alone")
+    written = {path: path.stat().st_mtime_ns for path in out.rglob("*.npz")}
+    (out / "s02" / "pre" / "take-kinefit" / RECORD).unlink()  # as if it had been stopped before its end
+    assert track_takes(pattern, out, choices=CHOICES, cluster=address) == rows
+    again = {path for path, at in written.items() if path.stat().st_mtime_ns != at}
+    assert again and all("s02" in path.parts for path in again)

@@ -1,4 +1,4 @@
-"""Cameras that go away and come back, folders that fill up, videos at their own speed."""
+"""Cameras that go away and come back, videos at their own speed."""
 
 import time
 
@@ -8,7 +8,7 @@ import pytest
 
 from kinefit.errors import FileError
 from kinefit.live import cameras
-from kinefit.live.cameras import CameraStream, Clock, FolderStream, VideoReplay
+from kinefit.live.cameras import CameraStream, Clock, VideoReplay
 from kinefit.live.inbox import Inbox
 
 
@@ -65,26 +65,6 @@ def test_a_webcam_that_goes_away_is_opened_again(monkeypatch):
 def test_a_stream_that_is_not_there_is_told(tmp_path):
     with pytest.raises(FileError, match="cannot be opened"):
         CameraStream("cam", str(tmp_path / "nothing.sdp"), (64, 48), Clock())
-
-
-def test_new_images_of_a_folder_are_taken_once_and_in_order(tmp_path):
-    cv2.imwrite(str(tmp_path / "old_1.png"), image(1))
-    inbox = Inbox(["cam"], patience=0.0)
-    stream = FolderStream("cam", tmp_path, (64, 48), Clock())
-    stream.start(inbox)
-    seen = []
-    for k in (9, 10, 11):
-        cv2.imwrite(str(tmp_path / f"new_{k}.png"), image(k))
-        seen += taken(inbox, 1)
-    stream.stop()
-    assert [int(one.seen[0, 0, 0]) for one in seen] == [9, 10, 11]
-    assert all(np.diff([one.time for one in seen]) > 0)
-    assert inbox.came == {"cam": 3}
-
-
-def test_a_folder_that_is_not_there_is_told(tmp_path):
-    with pytest.raises(FileError, match="no such folder"):
-        FolderStream("cam", tmp_path / "nowhere", (64, 48), Clock())
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.live.cameras import Clock, FolderStream
+from kinefit.live.cameras import CameraSource, Clock
 from kinefit.live.people import LivePerson
 from kinefit.live.session import LiveSession
 
@@ -90,8 +90,8 @@ def test_a_client_can_end_the_session(scene, collected):
     assert session.processed < len(scene.recording) and collected.closed
 
 
-def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected, tmp_path):
-    stream = FolderStream("cam", tmp_path, (64, 48), Clock())
+def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):
+    stream = CameraSource("cam", (64, 48), Clock())
     session = LiveSession(scene.tracker(), [stream], [collected])
     stream._run = lambda inbox: stream._bring(inbox, np.zeros((10, 10, 3), np.uint8), 0.0)
     with pytest.raises(ObservationError, match="images of 10x10 px"):

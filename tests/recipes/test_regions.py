@@ -92,3 +92,12 @@ def test_what_cannot_be_is_refused():
         pose_from_regions(BODY, state(BODY, 0), RIG, images(0), densities="gauss")
     with pytest.raises(ObservationError, match="uint8"):
         pose_from_regions(BODY, state(BODY, 0), RIG, {"front": images(0)["front"][::2]})
+
+
+def test_smoothing_is_scipys_with_zeros_beyond_the_edges():
+    from scipy.ndimage import gaussian_filter
+
+    grid = np.random.default_rng(0).random((5, 12, 9))
+    for sigma in (0.7, 1.0, 2.0):
+        expected = gaussian_filter(grid, sigma, mode="constant")
+        np.testing.assert_allclose(densities._smoothed(grid, sigma), expected, atol=1e-12)

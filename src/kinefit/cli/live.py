@@ -59,9 +59,9 @@ def live(
 ) -> None:
     """Follow a person live, and stream the poses.
 
-    TAKE is a take file. Where its cameras have a `stream` (a webcam's number, an address such as rtsp://..., a folder
-    that fills up), they are followed as they see; else what the take recorded is replayed at its own speed. Frames that
-    come faster than they can be followed are dropped and counted, never queued.
+    TAKE is a take file. Where its sensors have a `stream` (a webcam's number, an address such as rtsp://..., a folder
+    that fills up with images, depth images or keypoints), they are followed as they see; else what the take recorded is
+    replayed at its own speed. Frames that come faster than they can be followed are dropped and counted, never queued.
 
     The page at http://localhost:8765 shows the person, and programs get the poses there by WebSocket; docs/live.md has
     the protocol. The session is left in the folder: as a motion for `kinefit export` and `kinefit view`, and, where the

@@ -1,8 +1,7 @@
-"""Cameras as sources: webcams and network streams, folders that fill up, and videos at their own speed."""
+"""Cameras as sources: webcams and network streams, and videos at their own speed."""
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from pathlib import Path
@@ -14,12 +13,9 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.live.inbox import Arrived, Inbox
-from kinefit.readers.image_folders import images_in
 from kinefit.readers.video import Video
 
 _AGAIN = 1.0  # [s] between attempts to open a camera that went away
-_LOOK = 0.005  # [s] between looks at a folder
-_SETTLED = 0.05  # [s] for which an image's file must not have changed before it is taken for whole
 
 
 class Clock:
@@ -37,19 +33,19 @@ class Clock:
             return time.monotonic() - self._start
 
 
-class _Camera:
-    """A source of one camera's images, in a thread of its own."""
+class ThreadSource:
+    """A source of one sensor, in a thread of its own."""
 
-    def __init__(self, name: str, size: tuple[int, int], clock: Clock) -> None:
-        self.name, self.size, self.clock = name, size, clock
+    def __init__(self, name: str, clock: Clock) -> None:
+        self.name, self.clock = name, clock
         self.sensors: tuple[str, ...] = (name,)
         self.patient = False
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self, inbox: Inbox) -> None:
-        """Bring images from now on."""
-        self._thread = threading.Thread(target=self._guarded, args=(inbox,), daemon=True, name=f"camera {self.name}")
+        """Bring what is seen from now on."""
+        self._thread = threading.Thread(target=self._guarded, args=(inbox,), daemon=True, name=self.name)
         self._thread.start()
 
     def stop(self) -> None:
@@ -70,6 +66,14 @@ class _Camera:
     def _run(self, inbox: Inbox) -> None:
         raise NotImplementedError
 
+
+class CameraSource(ThreadSource):
+    """A source of one camera's images of a size (width, height) [px]."""
+
+    def __init__(self, name: str, size: tuple[int, int], clock: Clock) -> None:
+        super().__init__(name, clock)
+        self.size = size
+
     def _bring(self, inbox: Inbox, image: NDArray[np.uint8], when: float, *, wait: bool = False) -> bool:
         if image.shape[1::-1] != self.size:
             raise ObservationError(
@@ -79,7 +83,7 @@ class _Camera:
         return inbox.put(Arrived(self.name, when, time.monotonic(), image), wait=wait)
 
 
-class CameraStream(_Camera):
+class CameraStream(CameraSource):
     """A webcam by its number, or a network stream by its address; one that goes away is opened again when it is back.
 
     Parameters
@@ -129,41 +133,7 @@ class CameraStream(_Camera):
             self._capture.release()
 
 
-class FolderStream(_Camera):
-    """A folder into which another program puts images: each new one is taken once, in the order of their numbers.
-
-    What lies there to begin with is not looked at.
-    """
-
-    def __init__(self, name: str, folder: Path, size: tuple[int, int], clock: Clock) -> None:
-        super().__init__(name, size, clock)
-        self.folder = folder
-        if not folder.is_dir():
-            raise FileError("no such folder", file=folder, place=f"camera {name}", remedy="Make it, or correct stream.")
-        self._known = {entry.name for entry in os.scandir(folder)}
-
-    def _run(self, inbox: Inbox) -> None:
-        while not self._stop.wait(_LOOK):
-            for path in self._new():
-                image = cv2.imread(str(path))
-                if image is not None and not self._bring(
-                    inbox, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), self.clock.now()
-                ):
-                    return
-
-    def _new(self) -> list[Path]:
-        now, fresh = time.time(), []
-        for entry in os.scandir(self.folder):
-            if entry.name in self._known or not entry.name.lower().endswith((".png", ".jpg", ".jpeg")):
-                continue
-            if now - entry.stat().st_mtime >= _SETTLED:
-                fresh.append(entry.name)
-        self._known.update(fresh)
-        order = {path.name: k for k, path in enumerate(images_in(self.folder))} if len(fresh) > 1 else {}
-        return [self.folder / name for name in sorted(fresh, key=lambda one: order.get(one, 0))]
-
-
-class VideoReplay(_Camera):
+class VideoReplay(CameraSource):
     """A recorded video at its own speed, or as fast as its images are taken.
 
     Parameters

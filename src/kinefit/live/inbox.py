@@ -71,6 +71,12 @@ class Inbox:
             self._changed.notify_all()
             return True
 
+    def lose(self, sensor: str) -> None:
+        """Count a frame that came and was not brought."""
+        with self._changed:
+            self.came[sensor] += 1
+            self.dropped[sensor] += 1
+
     def end(self, sensor: str, error: KinefitError | None = None) -> None:
         """Nothing more will come of a sensor; an error ends the session."""
         with self._changed:

@@ -74,7 +74,8 @@ def read_openpose(
     Parameters
     ----------
     folder : path
-        Files are taken in the order of the frame number that ends their name; the first one is frame 0.
+        Files are taken in the order of the frame number that ends their name; the first one is frame 0. Or one file, of
+        one frame, in which there may be nobody.
     camera : str
     rate : float [Hz]
     keypoint_set : str
@@ -101,7 +102,7 @@ def read_openpose(
     names = keypoint_names(keypoint_set)
     paths, start = _cut(_numbered_files(folder), frames, folder)
     people = [_read_people(path, len(names), keypoint_set) for path in paths]
-    if not any(map(len, people)):
+    if folder.is_dir() and not any(map(len, people)):
         raise ObservationError(
             f"nobody is seen in any of the {len(paths)} frames of camera {camera}", file=folder,
             remedy="Check that the detector ran on this camera's video; or leave this camera out.",
@@ -260,6 +261,8 @@ def _caliscope_camera(
 
 def _numbered_files(folder: Path) -> list[Path]:
     """Json files of a folder by frame number, without gaps."""
+    if folder.suffix.lower() == ".json" and folder.is_file():
+        return [folder]
     if not folder.is_dir():
         remedy = 'Name the folder, not one of its files; .npy files are of format = "mediapipe", .csv of "caliscope".'
         raise FileError("no such folder of json files", file=folder, remedy=remedy)

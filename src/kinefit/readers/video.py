@@ -1,4 +1,4 @@
-"""Videos, frame-exact: files or folders of images, one (`Video`) or several cameras in step (`VideoSet`)."""
+"""Videos, frame-exact: files, folders of images, topics of ROS 2; one (`Video`) or several in step (`VideoSet`)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.readers.image_folders import ImageFolder
+from kinefit.readers.ros.recordings import inside
+from kinefit.readers.ros.video import McapVideo
 from kinefit.readers.video_files import VideoFile
 
 
@@ -24,7 +26,8 @@ class Video:
     Parameters
     ----------
     path : path
-        Whatever FFmpeg decodes; or a folder of PNG or JPEG images, or a pattern of them ("cam01/img_*.png").
+        Whatever FFmpeg decodes; a folder of PNG or JPEG images, or a pattern of them ("cam01/img_*.png"); or a topic of
+        an MCAP recording of ROS 2 ("session.mcap/front/color/image_raw"; extra `ros`).
     rate : float [Hz], optional
         Of images, which state none: it is needed there. A file states its own, which counts.
 
@@ -38,11 +41,15 @@ class Video:
 
     def __init__(self, path: str | PathLike[str], *, rate: float | None = None) -> None:
         self.path = Path(path)
-        pattern = "*" in self.path.name
-        if not (pattern or self.path.exists()):
+        recording, pattern = inside(self.path), "*" in self.path.name
+        if not (recording or pattern or self.path.exists()):
             raise FileError("no such video", file=self.path, remedy="Check the path.")
-        images = pattern or self.path.is_dir()
-        self._source: VideoFile | ImageFolder = ImageFolder(self.path, rate) if images else VideoFile(self.path)
+        self._source: VideoFile | ImageFolder | McapVideo
+        if recording is not None:
+            self._source = McapVideo(*recording)
+        else:
+            images = pattern or self.path.is_dir()
+            self._source = ImageFolder(self.path, rate) if images else VideoFile(self.path)
         self.size: tuple[int, int] = self._source.size
         self.rate: float = self._source.rate
 

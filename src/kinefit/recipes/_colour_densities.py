@@ -5,8 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
-from scipy.special import logsumexp
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -30,8 +28,19 @@ def colour_cells(image: ArrayLike, camera: Camera) -> NDArray:
 
 def parzen_density(count: NDArray) -> NDArray:
     """Logarithm (cells,) of the Parzen estimate of a density, of pixels counted in cells of CIELab (cells,)."""
-    density = gaussian_filter(count.reshape(_GRID), _WINDOW / _CELL, mode="constant").ravel()
+    density = _smoothed(count.reshape(_GRID), _WINDOW / _CELL).ravel()
     return np.asarray(np.log(density / max(count.sum(), 1.0) / _CELL**3 + _FLOOR))
+
+
+def _smoothed(grid: NDArray, sigma: float) -> NDArray:
+    """A grid, zero beyond its edges, convolved with a Gaussian of a standard deviation in cells."""
+    reach = round(4.0 * sigma)
+    kernel = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma))
+    for axis in range(grid.ndim):
+        wide = np.moveaxis(np.pad(grid, [(reach, reach) if k == axis else (0, 0) for k in range(grid.ndim)]), axis, 0)
+        parts = (share * wide[k : k + grid.shape[axis]] for k, share in enumerate(kernel / kernel.sum()))
+        grid = np.moveaxis(np.sum(list(parts), axis=0), 0, axis)
+    return grid
 
 
 def mixture_density(count: NDArray) -> NDArray:
@@ -47,8 +56,8 @@ def mixture_density(count: NDArray) -> NDArray:
         off = x[:, None] - mean
         C = np.einsum("nk,nki,nkj->kij", n * share, off, off) / weight[:, None, None] + _CELL**2 / 12 * np.eye(3)
         log = _gaussians(x, weight, mean, C)
-        share = np.exp(log - logsumexp(log, axis=1, keepdims=True))
-    return np.logaddexp(logsumexp(_gaussians(every, weight, mean, C), axis=1), np.log(_FLOOR))
+        share = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
+    return np.logaddexp(np.logaddexp.reduce(_gaussians(every, weight, mean, C), axis=1), np.log(_FLOOR))
 
 
 def _gaussians(x: NDArray, weight: NDArray, mean: NDArray, C: NDArray) -> NDArray:

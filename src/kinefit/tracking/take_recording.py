@@ -78,7 +78,7 @@ def recording_of(
     stereo = load_stereo(take, seen)
     depth: tuple[DepthVideo, ...] = (*seen.depth, *stereo)
     rig = Rig((*(seen.rig or ()), *(v.camera for v in stereo if v.camera is not None)))
-    start = _motion_start(take, body) if take.start is not None else _posed_start(take, body, seen.frames)
+    start = _motion_start(take, body) if take.start is not None else posed_start(take, body, seen.frames)
     marked, body = _markers(take, seen, body)
     first, rate = seen.frames[0], seen.rate
     times = np.arange(*seen.frames) / rate
@@ -153,8 +153,14 @@ def marker_sensor(take: Take, k: int) -> str:
     return "markers" if len(take.markers) == 1 else f"markers {k + 1}"
 
 
-def _posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, BodyState] | None:
-    """Step and state of `[start]`; None where there is none."""
+def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, BodyState] | None:
+    """Step and state of `[start]`; None where there is none.
+
+    Raises
+    ------
+    TakeError
+        A step that is not there, or angles that the body does not have.
+    """
     pose, tree = take.pose, body.tree
     if pose is None:
         return None

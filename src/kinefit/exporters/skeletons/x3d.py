@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from xml.sax.saxutils import quoteattr
@@ -47,7 +48,8 @@ def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = 
     if len(motion) < 2:
         raise ExportError("X3D moves a figure between two frames or more", file=path, remedy="Give a longer motion.")
     names = names or ("hanim" if body.aliases.get("hanim") else "kinefit")
-    joints = bone_names(body, names, path)
+    joints, segments = bone_names(body, names, path), plain_names(body.tree.segments)
+    ids = _ids(joints, segments)
     plain = rest_pose(body, rest, names, path)
     pose = standing(body) if np.array_equal(plain.turns, np.broadcast_to(np.eye(3), plain.turns.shape)) else plain
     turns, places = pose.local_moves(motion, "y")
@@ -62,33 +64,48 @@ def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = 
         yield '<meta name="generator" content="kinefit"/></head>\n<Scene>'
         yield f'<TimeSensor DEF="clock" cycleInterval="{seconds:.9g}" loop="true"/>'
         yield '<HAnimHumanoid DEF="humanoid" name="humanoid" version="2.0">'
-        yield from _joints(body, pose, joints)
-        yield from (f'<HAnimJoint USE="joint_{s}" containerField="joints"/>' for s in range(len(joints)))
-        yield from (f'<HAnimSegment USE="segment_{s}" containerField="segments"/>' for s in range(len(joints)))
+        yield from _joints(body, pose, joints, segments, ids)
+        yield from (f'<HAnimJoint USE="{joint}" containerField="joints"/>' for joint, _ in ids)
+        yield from (f'<HAnimSegment USE="{segment}" containerField="segments"/>' for _, segment in ids)
         yield "</HAnimHumanoid>"
         for s in range(len(joints)):
-            yield from _moved("Orientation", "rotation", s, keys, _axis_angles(turns[:, s]))
+            yield from _moved("Orientation", "rotation", ids[s][0], keys, _axis_angles(turns[:, s]))
             if moves[s]:
-                yield from _moved("Position", "translation", s, keys, places[:, s] - pose.offsets[s])
+                yield from _moved("Position", "translation", ids[s][0], keys, places[:, s] - pose.offsets[s])
         yield "</Scene>\n</X3D>"
 
     write_lines(path, lines())
 
 
-def _joints(body: Body, pose: Rest, names: Sequence[str]) -> Iterator[str]:
+def _ids(joints: Sequence[str], segments: Sequence[str]) -> list[tuple[str, str]]:
+    """What each joint and its segment are called in the file: after the humanoid and their names, as H-Anim asks."""
+
+    def after(name: str, kind: str, s: int) -> str:
+        return f"humanoid_{name}" if re.fullmatch(r"[\w.-]+", name) else f"humanoid_{kind}_{s}"
+
+    limbs = [after(name, "segment", s) for s, name in enumerate(segments)]
+    out: list[tuple[str, str]] = []
+    for s, name in enumerate(joints):
+        own, others = after(name, "joint", s), {*limbs, *(joint for joint, _ in out)}
+        out.append((f"{own}_joint" if own in others else own, limbs[s]))
+    return out
+
+
+def _joints(
+    body: Body, pose: Rest, names: Sequence[str], plain: Sequence[str], ids: Sequence[tuple[str, str]]
+) -> Iterator[str]:
     """The tree of joints, each with its segment: lines to the joints below, or to its end."""
     tree, ends = body.tree, body.segment_ends()
-    plain = plain_names(tree.segments)
 
     def joint(s: int) -> Iterator[str]:
         field = ' containerField="skeleton"' if tree.parents[s] < 0 else ""
         centre = _numbers(pose.positions[s])
-        yield f'<HAnimJoint{field} DEF="joint_{s}" name={quoteattr(names[s])} center="{centre}">'
+        yield f'<HAnimJoint{field} DEF="{ids[s][0]}" name={quoteattr(names[s])} center="{centre}">'
         children = [int(child) for child in np.flatnonzero(tree.parents == s)]
         to = [pose.positions[child] for child in children]
         if not to and s in ends:
             to = [pose.positions[s] + pose.turns[s] @ ends[s]]
-        yield f'<HAnimSegment DEF="segment_{s}" name={quoteattr(plain[s])}>'
+        yield f'<HAnimSegment DEF="{ids[s][1]}" name={quoteattr(plain[s])}>'
         if to:
             points = _numbers(np.array([[pose.positions[s], end] for end in to]))
             yield '<Shape><Appearance><Material emissiveColor="0.1 0.4 0.7"/></Appearance>'
@@ -102,12 +119,12 @@ def _joints(body: Body, pose: Rest, names: Sequence[str]) -> Iterator[str]:
         yield from joint(int(root))
 
 
-def _moved(kind: str, field: str, s: int, keys: str, values: NDArray) -> Iterator[str]:
+def _moved(kind: str, field: str, joint: str, keys: str, values: NDArray) -> Iterator[str]:
     """An interpolator, and its routes from the clock and to the joint."""
-    name = f"{field}_{s}"
+    name = f"{field}_{joint}"
     yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{_numbers(values)}"/>'
     yield f'<ROUTE fromNode="clock" fromField="fraction_changed" toNode="{name}" toField="set_fraction"/>'
-    yield f'<ROUTE fromNode="{name}" fromField="value_changed" toNode="joint_{s}" toField="set_{field}"/>'
+    yield f'<ROUTE fromNode="{name}" fromField="value_changed" toNode="{joint}" toField="set_{field}"/>'
 
 
 def _axis_angles(quaternions: NDArray) -> NDArray:

@@ -25,11 +25,13 @@ from kinefit.readers.calibration.tables import (
     stated_unit,
     stereo_tables,
 )
+from kinefit.readers.ros.recordings import inside
+from kinefit.readers.ros.rig import mcap_rig
 from kinefit.readers.units import LENGTHS, worth
 
 FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML, COLMAP text "
-    "(cameras.txt and images.txt)"
+    "(cameras.txt and images.txt), MCAP of ROS 2"
 )
 _FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
 
@@ -49,7 +51,8 @@ def read_calibration(
     path : file or folder
         OpenCV YAML/XML/JSON (one file with all cameras; a folder with one file or one folder a camera; a folder with
         intrinsics.yml and extrinsics.yml), Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML,
-        COLMAP text (the folder). Poses are world to camera. A single camera without a pose becomes the world.
+        COLMAP text (the folder), MCAP of ROS 2 (CameraInfo and
+        /tf_static; extra `ros`). Poses are world to camera. A single camera without a pose becomes the world.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
         Unit of length of the file. "auto": what the file states (`unit = "mm"`, alone or under [metadata]), or what
         its format defines (Qualisys: mm), else metres unless that cannot be.
@@ -73,6 +76,8 @@ def read_calibration(
     path = Path(path)
     if not path.exists():
         raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
+    if (recording := inside(path)) is not None:
+        return mcap_rig(recording[0])
     if path.is_dir():
         return _read_folder(path, unit, image_size, exteriors)
     if path.name in ("cameras.txt", "images.txt"):

@@ -28,6 +28,7 @@ from kinefit.readers.calibration.read import (
 )
 from kinefit.readers.calibration.spans import value_span
 from kinefit.readers.calibration.tables import find, read_table
+from kinefit.readers.ros.recordings import inside
 
 _REMEDY = "Write it as Pose2Sim TOML instead: kinefit.readers.calibration.read.write_calibration."
 
@@ -73,6 +74,9 @@ def write_calibration_like(
     """
     like, path = Path(like), Path(path)
     like = like.parent if like.name in ("cameras.txt", "images.txt") else like
+    if inside(like) is not None:
+        remedy = "Write what `read_calibration` gives of it by `write_calibration`, and name that TOML in the take."
+        raise CalibrationError("a recording of ROS 2 is no calibration to be written again", file=like, remedy=remedy)
     old = read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
     for name in rig.names:
         if name not in old:

@@ -76,14 +76,13 @@ def listed(path: Path) -> list[Path]:
 
 def picture_source(files: list[Path]) -> DepthSource:
     """Depth in 16-bit pictures (counts) or 32-bit float TIFF (metres), one file a frame."""
-    first = _picture(files[0])
+    first = depth_picture(files[0])
     unit = 0.001 if first.dtype == np.uint16 else 1.0
     if len(files) == 1 and cv2.imcount(str(files[0])) > 1:  # one TIFF of many pages
         pages = cv2.imcount(str(files[0]))
-        return DepthSource(pages, lambda i: _counts(_page(files[0], i)), first.shape[::-1], unit)
-    return DepthSource(
-        len(files), lambda i: _counts(_picture(files[i])), first.shape[::-1], unit, names=tuple(f.name for f in files)
-    )
+        return DepthSource(pages, lambda i: counts_of(_page(files[0], i)), first.shape[::-1], unit)
+    names = tuple(f.name for f in files)
+    return DepthSource(len(files), lambda i: counts_of(depth_picture(files[i])), first.shape[::-1], unit, names=names)
 
 
 def _page(file: Path, i: int) -> NDArray:
@@ -93,7 +92,16 @@ def _page(file: Path, i: int) -> NDArray:
     return pages[0]
 
 
-def _picture(file: Path) -> NDArray:
+def depth_picture(file: Path) -> NDArray:
+    """(H, W) as a file holds it: counts of 16 bits, or metres in float.
+
+    Raises
+    ------
+    FileError
+        No image, or damaged.
+    ObservationError
+        An image that is no depth: of 8 bits, or of several channels.
+    """
     picture = read_picture(file, cv2.IMREAD_UNCHANGED)
     if picture.ndim != 2 or picture.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if picture.ndim == 2 else picture.shape[2]
@@ -105,7 +113,8 @@ def _picture(file: Path) -> NDArray:
     return picture
 
 
-def _counts(picture: NDArray) -> NDArray:
+def counts_of(picture: NDArray) -> NDArray:
+    """(H, W) float32 of a picture, 0 where 16 bits say that nothing was measured."""
     depth = picture.astype(np.float32)
     if picture.dtype == np.uint16:
         depth[picture == _SATURATED] = 0.0
@@ -141,7 +150,7 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
         data = np.fromfile(file, "<u2", width * height, offset=place * frame)
         if len(data) < width * height:
             raise FileError("is shorter than before", file=file, place=f"frame {i}", remedy="Copy it again.")
-        return _counts(data.reshape(height, width))
+        return counts_of(data.reshape(height, width))
 
     count = len(files) if len(files) > 1 else per_file
     return DepthSource(count, image, size, 0.001, names=tuple(f.name for f in files) if len(files) > 1 else ())
@@ -173,6 +182,6 @@ def array_source(path: Path) -> DepthSource:
             number[key] = float(value.ravel()[0])
     unit = number.get("unit", 1.0 if depth.dtype.kind == "f" else 0.001)
     return DepthSource(
-        len(depth), lambda i: _counts(depth[i]), depth.shape[:0:-1], unit, "unit" in number, times,
+        len(depth), lambda i: counts_of(depth[i]), depth.shape[:0:-1], unit, "unit" in number, times,
         rate=number.get("rate"),
     )  # fmt: skip

@@ -16,8 +16,9 @@ from kinefit.errors import FileError, ObservationError
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
 from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
-from kinefit.readers.depth.ros import mcap_source
 from kinefit.readers.depth.streams import bag_source, track_source
+from kinefit.readers.ros.depth import mcap_source
+from kinefit.readers.ros.recordings import inside
 
 FORMATS = (
     "a folder of 16-bit PNG or TIFF, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
@@ -48,8 +49,9 @@ def read_depth(
     ----------
     path : file, folder or pattern (frames/depth_*.png)
         16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), and `times`
-        [s], `unit` [m], `rate` [Hz] as it has), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS
-        2. Files are taken in the order of the numbers in their names.
+        [s], `unit` [m], `rate` [Hz] as it has), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS 2, with
+        the topic as a part of the path where several have depth (session.mcap/front/depth/image_raw). Files are taken
+        in the order of the numbers in their names.
     sensor : str, optional
         Name of the sensor's camera; default: the name of the file or folder.
     unit : float [m], optional
@@ -145,6 +147,8 @@ def is_unordered(path: Path) -> bool:
 
 
 def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
+    if (found := inside(path)) is not None:
+        return mcap_source(found[0], name, found[1])
     files = listed(path)
     if not files:
         if path.is_dir():
@@ -158,8 +162,6 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
             return track_source(files[0], name)
         if ending == ".bag":
             return bag_source(files[0], name)
-        if ending == ".mcap":
-            return mcap_source(files[0], name)
     if pictures := _of_ending(files, PICTURES):
         return picture_source(pictures)
     if pieces := _of_ending(files, clouds.ENDINGS):

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.errors import FileError, ObservationError, TakeError, choices, command
+from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
 from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
+from kinefit.readers.take.streams import odd_streams, refuse_streams
 from kinefit.readers.units import LENGTHS, worth
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
     "keypoints": {
         "file": ("openpose", "mediapipe", "caliscope", "detect"), "frame": ("openpose", "mediapipe", "caliscope"),
-        "rate": ("openpose", "mediapipe", "caliscope"), "face": ("skin",),
+        "rate": ("openpose", "mediapipe", "caliscope"), "face": ("skin",), "stream": ("openpose",),
     },
     "silhouette": {
         "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
@@ -46,9 +48,7 @@ def check_enough(take: Take) -> None:
     """
     others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
               take.surface_points)  # fmt: skip
-    if any(entry.stream is not None for entry in take.cameras) and not (take.keypoints or any(others)):
-        remedy = f"Follow them by {command('live', take.path)}, which leaves a take of what they saw."
-        raise TakeError("its cameras are streams, nothing is recorded", file=take.path, remedy=remedy)
+    refuse_streams(take)
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     lifted = not take.keypoints or any(entry.format == "detect" for entry in take.keypoints)
     if len(seeing) == 1 and not (lifted or any(others) or take.start or take.pose):
@@ -110,15 +110,13 @@ def _values(take: Take) -> None:
     for camera in take.cameras:
         if not abs(camera.time_offset) < 1e6 or (camera.size and not _is_size(camera.size)):
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
-        if camera.stream is not None and camera.video is not None:
-            refuse("a stream and a video", f"camera {camera.name}", "Leave one of both out.")
     for source in (*take.keypoints, *take.skin):
         place = f"keypoints of camera {source.camera}"
         sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS}.get(source.format, ("MEDIAPIPE_33",))
         if source.set is not None and source.set not in sets:
             kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
             refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
-        if source.file is None and source.format not in ("detect", "skin"):
+        if source.file is None and source.stream is None and source.format not in ("detect", "skin"):
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
@@ -163,7 +161,7 @@ def _values(take: Take) -> None:
         place = f"surface points {surface.file.name}"
         if not 0 < surface.sigma < 1 or not abs(surface.time_offset) < 1e6:
             refuse(f"sigma {surface.sigma} m, time offset {surface.time_offset} s", place, "Give metres and seconds.")
-    for problem, place, remedy in _odd_depth(take):
+    for problem, place, remedy in (*odd_streams(take), *_odd_depth(take)):
         refuse(problem, place, remedy)
 
 
@@ -339,7 +337,9 @@ def _files(take: Take) -> None:
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]
     named += [(f"depth {entry.name}, background", entry.background) for entry in take.depth]
     for place, file in named:
-        if file is not None and not file.exists() and not ("*" in file.name and listed(file)):
+        if file is None or file.exists() or inside(file) is not None:
+            continue
+        if not ("*" in file.name and listed(file)):
             raise FileError(
                 f"no such file or folder: {file}", file=take.path, place=place,
                 remedy="Correct the path; a relative one starts at the take file.",

@@ -64,6 +64,7 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
     depth, clouds, cameras = [], [], []
     for entry in take.depth:
         usual = take.rate or next(iter(rates.values()), None)
+        assert entry.file is not None
         try:
             if is_unordered(entry.file):
                 clouds.append(_clouds(entry, rig, usual))
@@ -80,6 +81,7 @@ def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVide
     odd = [key for key in ("size", "intrinsics", "background") if getattr(entry, key) is not None]
     if odd:
         raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Leave it out.")
+    assert entry.file is not None
     camera = entry.camera or entry.name
     clouds = read_clouds(
         entry.file, sensor=entry.name, unit=entry.unit or 1.0, rate=entry.rate, usual_rate=rate,
@@ -93,6 +95,7 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
     if entry.segment is not None:
         problem = "'segment' is of clouds of points, these are images"
         raise TakeError(problem, remedy="Give one PCD or PLY file a frame, of the points on this segment alone.")
+    assert entry.file is not None
     given: dict[str, Any] = {"sensor": entry.name, "unit": entry.unit, "size": entry.size}
     video = read_depth(
         entry.file, rate=entry.rate, usual_rate=rate, range=entry.range or (0.0, np.inf), time_unit=entry.time_unit,

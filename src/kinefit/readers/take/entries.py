@@ -68,6 +68,7 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
 
     name: str
     video: Path | None = None
+    topic: str | None = None  # of a video that is an MCAP recording of ROS 2: "/front/color/image_raw"
     stream: str | None = None  # of `kinefit live`: a webcam's number, an address, or a folder that fills up
     size: tuple[int, int] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
@@ -81,6 +82,7 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
 
     camera: str
     file: Path | None = None  # or folder; default, of "detect" only: what `kinefit detect` leaves beside the take
+    stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that OpenPose's JSON files come into
     format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
@@ -154,7 +156,9 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
 
     name: str
     camera: str | None = None  # its camera in the calibration; default: of its own name
-    file: Path  # or folder, or pattern (frames/depth_*.png)
+    file: Path | None = None  # or folder, or pattern (frames/depth_*.png)
+    stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that depth images come into
+    topic: str | None = None  # of a file that is an MCAP recording of ROS 2: "/front/depth/image_raw"
     unit: float | None = None  # [m] of one count; default: what the file states, else millimetres
     size: tuple[int, int] | None = None  # [px] (width, height), of raw files
     range: tuple[float, float] | None = None  # [m] (near, far): what is measured outside of it is dropped

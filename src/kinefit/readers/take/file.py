@@ -14,6 +14,7 @@ import msgspec
 from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml
 from kinefit.errors import FileError, TakeError, choices, shortened
+from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
     RENAMED,
@@ -160,6 +161,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         for key, units in (("unit", LENGTHS), ("time_unit", TIMES)):
             if (value := worth(row.get(key), units)) is not None:
                 row[key] = value
+    _name_topics(raw, path)
     folder = path.parent
     try:
         content = msgspec.convert(raw, _File, dec_hook=_path_in(folder))
@@ -197,6 +199,24 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
         return folder / value
 
     return make
+
+
+def _name_topics(raw: dict[str, Any], path: Path) -> None:
+    """Make `topic` a part of its file's path, as recordings of ROS 2 are read."""
+    for table, key in (("camera", "video"), ("depth", "file")):
+        for number, row in enumerate(raw.get(table, [])):
+            topic, file = row.get("topic"), row.get(key)
+            if topic is None or not isinstance(topic, str):
+                continue
+            place = f"[[{table}]] {number + 1}"
+            if not isinstance(file, str) or not topic.strip("/"):
+                remedy = f'Write {key} = "recording.mcap" and topic = "/front/image_raw".'
+                raise TakeError(f"a topic without {key}, or without a name", file=path, place=place, remedy=remedy)
+            recording = path.parent / file
+            if recording.exists() and inside(recording) is None:
+                problem = f"'topic' has no use with {file}"
+                raise TakeError(problem, file=path, place=place, remedy="It is for MCAP recordings of ROS 2.")
+            row[key] = f"{file}/{topic.strip('/')}"
 
 
 def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:

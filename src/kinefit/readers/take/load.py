@@ -36,6 +36,7 @@ from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_as
 from kinefit.readers.take.regions import load_regions
 from kinefit.readers.take.silhouettes import load_silhouettes
 from kinefit.readers.take.skin import load_skin
+from kinefit.readers.take.streams import refuse_streams
 from kinefit.readers.take.surface_points import load_surface_points
 from kinefit.readers.video import Video, check_rates, common_frames
 
@@ -117,6 +118,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
 
     Raises
     ------
+    TakeError
+        A stream, of which nothing is recorded.
     CalibrationError
         A camera without calibration; an image of another size than the calibration's where the take does not state how.
     ObservationError
@@ -124,6 +127,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     FileError
         A file that is damaged.
     """
+    refuse_streams(take)
     rig = read_rig(take, exteriors)
     rates: dict[str, float] = {"take": take.rate} if take.rate else {}
     lengths: dict[str, int] = {}

@@ -2,14 +2,14 @@
 
 import sys
 
-import cv2
 import numpy as np
 import pytest
+from tests.readers.ros.bags import START, Bag
 
 from kinefit import read_depth
 from kinefit.errors import CalibrationError, FileError, ObservationError
 
-rosbag2 = pytest.importorskip("rosbags.rosbag2")
+pytest.importorskip("rosbags.rosbag2")
 pytest.importorskip("mcap_ros2")
 
 COUNTS = np.array([np.arange(12).reshape(3, 4) * 100 + 1000 + k for k in range(4)], np.uint16)
@@ -19,51 +19,14 @@ K = [60.0, 0, 1.5, 0, 61.0, 1.0, 0, 0, 1]
 @pytest.fixture
 def record(tmp_path):
     """Write a recording of images {topic: (encoding, images)}; returns its file."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-
-    def header(ns):
-        stamp = types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
-        return types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
-
-    def image(encoding, array, ns):
-        if encoding.endswith("png"):
-            data = np.concatenate([np.zeros(12, np.uint8), cv2.imencode(".png", array)[1].ravel()])
-            kind = "16UC1; compressedDepth png"
-            return types["sensor_msgs/msg/CompressedImage"](header=header(ns), format=kind, data=data)
-        big = encoding.endswith(">")
-        raw = array.astype(array.dtype.newbyteorder(">" if big else "<"))
-        rows = raw.view(np.uint8).reshape(len(array), -1)
-        rows = np.pad(rows, ((0, 0), (0, 4)))  # rows may be longer than the image
-        return types["sensor_msgs/msg/Image"](
-            header=header(ns), height=array.shape[0], width=array.shape[1], encoding=encoding.rstrip(">"),
-            is_bigendian=int(big), step=rows.shape[1], data=rows.ravel(),
-        )  # fmt: skip
-
-    def info(model, lens, size=(4, 3)):
-        roi = types["sensor_msgs/msg/RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        return types["sensor_msgs/msg/CameraInfo"](
-            header=header(0), height=size[1], width=size[0], distortion_model=model, d=np.array(lens, float),
-            k=np.array(K), r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi,
-        )  # fmt: skip
 
     def write(images, infos=None, stamped=True):
-        folder = tmp_path / "bag"
-        with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as out:
-            for topic, (encoding, arrays) in images.items():
-                messages = [image(encoding, a, 5 * 10**9 + k * 10**8 if stamped else 0) for k, a in enumerate(arrays)]
-                connection = out.add_connection(topic, messages[0].__msgtype__, typestore=store)
-                for k, message in enumerate(messages):
-                    data = store.serialize_cdr(message, message.__msgtype__)
-                    out.write(connection, 7 * 10**9 + k * 2 * 10**8, data)
-            for topic, (model, lens, *size) in (infos or {}).items():
-                message = info(model, lens, *size)
-                connection = out.add_connection(topic, message.__msgtype__, typestore=store)
-                out.write(connection, 7 * 10**9, store.serialize_cdr(message, message.__msgtype__))
-        (file,) = folder.glob("*.mcap")
-        return file
+        bag = Bag()
+        for topic, (encoding, arrays) in images.items():
+            bag.images(topic, encoding, arrays, stamped=stamped)
+        for topic, (model, lens, *size) in (infos or {}).items():
+            bag.info(topic, K, *(size or [(4, 3)]), model=model, lens=lens)
+        return bag.write(tmp_path / "bag")
 
     return write
 
@@ -92,7 +55,7 @@ def test_times_of_the_recording_where_headers_tell_none(record):
 def test_of_two_cameras_the_name_says_which(record):
     file = record({"/left/depth": ("16UC1", COUNTS), "/right/depth": ("16UC1", COUNTS[::-1])})
     np.testing.assert_allclose(read_depth(file, sensor="right").frame(0).depth, COUNTS[3] * 0.001, rtol=1e-6)
-    with pytest.raises(ObservationError, match="2 topics have depth images: /left/depth, /right/depth"):
+    with pytest.raises(ObservationError, match=r"2 topics have depth images .*: /left/depth, /right/depth"):
         read_depth(file)
 
 
@@ -122,3 +85,57 @@ def test_damaged_files_are_told(record, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
     with pytest.raises(FileError, match=r"kinefit\[ros\]"):
         read_depth(tmp_path / "a.mcap")
+
+
+METRES = (COUNTS * 0.001).astype(np.float32)
+
+
+def test_inverse_depth_is_unpacked(record):
+    video = read_depth(record({"/depth": ("32FC1 png", METRES)}))
+    np.testing.assert_allclose(video.frame(2).depth, METRES[2], rtol=2e-4)  # steps of 1 in 10,000
+
+
+def test_a_topic_is_named_in_the_path(record):
+    file = record({"/left/depth": ("16UC1", COUNTS), "/right/depth": ("16UC1", COUNTS[::-1])})
+    for place in (file / "right" / "depth", file.parent / "right" / "depth"):  # of the file, or of its folder
+        np.testing.assert_allclose(read_depth(place).frame(0).depth, COUNTS[3] * 0.001, rtol=1e-6)
+    with pytest.raises(ObservationError, match=r"no topic /front/depth; .* there are /left/depth, /right/depth"):
+        read_depth(file / "front" / "depth")
+
+
+def test_a_topic_of_another_kind_or_encoding_is_told(record):
+    colour = np.zeros((1, 3, 4, 3), np.uint8)
+    file = record({"/depth": ("16UC1", COUNTS), "/color": ("rgb8", colour), "/odd": ("16UC1 rvl", COUNTS)})
+    with pytest.raises(ObservationError, match="/color has images of rgb8, no depth"):
+        read_depth(file / "color")
+    with pytest.raises(ObservationError, match="16UC1, 32FC1"):
+        read_depth(file / "odd")
+
+
+def test_topics_of_one_recording_share_their_clock(tmp_path):
+    bag = Bag().images("/a/depth", "16UC1", COUNTS).images("/b/depth", "16UC1", COUNTS, start=START + 25 * 10**6)
+    file = bag.write(tmp_path / "bag")
+    np.testing.assert_allclose(read_depth(file / "a/depth").times, np.arange(4) * 0.1, atol=1e-9)
+    np.testing.assert_allclose(read_depth(file / "b/depth").times, 0.025 + np.arange(4) * 0.1, atol=1e-9)
+
+
+def test_rectified_images_have_the_lens_of_p(tmp_path):
+    P = np.array([[50.0, 0, 1, 0], [0, 51.0, 1, 0], [0, 0, 1, 0]])
+    bag = Bag().images("/tof/image_rect", "16UC1", COUNTS).images("/raw/image_raw", "16UC1", COUNTS)
+    for folder in ("tof", "raw"):
+        bag.info(f"/{folder}/camera_info", K, (4, 3), lens=(0.1, 0.01, 0, 0, 0), P=P)
+    file = bag.write(tmp_path / "bag")
+    rectified, raw = (read_depth(file / topic).camera for topic in ("tof/image_rect", "raw/image_raw"))
+    np.testing.assert_array_equal(rectified.matrix, P[:, :3])
+    assert not len(rectified.distortion) and len(raw.distortion) == 5 and raw.matrix[0, 0] == 60.0
+
+
+def test_sqlite_and_split_recordings_are_told(tmp_path):
+    file = Bag().images("/depth", "16UC1", COUNTS).write(tmp_path / "bag", "SQLITE3")
+    for place in (file, file.parent, file / "depth"):
+        with pytest.raises(FileError, match="SQLite, which is not read.*bag convert"):
+            read_depth(place)
+    file = Bag().images("/depth", "16UC1", COUNTS).write(tmp_path / "two")
+    (file.parent / "two_1.mcap").write_bytes(file.read_bytes())
+    with pytest.raises(FileError, match="a recording in 2 files"):
+        read_depth(file.parent)

@@ -1,0 +1,204 @@
+"""Folders that fill up as sources: images of a camera, depth images, OpenPose's JSON files, one a frame."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.geometry.camera import ImageFrame
+from kinefit.live.cameras import Clock, ThreadSource
+from kinefit.live.inbox import Arrived, Inbox
+from kinefit.observations import DepthFrame
+from kinefit.readers.depth.images import PICTURES, counts_of, depth_picture, natural
+from kinefit.readers.keypoints import read_openpose
+
+_LOOK = 0.005  # [s] between looks at a folder
+_SETTLED = 0.05  # [s] for which a file must not have changed before it is taken for whole
+_TICK = 0.1  # [s] within which a folder may change twice under one time
+_MILLIMETRE = 0.001  # [m] of a count of 16 bits that nothing is said of
+
+
+class FolderSource(ThreadSource):
+    """A folder into which another program puts one file a frame: each new name is taken once, in the order of numbers.
+
+    What lies there to begin with is not looked at. Of several new files the last alone is read; the others, and files
+    that cannot be read, count as dropped.
+
+    Parameters
+    ----------
+    name : of the sensor
+    folder : Path
+    endings : of the files, ".png"
+    clock : Clock of the session
+
+    Raises
+    ------
+    FileError
+        No such folder.
+    """
+
+    def __init__(self, name: str, folder: Path, endings: tuple[str, ...], clock: Clock) -> None:
+        super().__init__(name, clock)
+        self.folder, self.endings = folder, endings
+        if not folder.is_dir():
+            raise FileError("no such folder", file=folder, place=name, remedy="Make it, or correct stream.")
+        self._known = {entry.name for entry in os.scandir(folder)}
+        self._changed, self._waiting = -1.0, True
+
+    def read(self, path: Path, when: float) -> Any:
+        """What a file holds, for the tracker; None where it cannot be read."""
+        raise NotImplementedError
+
+    def _run(self, inbox: Inbox) -> None:
+        while not self._stop.wait(_LOOK):
+            fresh = self._new()
+            for _ in fresh[:-1]:
+                inbox.lose(self.name)
+            for path in fresh[-1:]:
+                when = self.clock.now()
+                seen = self.read(path, when)
+                if seen is None:
+                    inbox.lose(self.name)
+                elif not inbox.put(Arrived(self.name, when, time.monotonic(), seen)):
+                    return
+
+    def _new(self) -> list[Path]:
+        """Whole files that were not there before; the folder is listed where it has changed, or some are not whole."""
+        now, fresh, there = time.time(), list[str](), set[str]()
+        try:
+            changed = os.stat(self.folder).st_mtime
+            if changed == self._changed and not self._waiting and now - changed > _TICK:
+                return []
+            entries = list(os.scandir(self.folder))
+        except OSError as error:
+            problem, remedy = f"the folder cannot be listed any more ({error.strerror})", "Make it again."
+            raise FileError(problem, file=self.folder, place=self.name, remedy=remedy) from error
+        self._changed, self._waiting = changed, False
+        for entry in entries:
+            there.add(entry.name)
+            if entry.name in self._known or not entry.name.lower().endswith(self.endings):
+                continue
+            try:
+                whole = now - entry.stat().st_mtime >= _SETTLED
+            except FileNotFoundError:  # taken away meanwhile
+                continue
+            if whole:
+                fresh.append(entry.name)
+            self._waiting |= not whole
+        self._known = (self._known & there) | set(fresh)
+        return [self.folder / name for name in sorted(fresh, key=natural)]
+
+
+class ImageFolderStream(FolderSource):
+    """Images (PNG, JPEG) of a camera of a size (width, height) [px], for the detector."""
+
+    def __init__(self, name: str, folder: Path, size: tuple[int, int], clock: Clock) -> None:
+        super().__init__(name, folder, (".png", ".jpg", ".jpeg"), clock)
+        self.size = size
+
+    def read(self, path: Path, when: float) -> Any:
+        """(H, W, 3) uint8 RGB.
+
+        Raises
+        ------
+        ObservationError
+            An image of another size.
+        """
+        image = cv2.imread(str(path))
+        if image is None:
+            return None
+        check_size(image.shape[1::-1], self.size, path, f"camera {self.name}")
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+class DepthFolderStream(FolderSource):
+    """Depth images of one sensor: PNG or TIFF of 16 bits, or float TIFF in metres.
+
+    Parameters
+    ----------
+    unit : float [m] of a count; default: 0.001 of 16 bits, 1 of float
+    size : (width, height) [px]
+    near, far : [m] what is measured outside of them is dropped
+    """
+
+    def __init__(
+        self, name: str, folder: Path, size: tuple[int, int], clock: Clock, *, unit: float | None = None,
+        near: float = 0.0, far: float = np.inf,
+    ) -> None:  # fmt: skip
+        super().__init__(name, folder, PICTURES, clock)
+        self.size, self.unit, self.near, self.far = size, unit, near, far
+
+    def read(self, path: Path, when: float) -> Any:
+        """A list of one `DepthFrame`.
+
+        Raises
+        ------
+        ObservationError
+            An image of another size, or that is no depth.
+        """
+        try:
+            picture = depth_picture(path)
+        except FileError:
+            return None
+        check_size(picture.shape[::-1], self.size, path, f"depth {self.name}")
+        counts = _MILLIMETRE if picture.dtype == np.uint16 else 1.0
+        depth = counts_of(picture) * np.float32(self.unit or counts)
+        depth[~((depth >= self.near) & (depth <= self.far))] = 0.0
+        return [DepthFrame(self.name, when, depth)]
+
+
+class KeypointFolderStream(FolderSource):
+    """OpenPose's JSON files of one camera.
+
+    Parameters
+    ----------
+    keypoint_set : of `readers.keypoints.KEYPOINT_SETS`
+    rate : float [Hz], about
+    image : ImageFrame of their coordinates, where it is not the calibration's
+    """
+
+    def __init__(
+        self, name: str, folder: Path, clock: Clock, *, keypoint_set: str, rate: float, image: ImageFrame | None = None
+    ) -> None:
+        super().__init__(name, folder, (".json",), clock)
+        self.keypoint_set, self.rate, self.image = keypoint_set, rate, image
+
+    def read(self, path: Path, when: float) -> Any:
+        """A list of one record of keypoints, of everybody in view.
+
+        Raises
+        ------
+        ObservationError
+            Another number of keypoints than the set has.
+        """
+        try:
+            return [read_openpose(
+                path, camera=self.name, rate=self.rate, keypoint_set=self.keypoint_set, time_offset=when,
+                image_frame=self.image,
+            )]  # fmt: skip
+        except FileNotFoundError:
+            return None
+        except ObservationError as error:
+            if isinstance(error.__cause__, msgspec.DecodeError | UnicodeDecodeError):
+                return None
+            raise
+
+
+def check_size(size: tuple[int, ...], wanted: tuple[int, int], path: Path, place: str) -> None:
+    """Refuse an image of another size (width, height) [px].
+
+    Raises
+    ------
+    ObservationError
+    """
+    if tuple(size) != tuple(wanted):
+        problem = f"images of {size[0]}x{size[1]} px, expected are {wanted[0]}x{wanted[1]}"
+        remedy = "Set the camera to that size, or calibrate it at the size that it has."
+        raise ObservationError(problem, file=path, place=place, remedy=remedy)

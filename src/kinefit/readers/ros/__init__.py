@@ -1,0 +1,1 @@
+"""Recordings of ROS 2 (MCAP, extra `ros`): depth, images, cameras."""

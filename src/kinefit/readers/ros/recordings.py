@@ -1,0 +1,216 @@
+"""MCAP recordings of ROS 2 (extra `ros`): their topics, and messages of a topic by number.
+
+A topic within a recording is written as a path: `session.mcap/front/depth/image_raw`. A folder that `ros2 bag record`
+leaves stands for the one MCAP file in it.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, KinefitError, ObservationError
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+INFO = "sensor_msgs/msg/CameraInfo"
+_ENDING = ".mcap"
+
+
+def inside(path: Path) -> tuple[Path, str | None] | None:
+    """The recording that a path leads into, and the topic, None where it names none; None for other files.
+
+    Raises
+    ------
+    FileError
+        A recording of another kind (SQLite), or one that is split into several files.
+    """
+    for file in (path, *path.parents):
+        found = _recording(file)
+        if found is not None:
+            topic = path.relative_to(file).as_posix()
+            return found, None if topic == "." else f"/{topic}"
+        if file.suffix.lower() == _ENDING:  # one that is not there
+            return None
+    return None
+
+
+def _recording(path: Path) -> Path | None:
+    ending = path.suffix.lower()
+    if ending == _ENDING and path.is_file():
+        return path
+    if path.is_dir() and (path / "metadata.yaml").is_file():
+        files = sorted(path.glob(f"*{_ENDING}"))
+        if len(files) > 1:
+            told = f"a recording in {len(files)} files"
+            raise FileError(told, file=path, remedy=f"Name one of them ({files[0].name}), or merge them: `mcap merge`.")
+        if files:
+            return files[0]
+        path = next(iter(path.glob("*.db3")), path)
+    if path.suffix.lower() == ".db3" and path.is_file():
+        remedy = "Make an MCAP file of it: `ros2 bag convert`, or `mcap convert recording.db3 recording.mcap`."
+        raise FileError("a recording of ROS 2 in SQLite, which is not read", file=path, remedy=remedy)
+    return None
+
+
+class Topics:
+    """What an open recording has.
+
+    Attributes
+    ----------
+    kinds : {topic: type of its messages}, of those with messages that can be read
+    """
+
+    def __init__(self, reader: Any, path: Path) -> None:
+        self._reader, self.path = reader, path
+        summary = reader.get_summary()
+        if summary is None:
+            told = "it has no index: was the recording cut short?"
+            raise FileError(told, file=path, remedy="Run `mcap recover` on it.")
+        self.kinds = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
+
+    def of(self, *kinds: str) -> list[str]:
+        """Topics of these types, in the order of their names."""
+        return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
+
+    def first(self, topic: str) -> Any:
+        """The first message; None where there is none."""
+        return next((message for *_, message in self._reader.iter_decoded_messages(topics=[topic])), None)
+
+    def all(self, topic: str) -> Iterator[Any]:
+        """All messages of a topic."""
+        return (message for *_, message in self._reader.iter_decoded_messages(topics=[topic]))
+
+    def chosen(self, topic: str | None, fitting: Mapping[str, Any] | list[str], what: str, name: str = "") -> str:
+        """The topic that is asked for; else the only one that fits, or that has a part called `name`.
+
+        Raises
+        ------
+        ObservationError
+            No such topic, or none or several that fit: the message names those that are there.
+        """
+        listed = ", ".join(sorted(fitting))
+        if topic is not None:
+            if topic in fitting:
+                return topic
+            there = f"there {'is' if len(fitting) == 1 else 'are'} {listed}" if fitting else "no topic of it has any"
+            kind = self.kinds.get(topic)
+            told = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
+            raise ObservationError(f"{told}; of {what} {there}", file=self.path, remedy="Correct topic.")
+        named = [one for one in fitting if name in one.split("/")] or list(fitting)
+        if len(named) == 1:
+            return named[0]
+        if not named:
+            have = ", ".join(sorted(self.kinds)) or "none"
+            told = f"no topic of it has {what}; its topics are {have}"
+            raise ObservationError(told, file=self.path, remedy="Record the camera's images.")
+        told = f"{len(named)} topics have {what}: {', '.join(sorted(named))}"
+        raise ObservationError(told, file=self.path, remedy="Write topic = ... beside the file.")
+
+    def begin(self) -> int:
+        """[ns] when the first image of any topic was seen, by its header; 0 where headers tell no time."""
+        stamps = []
+        for topic in self.of(IMAGE, COMPRESSED):
+            for _, _, message in self._reader.iter_messages(topics=[topic]):
+                stamps.append(stamp(message.data))
+                break
+        return min(stamps, default=0)
+
+    def times(self, topic: str) -> tuple[NDArray, list[int]]:
+        """(N,) [s] of a topic's images, since the recording's first one; and when each was logged [ns].
+
+        Headers tell the times; where these do not increase, the log does, and 0 is the topic's own first image.
+        """
+        stamps, logged = [], []
+        for _, _, message in self._reader.iter_messages(topics=[topic]):
+            stamps.append(stamp(message.data))
+            logged.append(message.log_time)
+        begin, by = self.begin(), np.array(stamps, np.int64)
+        if not (begin > 0 and (np.diff(by) > 0).all()):
+            by, begin = np.array(logged, np.int64), logged[0]
+        return (by - begin) * 1e-9, logged
+
+
+class Messages:
+    """Messages of a topic by number; in order they are read on, else they are sought.
+
+    Parameters
+    ----------
+    path : of the recording
+    topic : str
+    logged : [ns] when each was
+    """
+
+    def __init__(self, path: Path, topic: str, logged: list[int]) -> None:
+        self._path, self._topic, self._logged = path, topic, logged
+        self._open, self._next = ExitStack(), -1
+        self._coming: Iterator[Any] = iter(())
+
+    def __call__(self, i: int) -> Any:
+        """Message `i`, decoded.
+
+        Raises
+        ------
+        FileError
+            It is not there any more, or damaged.
+        """
+        if i != self._next:
+            self._seek(i)
+        try:
+            *_, message = next(self._coming)
+        except StopIteration:
+            told = "frame cannot be found again"
+            raise FileError(told, file=self._path, place=f"frame {i}", remedy="Copy it again.") from None
+        except Exception as error:  # of damaged files libraries raise anything
+            raise _damaged(error, self._path) from error
+        self._next = i + 1
+        return message
+
+    def close(self) -> None:
+        """Close the file; it is opened again when it is needed."""
+        self._open.close()
+        self._next = -1
+
+    def _seek(self, i: int) -> None:
+        self.close()
+        at = self._logged[i]
+        reader = self._open.enter_context(reading(self._path))
+        self._coming = iter(reader.iter_decoded_messages(topics=[self._topic], starting_at=at))
+        for _ in range(i - self._logged.index(at)):  # of several that were logged at once
+            next(self._coming, None)
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[Any]:
+    """A reader; whatever its library raises becomes an error of the file."""
+    try:
+        from mcap.reader import make_reader
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        raise FileError(
+            "an MCAP recording needs the package mcap-ros2-support, which is not installed", file=path,
+            remedy="pip install 'kinefit[ros]'",
+        ) from None  # fmt: skip
+    try:
+        with open(path, "rb") as file:
+            yield make_reader(file, decoder_factories=[DecoderFactory()])
+    except KinefitError:
+        raise
+    except Exception as error:  # of damaged files libraries raise anything
+        raise _damaged(error, path) from error
+
+
+def _damaged(error: Exception, path: Path) -> FileError:
+    told = f"no recording of ROS 2 that can be read ({type(error).__name__}: {error})"
+    return FileError(told, file=path, remedy="Copy it again; `mcap doctor` says what is wrong with it.")
+
+
+def stamp(data: bytes) -> int:
+    """[ns] of the header that a message begins with, in CDR."""
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return seconds * 10**9 + nanoseconds

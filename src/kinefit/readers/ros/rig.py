@@ -1,0 +1,108 @@
+"""Cameras of an MCAP recording (ROS 2): lenses of CameraInfo, places of /tf_static."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import CalibrationError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.readers.ros.images import camera, is_rectified
+from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, INFO, Topics, reading
+
+_STATIC = "/tf_static"
+
+
+def mcap_rig(path: Path) -> Rig:
+    """Every camera that has a CameraInfo; its name is the shortest end of the topic's folder that no other camera has.
+
+    /front/color/camera_info and /front/depth/camera_info are `color` and `depth`, beside /side/color/camera_info they
+    are `front_color` and `depth`. Poses are those of the frames in the messages' headers, by /tf_static, in the frame
+    from which all of them hang; the optical axis is z, x to the right, y down (REP 103). A camera alone without
+    transforms is the world.
+
+    Raises
+    ------
+    CalibrationError
+        No camera, one that is not calibrated, no transform to one, a lens that OpenCV does not have.
+    FileError
+        As `readers.ros.recordings.reading`.
+    """
+    with reading(path) as reader:
+        topics = Topics(reader, path)
+        infos = {topic.rpartition("/")[0]: topics.first(topic) for topic in topics.of(INFO)}
+        infos = {folder: info for folder, info in infos.items() if info is not None}
+        tree = _tree(topics) if _STATIC in topics.kinds else {}
+        images = topics.of(IMAGE, COMPRESSED)
+    if not infos:
+        remedy = "Record camera_info of each camera."
+        raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
+    names = _names(list(infos))
+    cameras = []
+    for folder, info in infos.items():
+        beside = [topic for topic in images if topic.startswith(f"{folder}/")]
+        rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
+        found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
+        if found is None:
+            told = f"the CameraInfo of {folder} is not calibrated"
+            raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
+        cameras.append(found)
+    frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
+    if len(frames) == 1 and frames[0] not in tree:
+        return Rig(tuple(cameras))
+    roots = [_root(frame, tree) for frame in frames]
+    for frame, (root, _) in zip(frames, roots):
+        if root != roots[0][0]:
+            raise CalibrationError(
+                f"no transform in {_STATIC} between the frames {frames[0]} (below {roots[0][0]}) and {frame} "
+                f"(below {root})", file=path, remedy=f"Record {_STATIC}, and publish where each camera stands.",
+            )  # fmt: skip
+    return Rig(tuple(_placed(one, T) for one, (_, T) in zip(cameras, roots)))
+
+
+def _placed(one: Camera, T_world_camera: NDArray) -> Camera:
+    lens = () if one.distortion is None else tuple(one.distortion)
+    return Camera(one.name, one.size, one.matrix, lens, T_camera_world=se3.inverse(T_world_camera))  # type: ignore[arg-type]
+
+
+def _names(folders: list[str]) -> dict[str, str]:
+    """The shortest end of each folder that no other has."""
+    out = {}
+    for folder in folders:
+        parts, end = folder.strip("/").split("/"), folder
+        for count in range(1, len(parts) + 1):
+            end = "/".join(parts[-count:])
+            if sum(f"/{other.strip('/')}".endswith(f"/{end}") for other in folders) == 1:
+                break
+        out[folder] = end.replace("/", "_")
+    return out
+
+
+def _tree(topics: Topics) -> dict[str, tuple[str, NDArray]]:
+    """{frame: (its parent, T_parent_frame)}."""
+    out: dict[str, tuple[str, NDArray]] = {}
+    for message in topics.all(_STATIC):
+        for one in message.transforms:
+            out[str(one.child_frame_id).lstrip("/")] = str(one.header.frame_id).lstrip("/"), _matrix(one.transform)
+    return out
+
+
+def _matrix(transform: Any) -> NDArray:
+    """(4, 4) of a geometry_msgs/Transform."""
+    q = np.array([getattr(transform.rotation, axis) for axis in "wxyz"], float)
+    R = se3.rotation_from_quaternion(q) if q.any() else np.eye(3)
+    return se3.transform(R, np.array([getattr(transform.translation, axis) for axis in "xyz"], float))
+
+
+def _root(frame: str, tree: dict[str, tuple[str, NDArray]]) -> tuple[str, NDArray]:
+    """The frame from which one hangs, and T_root_frame."""
+    T, seen = np.eye(4), set[str]()
+    while frame in tree and frame not in seen:
+        seen.add(frame)
+        frame, step = tree[frame]
+        T = step @ T
+    return frame, T

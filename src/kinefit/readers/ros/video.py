@@ -1,0 +1,84 @@
+"""Images of a topic of an MCAP recording (ROS 2) as the frames of a video: what `Video` reads such a path with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.readers.ros.images import COLOURS, colours, is_colour, refuse_encoding
+from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, reading
+
+_GAP = 0.5  # [s] without an image that a video cannot bridge
+
+
+class McapVideo:
+    """Images at an even rate, that of the recording: each time shows the image nearest to it.
+
+    Frame 0 is at the recording's first image of any topic, so that cameras of one recording are in step.
+
+    Parameters
+    ----------
+    path : Path of the recording
+    topic : str or None
+        None: the only one that has images in colour or grey.
+
+    Raises
+    ------
+    FileError
+        The extra is not installed, or the file is damaged.
+    ObservationError
+        No such topic, one of another encoding, none or several that have images; half a second or more without any.
+    """
+
+    def __init__(self, path: Path, topic: str | None) -> None:
+        with reading(path) as reader:
+            topics = Topics(reader, path)
+            fitting = [one for one in topics.of(IMAGE, COMPRESSED) if is_colour(topics.first(one))]
+            refuse_encoding(topics, topic, "image", (*COLOURS, "jpeg", "png"))
+            self.topic = topics.chosen(topic, fitting, "images in colour or grey")
+            times, logged = topics.times(self.topic)
+            first = colours(topics.first(self.topic), path)
+        steps = np.diff(times)
+        if not len(steps):
+            problem = f"one image alone on the topic {self.topic}"
+            raise ObservationError(problem, file=path, remedy="Record it for longer.")
+        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > _GAP)
+        if len(gaps):
+            begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
+            raise ObservationError(
+                f"no image on the topic {self.topic} from {begin:.2f} to {end:.2f} s", file=path,
+                remedy="Cut the recording to the time that all its cameras saw: `mcap filter`.",
+            )  # fmt: skip
+        self.path, self.size = path, (int(first.shape[1]), int(first.shape[0]))
+        self.rate = round(1.0 / float(np.median(steps)), 6)
+        at = np.arange(round(times[-1] * self.rate) + 1) / self.rate
+        after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+        self._shown = np.where(at - times[after - 1] <= times[after] - at + 1e-6, after - 1, after)
+        self._messages, self._last = Messages(path, self.topic, logged), (0, first)
+
+    def __len__(self) -> int:
+        return len(self._shown)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._messages.close()
+
+    @property
+    def times(self) -> NDArray:
+        """(N,) [s] from the recording's first image."""
+        return np.arange(len(self)) / self.rate
+
+    def image(self, i: int) -> NDArray[np.uint8]:
+        """Frame `i` as (H, W, 3) uint8 RGB."""
+        number = int(self._shown[i])
+        if number != self._last[0]:
+            image = colours(self._messages(number), self.path)
+            if image.shape[1::-1] != self.size:
+                told = f"{image.shape[1]}x{image.shape[0]} px, but the first image has {self.size[0]}x{self.size[1]}"
+                remedy = "All images of a camera are of one size."
+                raise ObservationError(told, file=self.path, place=f"{self.topic}, frame {i}", remedy=remedy)
+            self._last = number, image
+        return self._last[1].copy()

@@ -1,0 +1,218 @@
+"""Folders that fill up: images, depth, keypoints; a recording that another program writes while it is followed."""
+
+import json
+import shutil
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+from tests.docs.drawn import write_openpose
+
+from kinefit.errors import FileError, ObservationError, TakeError
+from kinefit.geometry.camera import Rig
+from kinefit.live.cameras import Clock
+from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
+from kinefit.live.inbox import Inbox
+from kinefit.live.take import live_session
+from kinefit.readers.calibration.read import write_calibration
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.simulation import TOF, cut, in_front, simulate_depth, squat_and_wave
+
+
+def image(value):
+    return np.full((48, 64, 3), value, np.uint8)
+
+
+def taken(inbox, count, limit=20.0):
+    out, until = [], time.monotonic() + limit
+    while len(out) < count and time.monotonic() < until:
+        out += inbox.take(0.1)
+    return out
+
+
+def test_new_images_of_a_folder_are_taken_once_and_in_order(tmp_path):
+    cv2.imwrite(str(tmp_path / "old_1.png"), image(1))
+    inbox = Inbox(["cam"], patience=0.0)
+    stream = ImageFolderStream("cam", tmp_path, (64, 48), Clock())
+    stream.start(inbox)
+    seen = []
+    for k in (9, 10, 11):
+        cv2.imwrite(str(tmp_path / f"new_{k}.png"), image(k))
+        seen += taken(inbox, 1)
+    stream.stop()
+    assert [int(one.seen[0, 0, 0]) for one in seen] == [9, 10, 11]
+    assert all(np.diff([one.time for one in seen]) > 0)
+    assert inbox.came == {"cam": 3}
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    with pytest.raises(FileError, match="no such folder"):
+        ImageFolderStream("cam", tmp_path / "nowhere", (64, 48), Clock())
+
+
+def test_of_many_new_files_the_last_is_read_and_the_others_are_counted(tmp_path):
+    inbox = Inbox(["tof"], patience=0.0)
+    stream = DepthFolderStream("tof", tmp_path, (64, 48), Clock(), near=0.5, far=3.0)
+    for k in range(5):  # before it looks for the first time
+        cv2.imwrite(str(tmp_path / f"depth_{8 + k}.png"), np.full((48, 64), 1000 + k, np.uint16))
+    time.sleep(0.1)
+    stream.start(inbox)
+    (one,) = taken(inbox, 1)
+    stream.stop()
+    assert one.seen[0].depth[0, 0] == pytest.approx(1.004)
+    assert inbox.came == {"tof": 5} and inbox.dropped == {"tof": 4}
+
+
+def test_units_ranges_and_damage_of_depth_images(tmp_path):
+    stream = DepthFolderStream("tof", tmp_path, (64, 48), Clock(), near=0.5, far=3.0)
+    counts = np.full((48, 64), 2000, np.uint16)
+    counts[0], counts[1] = 4000, 65535
+    cv2.imwrite(str(tmp_path / "a.png"), counts)
+    cv2.imwrite(str(tmp_path / "b.tiff"), (counts * 0.001).astype(np.float32))
+    for name in ("a.png", "b.tiff"):
+        depth = stream.read(tmp_path / name, 1.5)[0]
+        assert depth.time == 1.5 and not depth.depth[:2].any() and np.allclose(depth.depth[2:], 2.0)
+    (tmp_path / "c.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
+    assert stream.read(tmp_path / "c.png", 0.0) is None
+    cv2.imwrite(str(tmp_path / "d.png"), image(3))
+    with pytest.raises(ObservationError, match="which is no depth"):
+        stream.read(tmp_path / "d.png", 0.0)
+    cv2.imwrite(str(tmp_path / "e.png"), counts[:20])
+    with pytest.raises(ObservationError, match="images of 64x20 px, expected are 64x48"):
+        stream.read(tmp_path / "e.png", 0.0)
+
+
+def test_keypoints_of_nobody_damaged_and_of_another_set(tmp_path):
+    stream = KeypointFolderStream("cam", tmp_path, Clock(), keypoint_set="BODY_25B", rate=30.0)
+    (tmp_path / "a_000.json").write_text(json.dumps({"people": []}))
+    (nobody,) = stream.read(tmp_path / "a_000.json", 2.0)
+    assert nobody.points.shape == (1, 0, 25, 2) and nobody.times[0] == 2.0
+    (tmp_path / "b_001.json").write_text('{"people": [{"pose_keypoints_2d": [1, 2')
+    assert stream.read(tmp_path / "b_001.json", 2.0) is None
+    (tmp_path / "c_002.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": [1.0] * 51}]}))
+    with pytest.raises(ObservationError, match="COCO_17"):
+        stream.read(tmp_path / "c_002.json", 2.0)
+
+
+def test_a_folder_that_is_taken_away_ends_the_session_with_its_name(tmp_path):
+    (tmp_path / "gone").mkdir()
+    inbox = Inbox(["tof"], patience=0.0)
+    stream = DepthFolderStream("tof", tmp_path / "gone", (64, 48), Clock())
+    (tmp_path / "gone").rmdir()
+    stream.start(inbox)
+    with pytest.raises(FileError, match="gone.*cannot be listed any more"):
+        taken(inbox, 1)
+    stream.stop()
+
+
+class Writer:
+    """Another program: puts the files of a recording into folders at a rate [Hz], as soon as somebody looks."""
+
+    def __init__(self, recorded, rate):
+        self.recorded, self.rate, self.written = recorded, rate, 0
+        self.thread = threading.Thread(target=self.run, daemon=True)
+
+    def run(self):
+        begin = time.monotonic()
+        for k, files in enumerate(self.recorded):
+            time.sleep(max(begin + k / self.rate - time.monotonic(), 0.0))
+            for source, folder in files:
+                shutil.copyfile(source, folder / source.name)
+                self.written += 1
+
+
+def follow(take, writer, collected):
+    session = live_session(read_take(take), [collected])
+
+    def until_all_came():
+        writer.run()
+        until = time.monotonic() + 20.0
+        while sum(session.inbox.came.values()) < writer.written and time.monotonic() < until:
+            time.sleep(0.02)
+        session.ask({"stop": True})  # after the step with what waits
+
+    thread = threading.Thread(target=until_all_came, daemon=True)
+    thread.start()
+    session.run(60.0)
+    thread.join()
+    return session
+
+
+def test_keypoints_that_a_detector_writes_are_followed(scene, collected, tmp_path):
+    write_calibration(scene.rig, tmp_path / "calibration.toml")
+    parts = [f'[take]\nrate = 10.0\nup = "{scene.motion.up}"\nsize = false\n[calibration]\nfile = "calibration.toml"\n']
+    for k in scene.keypoints:
+        write_openpose(tmp_path / "recorded" / k.camera, k)
+        (tmp_path / "new" / k.camera).mkdir(parents=True)
+        parts.append(f'[[camera]]\nname = "{k.camera}"\n[[keypoints]]\ncamera = "{k.camera}"\nsigma = 2.0\n')
+        parts.append(f'stream = "new/{k.camera}"\n')
+    (tmp_path / "take.toml").write_text("".join(parts))
+    files = [sorted((tmp_path / "recorded" / k.camera).iterdir()) for k in scene.keypoints]
+    recorded = [[(path, tmp_path / "new" / path.parent.name) for path in step] for step in zip(*files)]
+    writer = Writer(recorded[:12], 10.0)
+    session = follow(tmp_path / "take.toml", writer, collected)
+    came, dropped = sum(session.inbox.came.values()), sum(session.inbox.dropped.values())
+    assert came == writer.written == 12 * len(files) and dropped < came
+    found = [posed for posed in collected.poses if posed.result is not None]
+    assert len(found) >= 2
+    truth = scene.motion.segment_poses()[11, :, :3, 3]
+    assert np.linalg.norm(found[-1].Ts_world_segment[:, :3, 3] - truth, axis=1).mean() < 0.05
+
+
+def test_depth_images_that_a_program_writes_are_followed(collected, tmp_path):
+    motion = cut(squat_and_wave(rate=10.0), 0, 6)
+    camera = in_front(motion, TOF.camera(), near=TOF.near, far=TOF.far)
+    video = simulate_depth(motion, camera, TOF, seed=1)
+    (tmp_path / "recorded").mkdir()
+    (tmp_path / "new").mkdir()
+    recorded = []
+    for i in range(len(motion)):
+        path = tmp_path / "recorded" / f"{i}.png"
+        cv2.imwrite(str(path), np.rint(1000 * video.frame(i).depth).astype(np.uint16))
+        recorded.append([(path, tmp_path / "new")])
+    write_calibration(Rig((camera,)), tmp_path / "calibration.toml")
+    root = motion.Ts_world_root[0]
+    (tmp_path / "take.toml").write_text(
+        f'[take]\nrate = 10.0\nup = "{motion.up}"\nsize = false\n[calibration]\nfile = "calibration.toml"\n'
+        f"[start]\nat = {root[:3, 3].tolist()}\nforward = {root[:3, 0].tolist()}\n"
+        f'[[depth]]\nname = "tof"\ncamera = "{camera.name}"\nstream = "new"\nsigma = 0.02\n'
+    )
+    writer = Writer(recorded, 4.0)
+    session = follow(tmp_path / "take.toml", writer, collected)
+    assert session.inbox.came == {"tof": 6}
+    assert session.processed == 6 - session.inbox.dropped["tof"] >= 1
+    found = [posed for posed in collected.poses if posed.result is not None]
+    truth = motion.segment_poses()[5, :, :3, 3]
+    assert np.linalg.norm(found[-1].Ts_world_segment[:, :3, 3] - truth, axis=1).mean() < 0.08
+
+
+DEPTH = '[[depth]]\nname = "tof"\nintrinsics = [1.0, 1.0, 5.0, 5.0]\n'
+
+
+STREAM = DEPTH + 'stream = "new"\n'
+CAMERA = '[[camera]]\nname = "a"\n'
+KEYPOINTS = '[[keypoints]]\ncamera = "a"\nstream = "new"\n'
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    (DEPTH, "neither a file nor a stream"), (STREAM, "a stream with intrinsics, and no size"),
+    (STREAM + 'file = "old.npz"\nsize = [10, 10]\n', "a stream and a file"),
+    (STREAM + 'size = [10, 10]\n[[markers]]\nfile = "a.trc"\n', "what was recorded stands beside streams"),
+    (CAMERA + KEYPOINTS + 'format = "mediapipe"\n', "'stream' has no use"),
+    (CAMERA + 'stream = "0"\n' + KEYPOINTS, "its camera has a stream, too"),
+])  # fmt: skip
+def test_streams_beside_what_excludes_them(tmp_path, text, told):
+    (tmp_path / "take.toml").write_text(text)
+    with pytest.raises(TakeError, match=told):
+        read_take(tmp_path / "take.toml")
+
+
+def test_a_stream_is_no_recording(tmp_path):
+    (tmp_path / "take.toml").write_text(STREAM + 'size = [10, 10]\n')
+    with pytest.raises(TakeError, match="nothing is recorded.*kinefit live"):
+        load_observations(read_take(tmp_path / "take.toml"))
+    with pytest.raises(FileError, match="no such folder"):
+        live_session(read_take(tmp_path / "take.toml"))
