@@ -2,13 +2,14 @@
 
 Each person's points in space are carried to the next frame; in every camera people and detections are then paired at
 the least total cost, and views that do not fit the others are let go. Who is seen by enough cameras and is nobody yet
-is a new person, or one who was lost within reach. Whom cameras saw before enough of them did is added backwards.
+is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them did is added
+backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,9 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
 from kinefit.multiview.boxes import same_people
+from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
+from kinefit.multiview.returns import BRIEF, Chain, Return, Span, chains_of
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
 
@@ -41,6 +44,8 @@ class Person:
     speed : float [m/s] of the body's points, the mean over time of their median
     size : float [px] mean height in the pictures
     place : (3,) [m] median place of the body's middle
+    returns : when the person was away, and how sure it is that it is the same
+    maybe : numbers, in a list of people from 0, of others who left before this one came and may be the same
     """
 
     chosen: tuple[NDArray, ...]
@@ -49,6 +54,8 @@ class Person:
     speed: float
     size: float
     place: NDArray
+    returns: tuple[Return, ...] = ()
+    maybe: tuple[int, ...] = ()
 
 
 def views_needed(cameras: int) -> int:
@@ -73,13 +80,14 @@ def lasting(rate: float, frames: int) -> float:
     return min(_LASTING * rate, 0.5 * frames)
 
 
-def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
+def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | None = None) -> list[Person]:
     """Everybody whom enough cameras see for a second, the one of whom most is seen first.
 
     Parameters
     ----------
     rig : Rig
     keypoints : records of the same number of frames and the same rate, each of one or several people.
+    pictures : of the cameras, by whose colours those who come back are known again; by their size alone without
     """
     if not keypoints:
         return []
@@ -92,24 +100,30 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
     for f in reversed(range(search.frames)):
         search.backward(f)
     needed, long = search.needed, lasting(keypoints[0].rate, search.frames)
-    people = []
-    for track in search.tracks:
+    spans = [Span(t.nodes, t.path) for t in search.tracks]
+    people: list[tuple[Person, Chain]] = []
+    for chain in chains_of(rig, search.keypoints, spans, needed, pictures):
         views = np.zeros(search.frames, int)
         chosen = [np.full(search.frames, -1) for _ in keypoints]
-        for f, nodes in track.nodes.items():
+        for f, nodes in chain.span.nodes.items():
             views[f] = len(nodes)
             for q, p in nodes:
                 chosen[main[q]][f] = p
         if np.sum(views >= needed) >= long:
-            people.append(search.person(track, chosen, views, main))
-    people.sort(key=lambda one: -one.surety)
+            people.append((search.person(chain, chosen, views), chain))
+    people.sort(key=lambda one: -one[0].surety)
+    number = {k: i for i, (_, chain) in enumerate(people) for k in chain.members}
+    found = []
+    for i, (one, chain) in enumerate(people):
+        maybe = {number[k] for k in chain.maybe if k in number} - {i}
+        found.append(replace(one, maybe=tuple(sorted(maybe))))
     for q in set(range(len(keypoints))) - set(main):
         own = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
         if own is not None:
-            there = same_people([one.chosen[own] for one in people], keypoints[own], keypoints[q])
-            for one, places in zip(people, there):
+            there = same_people([one.chosen[own] for one in found], keypoints[own], keypoints[q])
+            for one, places in zip(found, there):
                 one.chosen[q][:] = places
-    return people
+    return found
 
 
 @dataclass(eq=False)
@@ -170,9 +184,10 @@ class _Search:
 
     def forward(self, frame: int) -> None:
         """Who goes on, who comes back and who is new in a frame."""
-        self._go_on(frame, self.tracks)
+        near = [t for t in self.tracks if frame - t.last <= BRIEF * self.rate]
+        self._go_on(frame, near)
         came = self._newcomers(frame)
-        away = [t for t in self.tracks if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
+        away = [t for t in near if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
         cost = np.array([[_apart(t.x, x) for _, x in came] for t in away]).reshape(len(away), len(came))
         reach = np.array([STRIDE + SPEED * (frame - t.last) / self.rate for t in away])
         cost[cost > reach[:, None]] = np.inf
@@ -256,17 +271,18 @@ class _Search:
         """Whether somebody stands at these very points: a second detection of one person is no other."""
         return any(_apart(t.x, x) < _SAME for t in self.tracks if frame in t.nodes)
 
-    def person(self, track: _Track, chosen: list[NDArray], views: NDArray, main: Sequence[int]) -> Person:
+    def person(self, chain: Chain, chosen: list[NDArray], views: NDArray) -> Person:
         """What is told of a person."""
         step = max(round(STEP * self.rate), 1)
-        moved = [track.path[f + step] - x for f, x in track.path.items() if f + step in track.path]
+        nodes, path = chain.span.nodes, chain.span.path
+        moved = [path[f + step] - x for f, x in path.items() if f + step in path]
         sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
-            self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes
+            self.uv[q][f, p, :, 1] for f, each in nodes.items() for q, p in each
         )]  # fmt: skip
-        sure = sum(float(self.surety[q][f, p]) for f, nodes in track.nodes.items() for q, p in nodes)
-        place = medians(medians(np.moveaxis(np.array(list(track.path.values())), 1, 2)).T)
+        sure = sum(float(self.surety[q][f, p]) for f, each in nodes.items() for q, p in each)
+        place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
-        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place)
+        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place, chain.returns)
 
 
 def _apart(a: NDArray, b: NDArray) -> float:
