@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
+from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, links_of, some_points, surety_of
 from kinefit.multiview.boxes import same_people
 from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
@@ -166,15 +166,16 @@ class _Search:
         self.frames = min(len(k) for k in keypoints)
         self.rate = keypoints[0].rate
         self.surety = [surety_of(k, self.frames) for k in keypoints]
-        self.meetings = meetings_of(rig, keypoints, self.surety, self.frames)
         self.cameras = [rig[k.camera] for k in keypoints]
         self.tracks: list[_Track] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
         some = some_points(len(keypoints[0].names))
-        self.uv = []
-        for k in keypoints:
-            uv = k.points[: self.frames, :, some]
-            self.uv.append(np.where((k.confidence[: self.frames, :, some] > 0.1)[..., None], uv, np.nan))
+        self.uv = [np.where((k.confidence[:, :, some] > 0.1)[..., None], k.points[:, :, some], np.nan) for k in keypoints]
+        self.pairs = {
+            (i, j): rig.select((a.camera, b.camera))
+            for i, a in enumerate(keypoints) for j, b in enumerate(keypoints[i + 1 :], start=i + 1)
+            if a.camera != b.camera
+        }  # fmt: skip
 
     def free(self, frame: int) -> list[Node]:
         """Detections of a frame that nobody has, the surest first."""
@@ -207,11 +208,12 @@ class _Search:
         Two people of like height fit each other in two views: the most views go first, then those that fit best.
         """
         free = self.free(frame)
-        if len(free) < self.needed:
+        if len({self.keypoints[q].camera for q, _ in free}) < self.needed:
             return []
         full = len(self.keypoints) * len(self.keypoints[0].names)
         ranked: list[tuple[int, float, int, list[Node], NDArray]] = []
-        for group in groups_of(free, self.meetings, self.surety, frame, full):
+        links = links_of(self.pairs, [uv[frame] for uv in self.uv], free)
+        for group in groups_of(free, links, self.surety, frame, full):
             nodes, x = self._agreeing(frame, list(group.nodes), None)
             if x is not None and len(nodes) >= self.needed and not self._is_there(frame, x):
                 ranked.append((-len(nodes), float(max(self._off(x, frame, n) for n in nodes)), len(ranked), nodes, x))

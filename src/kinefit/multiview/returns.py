@@ -22,7 +22,7 @@ from kinefit.solvers.assignment import assign
 
 BRIEF = 1.0  # [s] who is away for no longer goes on by place alone: in it people walk less far than they stand apart
 _SHORTEST = 0.3  # [s] of spans that are compared: in less, detectors err once and for all
-_RETURNS = 4.0  # odds, before anything is known of them, that who comes after somebody left is that one
+_RETURNS = 2.0  # odds, before anything is known of them, that who comes after somebody left is that one
 _SURE = 10.0  # odds, from which on somebody is taken for another: one in ten such returns would be wrong
 _WAY = 0.3, 0.7  # [m], [m/s] standard deviation of the way: a stride, and those who turn round out of view
 _ROOM = 25.0  # [m²] that cameras see in common, in which others come anywhere
