@@ -51,7 +51,8 @@ def run() -> None:
         _both(two, one, Path(folder))
 
 
-def _take(videos: Path, calibration: Path, folder: Path, image: str = "") -> Path:
+def take_of(videos: Path, calibration: Path, folder: Path, image: str = "") -> Path:
+    """A take file of four videos, in a new folder."""
     folder.mkdir()
     text = f'[take]\nrate = 60.0\n[calibration]\nfile = "{calibration}"\n'
     text += "".join(f'[[camera]]\nname = "{c}"\nvideo = "{videos / c}.mp4"\n{image}' for c in CAMERAS)
@@ -61,8 +62,8 @@ def _take(videos: Path, calibration: Path, folder: Path, image: str = "") -> Pat
 
 def _both(two: Path, one: Path, folder: Path) -> None:
     calibration = two / "Calib.qca.txt"
-    together = prepared(read_take(_take(two, calibration, folder / "two")))
-    by_himself = prepared(read_take(_take(one / "videos", calibration, folder / "one", 'image = "letterboxed"\n')))
+    together = prepared(read_take(take_of(two, calibration, folder / "two")))
+    by_himself = prepared(read_take(take_of(one / "videos", calibration, folder / "one", 'image = "letterboxed"\n')))
     view = people_in_view(together)
     assert view is not None
     people = view.people
