@@ -7,7 +7,7 @@ is followed by the region that the last landmarks tell.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -97,7 +97,7 @@ class Follower:
         """Those who are still there; two that have become one are the one that moved less."""
         seen: list[tuple[_Track, Sighting, float]] = []
         for track in self._tracks:
-            found = self._look_at(image, track)
+            found = self._look_at(image, track, others=[t.shape for t in self._tracks if t is not track and t.shape])
             if found is None:
                 self._lost.append(track)
                 continue
@@ -137,8 +137,9 @@ class Follower:
         """The first who is a person at a second look too, and nobody known; more is asked of who was searched for."""
         score, clear = (_SURE, _CLEAR) if searched else (_THERE, _VISIBLE)
         for person in people:
-            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score)
-            new = once and self._look_at(image, once[0], score)
+            others = [t.shape for t in known if t.shape]
+            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score, others)
+            new = once and self._look_at(image, once[0], score, others)
             if new and _clearness(new[1], image) >= clear and not any(_is_part(new[0], t) for t in known):
                 return new
         return None
@@ -153,13 +154,17 @@ class Follower:
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE
-    ) -> tuple[_Track, Sighting] | None:
-        """Landmarks of a person in the region where they are expected; None where there is nobody."""
+        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE,
+        others: Sequence[tuple[Roi, NDArray]] = (),
+    ) -> tuple[_Track, Sighting] | None:  # fmt: skip
+        """Landmarks of a person in the region where they are expected; None where there is nobody.
+
+        Others in the region, where they were last, are painted over: the network draws a person's limbs towards them.
+        """
         roi = track.steady.roi
         if not _SMALLEST < roi.side < _LARGEST * max(image.shape[:2]):
             return None
-        pose = self.models.pose(roi.crop(image, SIZE))
+        pose = self.models.pose(_alone(roi.crop(image, SIZE), roi, track.shape, others))
         if pose.score < score:
             return None
         points = roi.to_image(pose.points, SIZE)
@@ -168,6 +173,25 @@ class Follower:
         runs = mask_runs(pose, roi, image.shape[:2]) if self.masks else np.zeros(0, np.uint32)
         sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted))
         return replace(track, steady=steady, points=points, last=self._frame, shape=(roi, pose.mask)), sighting
+
+
+def _alone(
+    crop: NDArray[np.uint8], roi: Roi, own: tuple[Roi, NDArray] | None, others: Sequence[tuple[Roi, NDArray]]
+) -> NDArray[np.uint8]:
+    """A region with other people in it painted over, but for pixels that were the person's own."""
+    theirs = [cv2.dilate(_moved(shape, roi, _RATHER), np.ones((_RIM, _RIM), np.uint8)) for shape in others]
+    theirs = [mask for mask in theirs if mask.any()]
+    if theirs:
+        mine = _moved(own, roi, _RATHER) if own else np.zeros(crop.shape[:2], np.uint8)
+        crop[(np.maximum.reduce(theirs) > 0) & (mine == 0)] = _GREY
+    return crop
+
+
+def _moved(shape: tuple[Roi, NDArray], roi: Roi, least: float) -> NDArray[np.uint8]:
+    """Pixels of a region (SIZE, SIZE), 0 or 1, that a mask of another region holds for likely."""
+    A_roi_image = cv2.invertAffineTransform(roi.A_image_crop(SIZE))
+    A = A_roi_image @ np.vstack([shape[0].A_image_crop(SIZE), [0, 0, 1]])
+    return (cv2.warpAffine(shape[1], A, (SIZE, SIZE)) > least).astype(np.uint8)
 
 
 def _clearness(seen: Sighting, image: NDArray) -> float:
@@ -184,9 +208,7 @@ def _is_part(new: _Track, known: _Track) -> bool:
     """Whether most of what looks like another person is somebody who is known."""
     assert new.shape and known.shape
     (roi, mask), (other_roi, other) = new.shape, known.shape
-    A_known_image = cv2.invertAffineTransform(other_roi.A_image_crop(SIZE))
-    A_known_new = A_known_image @ np.vstack([roi.A_image_crop(SIZE), [0, 0, 1]])
-    moved = cv2.warpAffine(mask, A_known_new, (SIZE, SIZE)) > _RATHER
+    moved = _moved((roi, mask), other_roi, _RATHER) > 0
     area = float((mask > _RATHER).sum()) * (roi.side / other_roi.side) ** 2
     return bool((moved & (other > _RATHER)).sum() > _MOST * area) or _is_same(new, known)
 

@@ -122,8 +122,8 @@ def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
     for k, one in enumerate(told["each"], start=1):
         for back in one.get("returns", ()):
             said.append(
-                f"person {k} leaves at {back['left_s']:.1f} s, and who comes at {back['came_s']:.1f} s is taken for the "
-                f"same, by size, clothes and way (odds {min(back['odds'], 1000):.0f} to 1)"
+                f"person {k} leaves at {back['left_s']:.1f} s, and who comes at {back['came_s']:.1f} s is taken for "
+                f"the same, by size, clothes and way (odds {min(back['odds'], 1000):.0f} to 1)"
             )
         if one.get("maybe"):
             others = " or ".join(map(str, one["maybe"]))

@@ -8,7 +8,7 @@ backwards. Who was away for longer is known again by size, clothes and way, see 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
 from kinefit.multiview.returns import BRIEF, Chain, Return, Span, chains_of
 from kinefit.observations import Keypoints
+from kinefit.sensors.channels import mirror_name
 from kinefit.solvers.assignment import assign
 
 _NEAR = 0.25  # a person's points and a detection differ by less, as a share of the detection's height, and by ...
@@ -169,8 +170,10 @@ class _Search:
         self.cameras = [rig[k.camera] for k in keypoints]
         self.tracks: list[_Track] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
-        some = some_points(len(keypoints[0].names))
-        self.uv = [np.where((k.confidence[:, :, some] > 0.1)[..., None], k.points[:, :, some], np.nan) for k in keypoints]
+        names = keypoints[0].names
+        some = some_points(len(names))
+        mirrored = [names.index(m) if (m := mirror_name(names[k])) in names else k for k in some]
+        self.uv, self.exchanged = ([_seen(k, columns) for k in keypoints] for columns in (some, mirrored))
         self.pairs = {
             (i, j): rig.select((a.camera, b.camera))
             for i, a in enumerate(keypoints) for j, b in enumerate(keypoints[i + 1 :], start=i + 1)
@@ -216,7 +219,8 @@ class _Search:
         for group in groups_of(free, links, self.surety, frame, full):
             nodes, x = self._agreeing(frame, list(group.nodes), None)
             if x is not None and len(nodes) >= self.needed and not self._is_there(frame, x):
-                ranked.append((-len(nodes), float(max(self._off(x, frame, n) for n in nodes)), len(ranked), nodes, x))
+                worst = max(self._off(x, n, self.uv[n[0]][frame, n[1]]) for n in nodes)
+                ranked.append((-len(nodes), worst, len(ranked), nodes, x))
         came: list[tuple[list[Node], NDArray]] = []
         for *_, nodes, x in sorted(ranked, key=lambda r: r[:3]):
             if not any(node in taken for taken, _ in came for node in nodes):
@@ -233,39 +237,49 @@ class _Search:
 
     def _go_on(self, frame: int, tracks: Sequence[_Track]) -> None:
         """Pair people with detections, camera by camera."""
-        free, views = self.free(frame), [list[Node]() for _ in tracks]
+        free, views, sides = self.free(frame), [list[Node]() for _ in tracks], set[Node]()
         expected = [t.expected(frame) for t in tracks]
         for q in range(len(self.cameras)):
             mine = [p for r, p in free if r == q]
             if not mine or not tracks:
                 continue
-            cost = distances(self.cameras[q], np.array(expected), self.uv[q][frame, mine])
+            both = np.concatenate([self.uv[q][frame, mine], self.exchanged[q][frame, mine]])
+            as_is, turned = np.hsplit(distances(self.cameras[q], np.array(expected), both), 2)
+            cost = np.minimum(as_is, turned)
             waited = np.array([abs(frame - t.last) for t in tracks])
             near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)
             cost[cost > near[:, None]] = np.inf
             for t, p in assign(cost, 0.6):
                 views[t].append((q, mine[p]))
+                if turned[t, p] < as_is[t, p]:
+                    sides.add((q, mine[p]))
         for track, x, nodes in zip(tracks, expected, views, strict=True):
             if nodes:
-                kept, found = self._agreeing(frame, nodes, x)
+                kept, found = self._agreeing(frame, nodes, x, sides)
                 track.seen(frame, kept, found, SPEED / self.rate)
 
-    def _off(self, x: NDArray, frame: int, node: Node) -> float:
-        """How far a detection is from points (k, 3), as a share of its height."""
-        return float(distances(self.cameras[node[0]], x[None], self.uv[node[0]][frame, node[1]][None])[0, 0])
+    def _off(self, x: NDArray, node: Node, uv: NDArray) -> float:
+        """How far a detection's points (k, 2) [px] are from points (k, 3), as a share of its height."""
+        return float(distances(self.cameras[node[0]], x[None], uv[None])[0, 0])
 
-    def _agreeing(self, frame: int, nodes: list[Node], expected: NDArray | None) -> tuple[list[Node], NDArray | None]:
-        """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
+    def _agreeing(
+        self, frame: int, nodes: list[Node], expected: NDArray | None, sides: Collection[Node] = ()
+    ) -> tuple[list[Node], NDArray | None]:
+        """The views that are of one person, and its points (k, 3) [m]; None where a single one is left.
+
+        Of those in `sides` left is taken for right: the detector did so, which the fit of the person sets right.
+        """
         while len(nodes) > 1:
-            uv = np.stack([self.uv[q][frame, p] for q, p in nodes], axis=1)
+            each = [(self.exchanged if node in sides else self.uv)[node[0]][frame, node[1]] for node in nodes]
+            uv = np.stack(each, axis=1)
             height = float(medians(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
             x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
-            off = np.array([self._off(x, frame, node) for node in nodes])
+            off = np.array([self._off(x, node, own) for node, own in zip(nodes, each)])
             if off.max() <= _FITS:
                 return nodes, x
             if len(nodes) == 2 and expected is not None:
-                off = np.array([self._off(expected, frame, node) for node in nodes])
+                off = np.array([self._off(expected, node, own) for node, own in zip(nodes, each)])
             nodes = [node for i, node in enumerate(nodes) if i != int(off.argmax())]
         return nodes, None
 
@@ -285,6 +299,12 @@ class _Search:
         place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
         return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place, chain.returns)
+
+
+def _seen(record: Keypoints, columns: Sequence[int] | NDArray) -> NDArray:
+    """(F, P, k, 2) [px] some points of a record; NaN where they are not seen."""
+    sure = record.confidence[:, :, columns] > 0.1
+    return np.where(sure[..., None], record.points[:, :, columns], np.nan)
 
 
 def _apart(a: NDArray, b: NDArray) -> float:
