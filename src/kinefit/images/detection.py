@@ -27,6 +27,7 @@ _RATHER = 0.5  # probability from which on a pixel is the person's
 _MOST = 0.5  # share of a mask
 _HARDLY, _RIM, _GREY = 0.3, 7, 128  # probability and rim [px of the crop] of what is painted over, and the paint
 _SAME_PERSON = 0.05  # two who are followed are one where their heads, or all of them, differ by less (in sides)
+_BESIDE = 0.3  # middles of the hips of two people are further apart (in sides); of one who is followed twice, nearer
 _NEAR = 0.3  # somebody comes back where the head is no further from where it was (in sides)
 _FEW, _BRIEF = 3, 0.2  # [frames], [s]: who is seen for less in all is a deception of the networks
 _SMALLEST, _LARGEST = 16, 8  # [px], [sides of the picture]: regions beyond show nothing that could be recognised
@@ -137,9 +138,8 @@ class Follower:
         """The first who is a person at a second look too, and nobody known; more is asked of who was searched for."""
         score, clear = (_SURE, _CLEAR) if searched else (_THERE, _VISIBLE)
         for person in people:
-            others = [t.shape for t in known if t.shape]
-            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score, others)
-            new = once and self._look_at(image, once[0], score, others)
+            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score)
+            new = once and self._look_at(image, once[0], score)
             if new and _clearness(new[1], image) >= clear and not any(_is_part(new[0], t) for t in known):
                 return new
         return None
@@ -178,8 +178,15 @@ class Follower:
 def _alone(
     crop: NDArray[np.uint8], roi: Roi, own: tuple[Roi, NDArray] | None, others: Sequence[tuple[Roi, NDArray]]
 ) -> NDArray[np.uint8]:
-    """A region with other people in it painted over, but for pixels that were the person's own."""
-    theirs = [cv2.dilate(_moved(shape, roi, _RATHER), np.ones((_RIM, _RIM), np.uint8)) for shape in others]
+    """A region with other people in it painted over, but for pixels that were the person's own.
+
+    Those at the very same place are not: they may be the same person, followed twice.
+    """
+    beside = [
+        shape for shape in others
+        if np.linalg.norm(shape[0].centre - roi.centre) > _BESIDE * min(shape[0].side, roi.side)
+    ]  # fmt: skip
+    theirs = [cv2.dilate(_moved(shape, roi, _RATHER), np.ones((_RIM, _RIM), np.uint8)) for shape in beside]
     theirs = [mask for mask in theirs if mask.any()]
     if theirs:
         mine = _moved(own, roi, _RATHER) if own else np.zeros(crop.shape[:2], np.uint8)
