@@ -116,7 +116,7 @@ def _shift(seen: Observations, alone: Observations, camera: str) -> NDArray:
 def _lag(seen: Observations, alone: Observations, camera: str, shift: NDArray) -> int:
     """How many frames later one recording shows what the other does: by the pixels that move in the other."""
     with Video(seen.videos[camera]) as first, Video(alone.videos[camera]) as second:
-        off = {lag: 0.0 for lag in range(-_LAGS, _LAGS + 1)}
+        off = dict.fromkeys(range(-_LAGS, _LAGS + 1), 0.0)
         for f in range(2 * _LAGS, min(len(first), len(second)) - 2 * _LAGS, 6):
             u, v = np.round(shift).astype(int)
             with_her = np.roll(first.read(f).astype(float).mean(axis=2), (-v, -u), axis=(0, 1))

@@ -1,4 +1,4 @@
-"""People who leave and come back elsewhere: who is known again by size and clothes, who is left open, who is mistaken."""
+"""People who leave and come back elsewhere: known again by size and clothes, left open, or mistaken."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ def _real() -> None:
             gap = round(seconds * seen.rate)
             records = [_cut(k, half, gap) for k in seen.keypoints]
             with TakePictures(take, seen) as pictures:
-                own: Pictures = lambda c, f, gap=gap: pictures(c, f if f < half else f - gap)  # noqa: B023, E731
+                own: Pictures = lambda c, f, gap=gap: pictures(c, f if f < half else f - gap)
                 found = people_of(seen.rig, records, own)
             known += sum(any(_is_same(one, other, records, half, gap) for other in found) for one in whole)
     figure(name, float(known), unit, goal)
@@ -228,7 +228,9 @@ def run() -> None:
     """Print every figure."""
     _real()
     of: dict[tuple[str, bool], NDArray] = {}
-    by: dict[str, Callable[[Scene], Pictures | None]] = {"size": lambda s: None, "size and clothes": lambda s: s.pictures}
+    by: dict[str, Callable[[Scene], Pictures | None]] = {
+        "size": lambda s: None, "size and clothes": lambda s: s.pictures,
+    }  # fmt: skip
     for kind in KINDS[:1] if quick() else KINDS:
         told = {way: np.zeros(3, int) for way in by}
         for seed in SEEDS:

@@ -1,5 +1,7 @@
 """All people: each keeps their own detections in every camera, whoever comes, goes, crosses or hides another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import posture, rig_around
@@ -120,6 +122,19 @@ def test_who_is_seen_by_too_few_at_first_has_their_beginning_too():
     b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)
     early = [(1, c, 0, 15) for c in range(2, len(RIG))]
     check_each_is_one(*_found(records([a, b], unseen=early)))
+
+
+def test_a_view_whose_sides_the_detector_exchanged_stays_with_its_person():
+    from kinefit.sensors.channels import mirror_name
+
+    a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 60), 1)
+    b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)
+    keypoints, truth = records([a, b], outliers=0.1)
+    points = np.array(keypoints[1].points)
+    points[20:45] = points[20:45][:, :, [NAMES.index(mirror_name(n)) for n in NAMES]]
+    keypoints[1] = replace(keypoints[1], points=points)
+    found = people_of(RIG, keypoints)
+    check_each_is_one(found, truth)
 
 
 def test_a_passer_by_is_nobody():

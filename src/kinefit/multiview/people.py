@@ -245,6 +245,7 @@ class _Search:
                 continue
             both = np.concatenate([self.uv[q][frame, mine], self.exchanged[q][frame, mine]])
             as_is, turned = np.hsplit(distances(self.cameras[q], np.array(expected), both), 2)
+            turned[np.isinf(as_is)] = np.inf  # too little is seen to tell
             cost = np.minimum(as_is, turned)
             waited = np.array([abs(frame - t.last) for t in tracks])
             near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)

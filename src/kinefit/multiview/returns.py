@@ -170,7 +170,6 @@ def _looks(rig: Rig, keypoints: Sequence[Keypoints], span: Span, pictures: Pictu
 
 def _joined(a: Span, b: Span, back: Return) -> Span:
     """Both spans; what one camera alone saw of the one while the other was in view is left out."""
-    nodes, path = ({
-        **{f: v for f, v in one.items() if f > back.left}, **{f: v for f, v in other.items() if f < back.came}
-    } for one, other in ((b.nodes, a.nodes), (b.path, a.path)))  # fmt: skip
+    nodes = {f: v for f, v in b.nodes.items() if f > back.left} | {f: v for f, v in a.nodes.items() if f < back.came}
+    path = {f: x for f, x in b.path.items() if f > back.left} | {f: x for f, x in a.path.items() if f < back.came}
     return Span(nodes, path)
