@@ -88,8 +88,7 @@ def _speed() -> None:
             began = time.process_time()
             people = people_of(seen.rig, seen.keypoints)
             for k in range(len(people)):
-                one = follow(seen.rig, seen.keypoints, k + 1) if k == 0 else one  # noqa: F821
-                alone = _alone(seen, one, k)
+                alone = _alone(seen, follow(seen.rig, seen.keypoints, k + 1, people), k)  # found once, as by the command
                 track(alone, load_body("humanoid"), smooth=False)
             times.append(time.process_time() - began)
         spent[count] = min(times) / len(seen.keypoints[0])
