@@ -30,7 +30,7 @@ from kinefit.simulation.movements import people as persons
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
-FRAMES, SHOWN, TILE = 100, 34, (480, 400)
+FRAMES, SHOWN, TILE, _WIDE = 100, 34, (384, 320), 5
 GONE, BACK, EARLY, LATE = 33, 67, 20, 80  # frames in which those who leave are away, and two in which they are drawn
 COLOURS = ((60, 180, 255), (255, 150, 40), (90, 210, 90), (220, 90, 220), (60, 60, 235), (200, 200, 40))
 Pixels = tuple[NDArray, NDArray]  # (F, K, 2) [px] and (F, K) of one person in one camera
@@ -40,9 +40,9 @@ Case = tuple[Rig, list[list[Pixels]], int | str | None]  # rig, [camera][person]
 def main(out: Path) -> None:
     """Write the picture, and print what was said of each case."""
     tiles = [_tile(name, make) for name, make in CASES.items()]
-    while len(tiles) % 4:
+    while len(tiles) % _WIDE:
         tiles.append(np.full_like(tiles[0], 255))
-    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[k : k + 4]) for k in range(0, len(tiles), 4)]))
+    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[k : k + _WIDE]) for k in range(0, len(tiles), _WIDE)]))
 
 
 def _rig(away: float = 4.2) -> Rig:

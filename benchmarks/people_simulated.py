@@ -88,7 +88,8 @@ def _speed() -> None:
             began = time.process_time()
             people = people_of(seen.rig, seen.keypoints)
             for k in range(len(people)):
-                alone = _alone(seen, follow(seen.rig, seen.keypoints, k + 1, people), k)  # found once, as by the command
+                one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
+                alone = _alone(seen, one, k)
                 track(alone, load_body("humanoid"), smooth=False)
             times.append(time.process_time() - began)
         spent[count] = min(times) / len(seen.keypoints[0])

@@ -49,7 +49,7 @@ class Followed:
                 "place_m": [round(float(v), 2) for v in one.place],
                 "returns": [{
                     "left_s": round(r.left / self.rate, 2), "came_s": round(r.came / self.rate, 2),
-                    "odds": round(r.odds, 1),
+                    "odds": round(r.odds, 1), "by": list(r.by),
                 } for r in one.returns],
                 "maybe": [k + 1 for k in one.maybe],
             } for one in self.people],
@@ -123,9 +123,9 @@ def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
         for back in one.get("returns", ()):
             said.append(
                 f"person {k} leaves at {back['left_s']:.1f} s, and who comes at {back['came_s']:.1f} s is taken for "
-                f"the same, by size, clothes and way (odds {min(back['odds'], 1000):.0f} to 1)"
+                f"the same, by {', '.join(back['by'])} (odds {min(back['odds'], 1000):.0f} to 1)"
             )
         if one.get("maybe"):
             others = " or ".join(map(str, one["maybe"]))
-            said.append(f"person {k} may be person {others}, who left before: size, clothes and way leave it open")
+            said.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
     return said

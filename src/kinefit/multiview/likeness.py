@@ -73,6 +73,12 @@ def likeness(a: Looks, b: Looks) -> float:
     return size_likeness(a, b) + colour_likeness(a, b)
 
 
+def both_know(a: Looks, b: Looks) -> tuple[str, ...]:
+    """By what two can be compared: "size", "clothes"."""
+    size, clothes = (bool(np.isfinite(d).any()) for d in (a.bones - b.bones, a.colours - b.colours))
+    return ("size",) * size + ("clothes",) * clothes
+
+
 def size_likeness(a: Looks, b: Looks) -> float:
     """Of `likeness` what the lengths of bones say."""
     d = a.bones - b.bones

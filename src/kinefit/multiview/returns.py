@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.association import SPEED, STRIDE, Node
-from kinefit.multiview.likeness import Looks, Pictures, bones_of, colours_of, likeness
+from kinefit.multiview.likeness import Looks, Pictures, bones_of, both_know, colours_of, likeness
 from kinefit.multiview.medians import medians
 from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
@@ -57,11 +57,13 @@ class Return:
     ----------
     left, came : frames
     odds : to one, that it is the same person
+    by : what told
     """
 
     left: int
     came: int
     odds: float
+    by: tuple[str, ...] = ("way",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +131,7 @@ def chains_of(
         while chain.members[-1] in follows:
             last = chain.members[-1]
             following, sure = follows[last]
-            back = Return(ends[last][1], ends[following][0], sure)
+            back = Return(ends[last][1], ends[following][0], sure, (*both_know(looks[last], looks[following]), "way"))
             joined = _joined(chain.span, spans[following], back)
             chain = replace(chain, span=joined, members=(*chain.members, following), returns=(*chain.returns, back))
         out.append(chain)
