@@ -10,6 +10,7 @@ PARTS = {
     "people_turned": "a camera whose calibration is turned, on the real trial",
     "people_one_camera": "one person before one camera, against markers",
     "people_depth": "one person before real depth cameras",
+    "people_return": "people who leave and come back elsewhere, simulated and in four real videos",
     "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
 }
 

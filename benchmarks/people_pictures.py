@@ -21,6 +21,7 @@ from kinefit import load_body
 from kinefit.errors import KinefitError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
+from kinefit.multiview.followed import Followed, sentences
 from kinefit.multiview.people import people_of
 from kinefit.observations import Keypoints
 from kinefit.simulation import simulate_keypoints
@@ -29,7 +30,8 @@ from kinefit.simulation.movements import people as persons
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
-FRAMES, SHOWN, TILE = 60, 34, (480, 400)
+FRAMES, SHOWN, TILE, _WIDE = 100, 34, (384, 320), 5
+GONE, BACK, EARLY, LATE = 33, 67, 20, 80  # frames in which those who leave are away, and two in which they are drawn
 COLOURS = ((60, 180, 255), (255, 150, 40), (90, 210, 90), (220, 90, 220), (60, 60, 235), (200, 200, 40))
 Pixels = tuple[NDArray, NDArray]  # (F, K, 2) [px] and (F, K) of one person in one camera
 Case = tuple[Rig, list[list[Pixels]], int | str | None]  # rig, [camera][person], who is asked for
@@ -38,9 +40,9 @@ Case = tuple[Rig, list[list[Pixels]], int | str | None]  # rig, [camera][person]
 def main(out: Path) -> None:
     """Write the picture, and print what was said of each case."""
     tiles = [_tile(name, make) for name, make in CASES.items()]
-    while len(tiles) % 4:
+    while len(tiles) % _WIDE:
         tiles.append(np.full_like(tiles[0], 255))
-    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[k : k + 4]) for k in range(0, len(tiles), 4)]))
+    cv2.imwrite(str(out), np.vstack([np.hstack(tiles[k : k + _WIDE]) for k in range(0, len(tiles), _WIDE)]))
 
 
 def _rig(away: float = 4.2) -> Rig:
@@ -152,10 +154,25 @@ def _sitting() -> Case:
     return rig, _seen([one], rig), None
 
 
+def _returning(*sizes: float) -> Case:
+    """Two who leave for 1.1 s and come back each where the other was."""
+    body = load_body("humanoid")
+    motions, side = [], np.where(np.arange(FRAMES) < GONE, -0.45, 0.45)
+    for k, size in enumerate(sizes):
+        own = body.scaled([size] * len(body.scale_groups))
+        path = np.column_stack([side if k else -side, np.full(FRAMES, 0.1), np.full(FRAMES, 0.6)])
+        motions.append(_along(movement("wave", own, rate=RATE), path, FRAMES))
+    rig = _rig()
+    there = (np.arange(FRAMES) < GONE) | (np.arange(FRAMES) >= BACK)
+    seen = [[(uv, np.where(there[:, None], sure, 0.0)) for uv, sure in each] for each in _seen(motions, rig)]
+    return rig, seen, None
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "twins": _twins, "a mirror": _mirror, "a poster": lambda: _picture(False, 1.0),
     "a television": lambda: _picture(True, 0.45), "twelve, one chosen": _crowd, "cut by every edge": _cut,
     "person 3 of two": _third, "sitting all the time": _sitting,
+    "two come back exchanged": lambda: _returning(0.92, 1.06), "twins come back": lambda: _returning(1.0, 1.0),
 }  # fmt: skip
 
 
@@ -171,9 +188,12 @@ def _tile(name: str, make: Callable[[], Case]) -> NDArray:
     spent = time.process_time() - began
     camera, count = rig.cameras[1], max(len(people), 1)
     image = np.full((camera.size[1], camera.size[0], 3), 250, np.uint8)
-    for uv, sure in zip(records[1].points[SHOWN].reshape(-1, 2), records[1].confidence[SHOWN].ravel()):
-        if sure > 0 and np.isfinite(uv).all():
-            cv2.circle(image, uv.astype(int).tolist(), 6, (150, 150, 150), -1)
+    shown = (EARLY, LATE) if "come back" in name else (SHOWN,)
+    images = [image.copy() for _ in shown]
+    for own, frame in zip(images, shown):
+        for uv, sure in zip(records[1].points[frame].reshape(-1, 2), records[1].confidence[frame].ravel()):
+            if sure > 0 and np.isfinite(uv).all():
+                cv2.circle(own, uv.astype(int).tolist(), 6, (150, 150, 150), -1)
     said = f"{len(people)} in view"
     for k in range(count) if wanted is None else [int(wanted) - 1]:
         try:
@@ -182,10 +202,15 @@ def _tile(name: str, make: Callable[[], Case]) -> NDArray:
         except KinefitError as error:
             said = str(error.problem)
             continue
-        _draw(image, motion, camera, k)
+        for own, frame in zip(images, shown):
+            if len(shown) == 1 or people[k].views[frame]:
+                _draw(own, motion, camera, k, frame)
         print(f"# {name}: person {k + 1}: {_told(motion)}")
+    followed = Followed((), tuple(people), 1, RATE).as_told()
+    for sentence in sentences(followed, asked=True)[1:]:
+        print(f"# {name}: {sentence}")
     print(f"# {name}: {said}; who is who in {FRAMES} frames: {spent:.2f} s of CPU", flush=True)
-    return _titled(image, f"{name}: {said}")
+    return _titled(images, f"{name}: {said}")
 
 
 def _told(motion: Motion) -> str:
@@ -197,10 +222,10 @@ def _told(motion: Motion) -> str:
     return f"{tall:.2f} m tall, {speed:.2f} m/s, {known}"
 
 
-def _draw(image: NDArray, motion: Motion, camera: object, k: int) -> None:
+def _draw(image: NDArray, motion: Motion, camera: object, k: int, frame: int) -> None:
     """A skeleton; joints of which nothing is known are left out."""
-    joints = motion.segment_poses()[SHOWN, :, :3, 3]
-    uv, known = camera.project(joints), np.isfinite(motion.joint_std[SHOWN]).all(axis=-1)  # type: ignore[attr-defined]
+    joints = motion.segment_poses()[frame, :, :3, 3]
+    uv, known = camera.project(joints), np.isfinite(motion.joint_std[frame]).all(axis=-1)  # type: ignore[attr-defined]
     colour = COLOURS[k % len(COLOURS)]
     for s, p in enumerate(motion.body.tree.parents):
         if p >= 0 and known[s] and known[p] and np.isfinite(uv[[s, p]]).all():
@@ -209,8 +234,9 @@ def _draw(image: NDArray, motion: Motion, camera: object, k: int) -> None:
     cv2.putText(image, str(k + 1), (int(at[0]) + 15, int(at[1]) - 30), 0, 2.2, colour, 6, cv2.LINE_AA)
 
 
-def _titled(image: NDArray, text: str) -> NDArray:
-    image = image[260:800, 280:1000]
+def _titled(images: list[NDArray], text: str) -> NDArray:
+    wide = 720 // len(images) // 2
+    image = np.hstack([one[260:800, 640 - wide : 640 + wide] for one in images])
     scale = min(TILE[0] / image.shape[1], (TILE[1] - 30) / image.shape[0])
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     out = np.full((TILE[1], TILE[0], 3), 255, np.uint8)

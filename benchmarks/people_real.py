@@ -30,6 +30,7 @@ _GOALS = {
 }  # fmt: skip
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 _FAR = 30.0  # px, pictures are not moved further: what matches beyond is no match
+_LAGS, _MOVING = 2, 25.0  # frames looked at before and after; grey values by which a pixel changes where he moves
 ACCURACY = 8.0  # px, as `kinefit track` takes it for the built-in detector
 
 
@@ -51,7 +52,8 @@ def run() -> None:
         _both(two, one, Path(folder))
 
 
-def _take(videos: Path, calibration: Path, folder: Path, image: str = "") -> Path:
+def take_of(videos: Path, calibration: Path, folder: Path, image: str = "") -> Path:
+    """A take file of four videos, in a new folder."""
     folder.mkdir()
     text = f'[take]\nrate = 60.0\n[calibration]\nfile = "{calibration}"\n'
     text += "".join(f'[[camera]]\nname = "{c}"\nvideo = "{videos / c}.mp4"\n{image}' for c in CAMERAS)
@@ -61,8 +63,8 @@ def _take(videos: Path, calibration: Path, folder: Path, image: str = "") -> Pat
 
 def _both(two: Path, one: Path, folder: Path) -> None:
     calibration = two / "Calib.qca.txt"
-    together = prepared(read_take(_take(two, calibration, folder / "two")))
-    by_himself = prepared(read_take(_take(one / "videos", calibration, folder / "one", 'image = "letterboxed"\n')))
+    together = prepared(read_take(take_of(two, calibration, folder / "two")))
+    by_himself = prepared(read_take(take_of(one / "videos", calibration, folder / "one", 'image = "letterboxed"\n')))
     view = people_in_view(together)
     assert view is not None
     people = view.people
@@ -74,7 +76,10 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     man = int(np.argmax([p.speed for p in people]))
     seen, alone = load_observations(together), load_observations(by_himself)
     shift = {c: _shift(seen, alone, c) for c in CAMERAS}
-    print(f"# the pictures were moved by {', '.join(f'{c} {v.round(1).tolist()}' for c, v in shift.items())} px")
+    lags = {c: _lag(seen, alone, c, shift[c]) for c in CAMERAS}
+    print(f"# the pictures were moved by {', '.join(f'{c} {v.round(1).tolist()}' for c, v in shift.items())} px, "
+          f"and come {', '.join(f'{c} {v}' for c, v in lags.items())} frames later")  # fmt: skip
+    lag = round(float(np.median(list(lags.values()))))
     assert seen.rig is not None and alone.rig is not None
     moved = []
     for k in seen.keypoints:  # as if her pictures were his, but for a constant shift
@@ -83,7 +88,9 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     with_her = track(Recording.of_keypoints(seen.rig, moved, accuracy=ACCURACY, person=man + 1), load_body("humanoid"))
     without = track(Recording.of_keypoints(alone.rig, alone.keypoints, accuracy=ACCURACY), load_body("humanoid"))
     for name, motion in (("as they are", motions[man]), ("moved back", with_her)):
-        gap = 1e3 * np.linalg.norm((motion.segment_poses() - without.segment_poses())[..., :3, 3], axis=-1)
+        a, b = motion.segment_poses()[max(lag, 0) :, :, :3, 3], without.segment_poses()[max(-lag, 0) :, :, :3, 3]
+        count = min(len(a), len(b))
+        gap = 1e3 * np.linalg.norm(a[:count] - b[:count], axis=-1)
         print(f"# the man's joints with her in view, pictures {name}: median {np.median(gap):.1f}, 95th "
               f"{np.percentile(gap, 95):.1f} mm")  # fmt: skip
     _figure("people_man_median", float(np.median(gap)))
@@ -104,6 +111,21 @@ def _shift(seen: Observations, alone: Observations, camera: str) -> NDArray:
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, True).match(*features)
     moved = np.array([np.subtract(points[0][m.queryIdx].pt, points[1][m.trainIdx].pt) for m in pairs])
     return np.median(moved[np.linalg.norm(moved, axis=1) < _FAR], axis=0)
+
+
+def _lag(seen: Observations, alone: Observations, camera: str, shift: NDArray) -> int:
+    """How many frames later one recording shows what the other does: by the pixels that move in the other."""
+    with Video(seen.videos[camera]) as first, Video(alone.videos[camera]) as second:
+        off = dict.fromkeys(range(-_LAGS, _LAGS + 1), 0.0)
+        for f in range(2 * _LAGS, min(len(first), len(second)) - 2 * _LAGS, 6):
+            u, v = np.round(shift).astype(int)
+            with_her = np.roll(first.read(f).astype(float).mean(axis=2), (-v, -u), axis=(0, 1))
+            near = {lag: second.read(f - lag).astype(float).mean(axis=2) for lag in off}
+            h, w = np.minimum(with_her.shape, near[0].shape)
+            moving = np.abs(near[_LAGS] - near[-_LAGS])[:h, :w] > _MOVING
+            for lag, picture in near.items():  # the median: where she stands nothing fits
+                off[lag] += float(np.median(np.abs(with_her[:h, :w] - picture[:h, :w])[moving]))
+    return min(off, key=lambda lag: off[lag])
 
 
 def _figure(name: str, value: float) -> None:

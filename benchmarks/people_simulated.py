@@ -88,7 +88,7 @@ def _speed() -> None:
             began = time.process_time()
             people = people_of(seen.rig, seen.keypoints)
             for k in range(len(people)):
-                one = follow(seen.rig, seen.keypoints, k + 1) if k == 0 else one  # noqa: F821
+                one = follow(seen.rig, seen.keypoints, k + 1, people)  # who is who is found once, as by the command
                 alone = _alone(seen, one, k)
                 track(alone, load_body("humanoid"), smooth=False)
             times.append(time.process_time() - began)

@@ -75,6 +75,16 @@ def test_two_regions_that_meet_on_one_person_become_one(draw, models):
     assert found.seen[:10].all() and (found.seen[-5:].sum(axis=1) == 1).all()
 
 
+def test_others_are_painted_over_in_the_region_of_one(draw, models):
+    """The networks would draw the limbs of one towards another: a person's region shows nobody else."""
+    image = draw((100, 120, 25), (154, 120, 25))
+    seen, pose = [], models.pose
+    models.pose = lambda crop: seen.append((crop.min(axis=2) > 200).mean()) or pose(crop)
+    found = detect([image] * 8, models)
+    assert found.seen[-4:].all() and found.points.shape[1] == 2
+    assert np.allclose(seen[-2:], np.pi / 3.0**2, rtol=0.06)  # a disc in a square of three radii
+
+
 def test_the_same_person_is_not_found_twice(draw, models):
     models.only_one = False
     image = draw((100, 120, 40))

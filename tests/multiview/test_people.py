@@ -1,5 +1,7 @@
 """All people: each keeps their own detections in every camera, whoever comes, goes, crosses or hides another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import posture, rig_around
@@ -120,6 +122,41 @@ def test_who_is_seen_by_too_few_at_first_has_their_beginning_too():
     b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)
     early = [(1, c, 0, 15) for c in range(2, len(RIG))]
     check_each_is_one(*_found(records([a, b], unseen=early)))
+
+
+def test_a_view_whose_sides_the_detector_exchanged_stays_with_its_person():
+    from kinefit.sensors.channels import mirror_name
+
+    a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 60), 1)
+    b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)
+    keypoints, truth = records([a, b], outliers=0.1)
+    points = np.array(keypoints[1].points)
+    points[20:45] = points[20:45][:, :, [NAMES.index(mirror_name(n)) for n in NAMES]]
+    keypoints[1] = replace(keypoints[1], points=points)
+    found = people_of(RIG, keypoints)
+    check_each_is_one(found, truth)
+
+
+def test_twelve_are_found_and_each_is_one():
+    places = [(1.0 * (k % 4 - 1.5), 0.0, 1.0 * (k // 4 - 1.0)) for k in range(12)]
+    told = records([along(line(p, p, 25), k) for k, p in enumerate(places)], outliers=0.1)
+    check_each_is_one(*_found(told), least=0.95)
+
+
+def test_of_whom_every_picture_shows_the_upper_half_is_found():
+    a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 40), 1)
+    keypoints, truth = records([a, along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 40), 2)])
+    low = np.array([any(part in name for part in ("Knee", "Ankle", "Toe", "Heel")) for name in NAMES])
+    cut = [replace(k, points=np.where(low[:, None], np.nan, k.points), confidence=np.where(low, 0.0, k.confidence))
+           for k in keypoints]  # fmt: skip
+    check_each_is_one(people_of(RIG, cut), truth)
+
+
+def test_a_poster_that_one_camera_sees_is_nobody():
+    a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 40), 1)
+    poster = np.repeat(along(line((1.0, 0.0, 0.6), (1.0, 0.0, 0.6), 1), 2), 40, axis=0)
+    found, truth = _found(records([a, poster], unseen=[(1, c, 0, 40) for c in range(1, len(RIG))]))
+    assert len(found) == 1 and np.all(owners(found, truth)[0] == 0)
 
 
 def test_a_passer_by_is_nobody():

@@ -142,13 +142,15 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     from kinefit.errors import TrackingError
     from kinefit.multiview.association import choose_people
     from kinefit.multiview.followed import follow
+    from kinefit.readers.take.pictures import TakePictures
     from kinefit.sensors.channels import make_channels
     from kinefit.sensors.triangulation import triangulated
 
     if seen.rig is None or not seen.keypoints:
         return None
     try:
-        keypoints = follow(seen.rig, seen.keypoints, take.person).keypoints
+        with TakePictures(take, seen) as pictures:
+            keypoints = follow(seen.rig, seen.keypoints, take.person, pictures=pictures).keypoints
         people = choose_people(seen.rig, keypoints)
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")

@@ -7,7 +7,7 @@ is followed by the region that the last landmarks tell.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -27,6 +27,7 @@ _RATHER = 0.5  # probability from which on a pixel is the person's
 _MOST = 0.5  # share of a mask
 _HARDLY, _RIM, _GREY = 0.3, 7, 128  # probability and rim [px of the crop] of what is painted over, and the paint
 _SAME_PERSON = 0.05  # two who are followed are one where their heads, or all of them, differ by less (in sides)
+_BESIDE = 0.3  # middles of the hips of two people are further apart (in sides); of one who is followed twice, nearer
 _NEAR = 0.3  # somebody comes back where the head is no further from where it was (in sides)
 _FEW, _BRIEF = 3, 0.2  # [frames], [s]: who is seen for less in all is a deception of the networks
 _SMALLEST, _LARGEST = 16, 8  # [px], [sides of the picture]: regions beyond show nothing that could be recognised
@@ -97,7 +98,7 @@ class Follower:
         """Those who are still there; two that have become one are the one that moved less."""
         seen: list[tuple[_Track, Sighting, float]] = []
         for track in self._tracks:
-            found = self._look_at(image, track)
+            found = self._look_at(image, track, others=[t.shape for t in self._tracks if t is not track and t.shape])
             if found is None:
                 self._lost.append(track)
                 continue
@@ -153,13 +154,17 @@ class Follower:
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE
-    ) -> tuple[_Track, Sighting] | None:
-        """Landmarks of a person in the region where they are expected; None where there is nobody."""
+        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE,
+        others: Sequence[tuple[Roi, NDArray]] = (),
+    ) -> tuple[_Track, Sighting] | None:  # fmt: skip
+        """Landmarks of a person in the region where they are expected; None where there is nobody.
+
+        Others in the region, where they were last, are painted over: the network draws a person's limbs towards them.
+        """
         roi = track.steady.roi
         if not _SMALLEST < roi.side < _LARGEST * max(image.shape[:2]):
             return None
-        pose = self.models.pose(roi.crop(image, SIZE))
+        pose = self.models.pose(_alone(roi.crop(image, SIZE), roi, track.shape, others))
         if pose.score < score:
             return None
         points = roi.to_image(pose.points, SIZE)
@@ -168,6 +173,32 @@ class Follower:
         runs = mask_runs(pose, roi, image.shape[:2]) if self.masks else np.zeros(0, np.uint32)
         sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted))
         return replace(track, steady=steady, points=points, last=self._frame, shape=(roi, pose.mask)), sighting
+
+
+def _alone(
+    crop: NDArray[np.uint8], roi: Roi, own: tuple[Roi, NDArray] | None, others: Sequence[tuple[Roi, NDArray]]
+) -> NDArray[np.uint8]:
+    """A region with other people in it painted over, but for pixels that were the person's own.
+
+    Those at the very same place are not: they may be the same person, followed twice.
+    """
+    beside = [
+        shape for shape in others
+        if np.linalg.norm(shape[0].centre - roi.centre) > _BESIDE * min(shape[0].side, roi.side)
+    ]  # fmt: skip
+    theirs = [cv2.dilate(_moved(shape, roi, _RATHER), np.ones((_RIM, _RIM), np.uint8)) for shape in beside]
+    theirs = [mask for mask in theirs if mask.any()]
+    if theirs:
+        mine = _moved(own, roi, _RATHER) if own else np.zeros(crop.shape[:2], np.uint8)
+        crop[(np.maximum.reduce(theirs) > 0) & (mine == 0)] = _GREY
+    return crop
+
+
+def _moved(shape: tuple[Roi, NDArray], roi: Roi, least: float) -> NDArray[np.uint8]:
+    """Pixels of a region (SIZE, SIZE), 0 or 1, that a mask of another region holds for likely."""
+    A_roi_image = cv2.invertAffineTransform(roi.A_image_crop(SIZE))
+    A = A_roi_image @ np.vstack([shape[0].A_image_crop(SIZE), [0, 0, 1]])
+    return (cv2.warpAffine(shape[1], A, (SIZE, SIZE)) > least).astype(np.uint8)
 
 
 def _clearness(seen: Sighting, image: NDArray) -> float:
@@ -184,9 +215,7 @@ def _is_part(new: _Track, known: _Track) -> bool:
     """Whether most of what looks like another person is somebody who is known."""
     assert new.shape and known.shape
     (roi, mask), (other_roi, other) = new.shape, known.shape
-    A_known_image = cv2.invertAffineTransform(other_roi.A_image_crop(SIZE))
-    A_known_new = A_known_image @ np.vstack([roi.A_image_crop(SIZE), [0, 0, 1]])
-    moved = cv2.warpAffine(mask, A_known_new, (SIZE, SIZE)) > _RATHER
+    moved = _moved((roi, mask), other_roi, _RATHER) > 0
     area = float((mask > _RATHER).sum()) * (roi.side / other_roi.side) ** 2
     return bool((moved & (other > _RATHER)).sum() > _MOST * area) or _is_same(new, known)
 

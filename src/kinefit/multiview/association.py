@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +77,8 @@ def _of_one_detector(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         for f in range(frames):
             ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(surety) for p in np.flatnonzero(s[f] > 0)]
             people = [(q, p) for _, q, p in sorted(ranked, reverse=True)]
-            groups.append(groups_of(people, meetings, surety, f, everybody))
+            links = {pair: centre[f] for pair, centre in meetings.items() if np.isfinite(centre[f, 0])}
+            groups.append(groups_of(people, links, surety, f, everybody))
         for f, group in enumerate(_one_person(groups, keypoints[0].rate)):
             for q, p in group:
                 chosen[q][f] = p
@@ -114,24 +115,46 @@ def meetings_of(
                     both = np.flatnonzero((surety[i][:, pa] > 0) & (surety[j][:, pb] > 0))
                     centre = np.full((frames, 3), np.nan)
                     if both.size:
-                        centre[both] = _meet(pair, a, pa, b, pb, both)
+                        at = both[:, None], some_points(len(a.names))
+                        uv = (np.where((k.confidence[:, p][at] > 0.1)[..., None], k.points[:, p][at], np.nan)
+                              for k, p in ((a, pa), (b, pb)))  # fmt: skip
+                        centre[both] = _meet(pair, *uv)
                     out[(i, pa), (j, pb)] = centre
     return out
 
 
-def _meet(pair: Rig, a: Keypoints, pa: int, b: Keypoints, pb: int, frames: NDArray) -> NDArray:
-    """(F, 3) median point in space where two detections agree in some frames, NaN where they do not."""
-    some = some_points(len(a.names))
-    at = frames[:, None], some
-    uv = np.stack([k.points[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2)
-    sure = np.stack([k.confidence[:, p][at] for k, p in ((a, pa), (b, pb))], axis=2) > 0.1
-    uv = np.where((np.isfinite(uv).all(axis=-1) & sure).all(axis=2)[..., None, None], uv, np.nan)
+def links_of(
+    pairs: Mapping[tuple[int, int], Rig], uv: Sequence[NDArray], nodes: Sequence[Node]
+) -> dict[tuple[Node, Node], NDArray]:
+    """Centre (3,) [m] in space of every two detections of one frame that are of one person.
+
+    Parameters
+    ----------
+    pairs : {records of two cameras: their rig}
+    uv : (P, k, 2) [px] of each record some points of everybody in this frame, NaN where they are not seen
+    nodes : detections to look at
+    """
+    out = {}
+    for (i, j), pair in pairs.items():
+        a, b = ([p for q, p in nodes if q == record] for record in (i, j))
+        if a and b:
+            pa, pb = (k.ravel() for k in np.meshgrid(a, b, indexing="ij"))
+            for m, n, centre in zip(pa, pb, _meet(pair, uv[i][pa], uv[j][pb])):
+                if np.isfinite(centre[0]):
+                    out[(i, int(m)), (j, int(n))] = centre
+    return out
+
+
+def _meet(pair: Rig, a: NDArray, b: NDArray) -> NDArray:
+    """(N, 3) [m] median point where detections (N, k, 2) [px] of two cameras agree, NaN where they do not."""
+    uv = np.stack([a, b], axis=2)
+    uv = np.where(np.isfinite(uv).all(axis=(2, 3))[..., None, None], uv, np.nan)
     x = triangulate(pair, uv.reshape(-1, 2, 2)).reshape(*uv.shape[:2], 3)
     error = np.stack([np.linalg.norm(c.project(x) - uv[:, :, k], axis=-1) for k, c in enumerate(pair)], axis=-1)
     with warnings.catch_warnings():  # frames without a common point are NaN, and meant to be
         warnings.simplefilter("ignore", RuntimeWarning)
         size = np.mean(np.nanmax(uv[..., 1], axis=1) - np.nanmin(uv[..., 1], axis=1), axis=1)
-        agree = medians(error.reshape(len(frames), -1)) < _AGREE * size
+        agree = medians(error.reshape(len(uv), -1)) < _AGREE * size
     agree &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _ENOUGH
     return np.where(agree[:, None], medians(np.moveaxis(x, 1, -1)), np.nan)
 
@@ -146,14 +169,12 @@ class Group:
 
 
 def groups_of(
-    people: list[Node], meetings: dict[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int, full: float
-) -> list[Group]:
-    """Largest sets of people of different records that all meet; single ones where nobody meets."""
-    links = {
-        pair: centre[frame]
-        for pair, centre in meetings.items()
-        if np.isfinite(centre[frame, 0]) and pair[0] in people and pair[1] in people
-    }
+    people: list[Node], meetings: Mapping[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int,
+    full: float,
+) -> list[Group]:  # fmt: skip
+    """Largest sets of people of different records that all meet in a frame; single ones where nobody meets."""
+    there = set(people)
+    links = {pair: centre for pair, centre in meetings.items() if pair[0] in there and pair[1] in there}
     found: dict[frozenset[Node], Group] = {}
     for pair in links:
         group = list(pair)

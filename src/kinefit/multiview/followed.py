@@ -10,6 +10,7 @@ import numpy as np
 
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
+from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.one_camera import lifted_alone, people_before
 from kinefit.multiview.people import Person, may_be_several, people_of
 from kinefit.observations import Keypoints
@@ -28,11 +29,13 @@ class Followed:
     keypoints : records; of this person alone where there are others
     people : everybody in view, the one of whom most is seen first; empty where nobody but one was ever detected
     number : of the person, from 1
+    rate : float [Hz] of the records
     """
 
     keypoints: tuple[Keypoints, ...]
     people: tuple[Person, ...] = ()
     number: int = 1
+    rate: float = 1.0
 
     def as_told(self) -> dict[str, Any]:
         """For `Motion.provenance`: nothing where there is one person."""
@@ -44,13 +47,19 @@ class Followed:
                 "frames": int(np.sum(one.views > 0)), "views": round(float(one.views.mean()), 2),
                 "speed_m_s": round(one.speed, 3), "height_px": round(one.size, 1),
                 "place_m": [round(float(v), 2) for v in one.place],
+                "returns": [{
+                    "left_s": round(r.left / self.rate, 2), "came_s": round(r.came / self.rate, 2),
+                    "odds": round(r.odds, 1), "by": list(r.by),
+                } for r in one.returns],
+                "maybe": [k + 1 for k in one.maybe],
             } for one in self.people],
         }}  # fmt: skip
 
 
 def follow(
-    rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None, people: Sequence[Person] | None = None
-) -> Followed:
+    rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None, people: Sequence[Person] | None = None,
+    pictures: Pictures | None = None,
+) -> Followed:  # fmt: skip
     """The keypoints of one of the people in view.
 
     Parameters
@@ -59,6 +68,7 @@ def follow(
     keypoints : records of the same number of frames and the same rate, each of one or several people.
     person : "first" (default), "moving", "largest", "nearest X Y Z" [m], or a number from 1
     people : everybody in view, where `follow` has found them in these keypoints before
+    pictures : of the cameras, by whose colours those who come back are known again
 
     Raises
     ------
@@ -71,14 +81,14 @@ def follow(
     if people is None:
         lifted = lifted_alone(keypoints)
         people = () if not may_be_several(keypoints) else (
-            people_of(rig, keypoints) if lifted is None else people_before(rig, keypoints, lifted)
+            people_of(rig, keypoints, pictures) if lifted is None else people_before(rig, keypoints, lifted)
         )
     people = tuple(people)
     number = choose(people, person)
     if len(people) < 2:
         return Followed(tuple(keypoints), people)
-    one = people[number]
-    return Followed(tuple(k.of_one(chosen) for k, chosen in zip(keypoints, one.chosen)), people, number + 1)
+    own = tuple(k.of_one(chosen) for k, chosen in zip(keypoints, people[number].chosen))
+    return Followed(own, people, number + 1, keypoints[0].rate)
 
 
 def choose(people: Sequence[Person], person: int | str | None) -> int:
@@ -108,4 +118,14 @@ def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
         f"{one['height_px']:.0f} px tall" for k, one in enumerate(told["each"], start=1)
     )  # fmt: skip
     why = "" if asked else ", of whom most is seen"
-    return [f"{told['in view']} people are in view, person {told['followed']} is followed{why} ({listed})"]
+    said = [f"{told['in view']} people are in view, person {told['followed']} is followed{why} ({listed})"]
+    for k, one in enumerate(told["each"], start=1):
+        for back in one.get("returns", ()):
+            said.append(
+                f"person {k} leaves at {back['left_s']:.1f} s, and who comes at {back['came_s']:.1f} s is taken for "
+                f"the same, by {', '.join(back['by'])} (odds {min(back['odds'], 1000):.0f} to 1)"
+            )
+        if one.get("maybe"):
+            others = " or ".join(map(str, one["maybe"]))
+            said.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
+    return said

@@ -2,23 +2,27 @@
 
 Each person's points in space are carried to the next frame; in every camera people and detections are then paired at
 the least total cost, and views that do not fit the others are let go. Who is seen by enough cameras and is nobody yet
-is a new person, or one who was lost within reach. Whom cameras saw before enough of them did is added backwards.
+is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them did is added
+backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, meetings_of, some_points, surety_of
+from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, links_of, some_points, surety_of
 from kinefit.multiview.boxes import same_people
+from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
+from kinefit.multiview.returns import BRIEF, Chain, Return, Span, chains_of
 from kinefit.observations import Keypoints
+from kinefit.sensors.channels import mirror_name
 from kinefit.solvers.assignment import assign
 
 _NEAR = 0.25  # a person's points and a detection differ by less, as a share of the detection's height, and by ...
@@ -41,6 +45,8 @@ class Person:
     speed : float [m/s] of the body's points, the mean over time of their median
     size : float [px] mean height in the pictures
     place : (3,) [m] median place of the body's middle
+    returns : when the person was away, and how sure it is that it is the same
+    maybe : numbers, in a list of people from 0, of others who left before this one came and may be the same
     """
 
     chosen: tuple[NDArray, ...]
@@ -49,6 +55,8 @@ class Person:
     speed: float
     size: float
     place: NDArray
+    returns: tuple[Return, ...] = ()
+    maybe: tuple[int, ...] = ()
 
 
 def views_needed(cameras: int) -> int:
@@ -73,13 +81,14 @@ def lasting(rate: float, frames: int) -> float:
     return min(_LASTING * rate, 0.5 * frames)
 
 
-def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
+def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | None = None) -> list[Person]:
     """Everybody whom enough cameras see for a second, the one of whom most is seen first.
 
     Parameters
     ----------
     rig : Rig
     keypoints : records of the same number of frames and the same rate, each of one or several people.
+    pictures : of the cameras, by whose colours those who come back are known again; by their size alone without
     """
     if not keypoints:
         return []
@@ -92,24 +101,30 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Person]:
     for f in reversed(range(search.frames)):
         search.backward(f)
     needed, long = search.needed, lasting(keypoints[0].rate, search.frames)
-    people = []
-    for track in search.tracks:
+    spans = [Span(t.nodes, t.path) for t in search.tracks]
+    people: list[tuple[Person, Chain]] = []
+    for chain in chains_of(rig, search.keypoints, spans, needed, pictures):
         views = np.zeros(search.frames, int)
         chosen = [np.full(search.frames, -1) for _ in keypoints]
-        for f, nodes in track.nodes.items():
+        for f, nodes in chain.span.nodes.items():
             views[f] = len(nodes)
             for q, p in nodes:
                 chosen[main[q]][f] = p
         if np.sum(views >= needed) >= long:
-            people.append(search.person(track, chosen, views, main))
-    people.sort(key=lambda one: -one.surety)
+            people.append((search.person(chain, chosen, views), chain))
+    people.sort(key=lambda one: -one[0].surety)
+    number = {k: i for i, (_, chain) in enumerate(people) for k in chain.members}
+    found = []
+    for i, (one, chain) in enumerate(people):
+        maybe = {number[k] for k in chain.maybe if k in number} - {i}
+        found.append(replace(one, maybe=tuple(sorted(maybe))))
     for q in set(range(len(keypoints))) - set(main):
         own = next((r for r in main if keypoints[r].camera == keypoints[q].camera), None)
         if own is not None:
-            there = same_people([one.chosen[own] for one in people], keypoints[own], keypoints[q])
-            for one, places in zip(people, there):
+            there = same_people([one.chosen[own] for one in found], keypoints[own], keypoints[q])
+            for one, places in zip(found, there):
                 one.chosen[q][:] = places
-    return people
+    return found
 
 
 @dataclass(eq=False)
@@ -152,15 +167,18 @@ class _Search:
         self.frames = min(len(k) for k in keypoints)
         self.rate = keypoints[0].rate
         self.surety = [surety_of(k, self.frames) for k in keypoints]
-        self.meetings = meetings_of(rig, keypoints, self.surety, self.frames)
         self.cameras = [rig[k.camera] for k in keypoints]
         self.tracks: list[_Track] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
-        some = some_points(len(keypoints[0].names))
-        self.uv = []
-        for k in keypoints:
-            uv = k.points[: self.frames, :, some]
-            self.uv.append(np.where((k.confidence[: self.frames, :, some] > 0.1)[..., None], uv, np.nan))
+        names = keypoints[0].names
+        some = some_points(len(names))
+        mirrored = [names.index(m) if (m := mirror_name(names[k])) in names else k for k in some]
+        self.uv, self.exchanged = ([_seen(k, columns) for k in keypoints] for columns in (some, mirrored))
+        self.pairs = {
+            (i, j): rig.select((a.camera, b.camera))
+            for i, a in enumerate(keypoints) for j, b in enumerate(keypoints[i + 1 :], start=i + 1)
+            if a.camera != b.camera
+        }  # fmt: skip
 
     def free(self, frame: int) -> list[Node]:
         """Detections of a frame that nobody has, the surest first."""
@@ -170,9 +188,10 @@ class _Search:
 
     def forward(self, frame: int) -> None:
         """Who goes on, who comes back and who is new in a frame."""
-        self._go_on(frame, self.tracks)
+        near = [t for t in self.tracks if frame - t.last <= BRIEF * self.rate]
+        self._go_on(frame, near)
         came = self._newcomers(frame)
-        away = [t for t in self.tracks if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
+        away = [t for t in near if len(t.nodes.get(frame, ())) < 2]  # one view is as good as none
         cost = np.array([[_apart(t.x, x) for _, x in came] for t in away]).reshape(len(away), len(came))
         reach = np.array([STRIDE + SPEED * (frame - t.last) / self.rate for t in away])
         cost[cost > reach[:, None]] = np.inf
@@ -192,14 +211,16 @@ class _Search:
         Two people of like height fit each other in two views: the most views go first, then those that fit best.
         """
         free = self.free(frame)
-        if len(free) < self.needed:
+        if len({self.keypoints[q].camera for q, _ in free}) < self.needed:
             return []
         full = len(self.keypoints) * len(self.keypoints[0].names)
         ranked: list[tuple[int, float, int, list[Node], NDArray]] = []
-        for group in groups_of(free, self.meetings, self.surety, frame, full):
+        links = links_of(self.pairs, [uv[frame] for uv in self.uv], free)
+        for group in groups_of(free, links, self.surety, frame, full):
             nodes, x = self._agreeing(frame, list(group.nodes), None)
             if x is not None and len(nodes) >= self.needed and not self._is_there(frame, x):
-                ranked.append((-len(nodes), float(max(self._off(x, frame, n) for n in nodes)), len(ranked), nodes, x))
+                worst = max(self._off(x, n, self.uv[n[0]][frame, n[1]]) for n in nodes)
+                ranked.append((-len(nodes), worst, len(ranked), nodes, x))
         came: list[tuple[list[Node], NDArray]] = []
         for *_, nodes, x in sorted(ranked, key=lambda r: r[:3]):
             if not any(node in taken for taken, _ in came for node in nodes):
@@ -216,39 +237,50 @@ class _Search:
 
     def _go_on(self, frame: int, tracks: Sequence[_Track]) -> None:
         """Pair people with detections, camera by camera."""
-        free, views = self.free(frame), [list[Node]() for _ in tracks]
+        free, views, sides = self.free(frame), [list[Node]() for _ in tracks], set[Node]()
         expected = [t.expected(frame) for t in tracks]
         for q in range(len(self.cameras)):
             mine = [p for r, p in free if r == q]
             if not mine or not tracks:
                 continue
-            cost = distances(self.cameras[q], np.array(expected), self.uv[q][frame, mine])
+            both = np.concatenate([self.uv[q][frame, mine], self.exchanged[q][frame, mine]])
+            as_is, turned = np.hsplit(distances(self.cameras[q], np.array(expected), both), 2)
+            turned[np.isinf(as_is)] = np.inf  # too little is seen to tell
+            cost = np.minimum(as_is, turned)
             waited = np.array([abs(frame - t.last) for t in tracks])
             near = np.minimum(_NEAR + SPEED / _TALL * waited / self.rate, 0.5)
             cost[cost > near[:, None]] = np.inf
             for t, p in assign(cost, 0.6):
                 views[t].append((q, mine[p]))
+                if turned[t, p] < as_is[t, p]:
+                    sides.add((q, mine[p]))
         for track, x, nodes in zip(tracks, expected, views, strict=True):
             if nodes:
-                kept, found = self._agreeing(frame, nodes, x)
+                kept, found = self._agreeing(frame, nodes, x, sides)
                 track.seen(frame, kept, found, SPEED / self.rate)
 
-    def _off(self, x: NDArray, frame: int, node: Node) -> float:
-        """How far a detection is from points (k, 3), as a share of its height."""
-        return float(distances(self.cameras[node[0]], x[None], self.uv[node[0]][frame, node[1]][None])[0, 0])
+    def _off(self, x: NDArray, node: Node, uv: NDArray) -> float:
+        """How far a detection's points (k, 2) [px] are from points (k, 3), as a share of its height."""
+        return float(distances(self.cameras[node[0]], x[None], uv[None])[0, 0])
 
-    def _agreeing(self, frame: int, nodes: list[Node], expected: NDArray | None) -> tuple[list[Node], NDArray | None]:
-        """The views that are of one person, and its points (k, 3) [m]; None where a single one is left."""
+    def _agreeing(
+        self, frame: int, nodes: list[Node], expected: NDArray | None, sides: Collection[Node] = ()
+    ) -> tuple[list[Node], NDArray | None]:
+        """The views that are of one person, and its points (k, 3) [m]; None where a single one is left.
+
+        Of those in `sides` left is taken for right: the detector did so, which the fit of the person sets right.
+        """
         while len(nodes) > 1:
-            uv = np.stack([self.uv[q][frame, p] for q, p in nodes], axis=1)
+            each = [(self.exchanged if node in sides else self.uv)[node[0]][frame, node[1]] for node in nodes]
+            uv = np.stack(each, axis=1)
             height = float(medians(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
             x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
-            off = np.array([self._off(x, frame, node) for node in nodes])
+            off = np.array([self._off(x, node, own) for node, own in zip(nodes, each)])
             if off.max() <= _FITS:
                 return nodes, x
             if len(nodes) == 2 and expected is not None:
-                off = np.array([self._off(expected, frame, node) for node in nodes])
+                off = np.array([self._off(expected, node, own) for node, own in zip(nodes, each)])
             nodes = [node for i, node in enumerate(nodes) if i != int(off.argmax())]
         return nodes, None
 
@@ -256,17 +288,24 @@ class _Search:
         """Whether somebody stands at these very points: a second detection of one person is no other."""
         return any(_apart(t.x, x) < _SAME for t in self.tracks if frame in t.nodes)
 
-    def person(self, track: _Track, chosen: list[NDArray], views: NDArray, main: Sequence[int]) -> Person:
+    def person(self, chain: Chain, chosen: list[NDArray], views: NDArray) -> Person:
         """What is told of a person."""
         step = max(round(STEP * self.rate), 1)
-        moved = [track.path[f + step] - x for f, x in track.path.items() if f + step in track.path]
+        nodes, path = chain.span.nodes, chain.span.path
+        moved = [path[f + step] - x for f, x in path.items() if f + step in path]
         sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
-            self.uv[q][f, p, :, 1] for f, nodes in track.nodes.items() for q, p in nodes
+            self.uv[q][f, p, :, 1] for f, each in nodes.items() for q, p in each
         )]  # fmt: skip
-        sure = sum(float(self.surety[q][f, p]) for f, nodes in track.nodes.items() for q, p in nodes)
-        place = medians(medians(np.moveaxis(np.array(list(track.path.values())), 1, 2)).T)
+        sure = sum(float(self.surety[q][f, p]) for f, each in nodes.items() for q, p in each)
+        place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
-        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place)
+        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place, chain.returns)
+
+
+def _seen(record: Keypoints, columns: Sequence[int] | NDArray) -> NDArray:
+    """(F, P, k, 2) [px] some points of a record; NaN where they are not seen."""
+    sure = record.confidence[:, :, columns] > 0.1
+    return np.where(sure[..., None], record.points[:, :, columns], np.nan)
 
 
 def _apart(a: NDArray, b: NDArray) -> float:

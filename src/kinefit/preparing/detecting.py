@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
 
-_METHOD = "2"  # raise it when the detector gives other numbers for the same video
+_METHOD = "3"  # raise it when the detector gives other numbers for the same video
 Step = Callable[[str, int, int], None]
 """Called with what is done, how much of it is done, and how much there is (0: unknown)."""
 

@@ -33,6 +33,10 @@ def assign(cost: ArrayLike, most: float = np.inf) -> list[tuple[int, int]]:
     if 1 in cost.shape:  # one to choose for
         best = int(np.argmin(np.where(allowed, cost, np.inf)))
         return [divmod(best, cost.shape[1])]
+    rows = np.flatnonzero(allowed.any(axis=1))
+    nearest = np.where(allowed, cost, np.inf)[rows].argmin(axis=1)
+    if len(set(nearest.tolist())) == len(rows):  # all have what is best for them: no total is better
+        return list(zip(rows.tolist(), nearest.tolist()))
     spread = float(np.ptp(cost[allowed])) + 1.0
     alone = most if np.isfinite(most) else float(cost[allowed].max()) + (min(cost.shape) + 1) * spread
     n = sum(cost.shape)  # everybody may stay alone, at the price of `most` a pair

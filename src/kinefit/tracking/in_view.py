@@ -20,6 +20,7 @@ from kinefit.multiview.people import Person
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations, load_observations
+from kinefit.readers.take.pictures import TakePictures
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take_recording import recording_of
@@ -118,7 +119,10 @@ def people_in_view(take: Take) -> InView | None:
         return None
     seen = load_observations(take)
     if take.keypoints:
-        return None if seen.rig is None else InView(seen, follow(seen.rig, seen.keypoints).people)
+        if seen.rig is None:
+            return None
+        with TakePictures(take, seen) as pictures:
+            return InView(seen, follow(seen.rig, seen.keypoints, pictures=pictures).people)
     body = load_body(take.body)
     return people_in_depth(seen, recording_of(take, seen, body)[0], body)
 

@@ -33,6 +33,7 @@ from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.one_camera import is_alone
+from kinefit.readers.take.pictures import TakePictures
 
 Progress = Callable[[str, int, int], None]
 
@@ -120,7 +121,9 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     accuracy: dict[str, float] = {}
     for entry in loaded.take.keypoints:
         accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
-    rig, one = seen.rig, follow(seen.rig, seen.keypoints, take.person or _SHOWS_MOST)
+    rig = seen.rig
+    with TakePictures(loaded.take, seen) as pictures:
+        one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, pictures=pictures)
     seen = replace(seen, keypoints=one.keypoints)
     check = check_keypoints(
         rig.select(tuple(n for n in rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
