@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.fingers import of_fingers
 from kinefit.bodies.morphing import MorphedPose, Morphing
 from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
 from kinefit.correspondences.depth_image import SurfaceSamples
@@ -58,6 +59,13 @@ class Surface:
         """Points spread over all of it."""
         points, normals, segment = sample(self.body, self.count)
         return SurfaceSamples(segment, points.T, normals.T)
+
+    @cached_property
+    def stiff_samples(self) -> SurfaceSamples:
+        """Those of them that are where they are drawn; fingers are not, as they bend."""
+        some = self.samples
+        keep = ~of_fingers(self.body, some.segment, some.point.T)
+        return SurfaceSamples(some.segment[keep], some.point[:, keep], some.normal[:, keep])
 
     @cached_property
     def areas(self) -> NDArray:
