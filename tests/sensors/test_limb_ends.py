@@ -76,7 +76,7 @@ def test_what_is_contradicted_stays_so_where_its_joint_is_unseen_too(standing):
 
 def test_a_fist_contradicts_no_hand(standing):
     """The same body without what lies beyond the knuckles: the hand counts by its palm."""
-    state, frames, joints = standing
+    _, frames, joints = standing
     hand = BODY.tree.segments.index("hand_r")
     camera = seen_from(joints["hand_r"])
     layers = Layers(BODY, camera)

@@ -156,6 +156,13 @@ class Score:
         """Score of one state."""
         return float(self(state.T_world_root[None], state.angles[None])[0])
 
+    def missing(self, state: BodyState) -> float:
+        """Share of the person that nothing of the body is drawn at, nor near it."""
+        observed, seen = self.view.observed, self.view.seen
+        drawn = np.abs(self.depth(state, tuple(range(len(self.body.tree.segments)))))
+        far = seen & ~(np.abs(drawn - observed) < TOLERANCE)
+        return float(far.sum()) / self.pixels
+
     def visible(self, state: BodyState) -> NDArray:
         """(S,) share of each segment's own outline that the sensor could see: within its image, behind nothing."""
         tree, view, mesh = self.body.tree, self.view, self.mesh

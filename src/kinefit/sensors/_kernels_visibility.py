@@ -40,7 +40,8 @@ def measured(depth, across, down, out):
 
 @jit
 def judge(
-    front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, rays, axes, end, counts, ends
+    front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, rays, axes, end, counts,
+    ends,
 ):  # fmt: skip
     """Count every segment's foremost pixels by what was measured there.
 

@@ -7,6 +7,8 @@ or nothing was measured there, no measurement holds it.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +36,7 @@ class LimbEnds:
 
     def __init__(self, body: Body, mesh: BodyMesh) -> None:
         count = len(body.tree.segments)
-        self.joints = np.array([pair for limb in limbs(body) for pair in zip(limb, limb[1:])], int).reshape(-1, 2)
+        self.joints = np.array([pair for limb in limbs(body) for pair in pairwise(limb)], int).reshape(-1, 2)
         own, self._of, first = [], [], [0]
         self.fingers = np.full(count, np.inf)
         at = knuckles(body)
@@ -53,7 +55,7 @@ class LimbEnds:
         self._number, self._count = np.diff(first), count
 
     def axes(self, vertices_world: NDArray, camera: Camera) -> NDArray:
-        """(S, 7) of each segment in the camera's frame: begin (3,) [m], axis (3,) [1/m] up to 1, where fingers begin."""
+        """(S, 7) of each segment in the camera's frame: begin (3,) [m], axis (3,) [1/m] up to 1, fingers."""
         ends = np.add.reduceat(vertices_world[self._index], self._first, axis=0) / self._number[:, None]
         ends = (ends @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).reshape(-1, 2, 3)
         along = ends[:, 1] - ends[:, 0]

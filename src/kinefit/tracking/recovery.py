@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.limbs import limbs
 from kinefit.frame.prediction import forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
@@ -25,6 +26,7 @@ _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than 
 _ANEW = 0.3  # [s] between frames in which a pose becomes any other: what limbs are not found is sought with the whole
 _TURN = 1.0  # [s] for which a person still faces about where it faced
 _STRIDE = 0.5  # [m] by which a root is found elsewhere without a step
+_ARM = 3.0 * LEAP  # of the person that no part of the body is near to, for which the whole is sought anew
 _GAIN = 0.1  # of the support, by which a start must be better than what was tracked
 
 
@@ -69,7 +71,10 @@ class Recovery:
         if result is None or result.support < s.support:
             result = self._from_points(tracker, time, frames, measurements, result)
         if result is not None:
-            seek = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
+            lost = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
+            seek = lost
+            if self._missing(tracker, time, measurements, result) > LEAP:
+                seek = lost | self._limbs_in_view(result)
             self._good[~seek] = time
             if not seek[0]:
                 self._root = result.state.T_world_root
@@ -82,9 +87,10 @@ class Recovery:
         self._sought = time
         if result is None or _astray(result, s.poor):
             return self._from_views(tracker, time, frames, result)
-        result = self._limbs(tracker, time, frames, measurements, result, seek)
-        if result.lost.any() and self.rate < 1.0 / _ANEW:
-            return self._from_views(tracker, time, frames, result)
+        result = self._limbs(tracker, time, frames, measurements, result, seek, lost)
+        missing = self._missing(tracker, time, measurements, result)
+        if self.rate < 1.0 / _ANEW and (result.lost.any() or missing > _ARM):
+            return self._from_views(tracker, time, frames, result, measurements, missing)
         return result
 
     def _from_points(
@@ -101,9 +107,10 @@ class Recovery:
         return result
 
     def _from_views(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None
-    ) -> FrameResult | None:
-        """A start from what shows a whole person."""
+        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None,
+        measurements: Sequence[Measurement] = (), missing: float = 0.0,
+    ) -> FrameResult | None:  # fmt: skip
+        """A start from what shows a whole person, of which the result leaves out a share `missing`."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
         own = tracker.sensors
         elapsed = abs(time - self._good[0])
@@ -117,20 +124,19 @@ class Recovery:
             found = tracker.fitted(time, frames, state).result
             poor = _astray(found, self.settings.poor)
             allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-            if allowed and (result is None or _better(found, result)):
-                result, self._lost_since = found, time
+            left = self._missing(tracker, time, measurements, found) if allowed and missing > _ARM else missing
+            if allowed and (result is None or _better(found, result) or left < missing - LEAP):
+                result, self._lost_since, missing = found, time, left
                 tracker.restart(found)
         return result
 
     def _limbs(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
-        result: FrameResult, seek: NDArray,
+        result: FrameResult, seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
-        scene = tracker.scene_of(result.state, time)
-        view = next((v for m in measurements if (v := m.hints(scene).view) is not None), None)
-        if view is None:
+        search = self._search(tracker, time, measurements, result)
+        if search is None:
             return result
-        search = Search(self.body, view, self.up, np.random.default_rng(0))
         free = dofs_of_limbs(self.body, seek)
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
         held = result.state, forgetting(inverse(np.diag(std**2)), free)
@@ -138,12 +144,35 @@ class Recovery:
         for state, least in find_limbs(search, result.state, seek):
             found = tracker.fitted(time, frames, state, held).result
             value = search.score.of(found.state) - LEAP * _against(tracker, found)
-            if not self._shown(tracker, found, seek):
+            if not self._shown(tracker, found, lost):
                 continue
             if value > max(best, now + least * self._leap(time, result, found, seek)):
                 best, result, self._lost_since = value, found, time
                 tracker.restart(found, np.where(free, 0.0, tracker.velocity))
         return result
+
+    def _search(
+        self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
+    ) -> Search | None:
+        """In the first view that there is of what was measured."""
+        scene = tracker.scene_of(result.state, time)
+        view = next((v for m in measurements if (v := m.hints(scene).view) is not None), None)
+        return None if view is None else Search(self.body, view, self.up, np.random.default_rng(0))
+
+    def _missing(
+        self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
+    ) -> float:
+        """Share of the person that no part of the body is near to; 0 where frames follow each other closely.
+
+        Between frames in which a pose becomes any other a limb may have come to lie on another, which then agrees.
+        """
+        search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
+        return 0.0 if search is None else search.score.missing(result.state)
+
+    def _limbs_in_view(self, result: FrameResult) -> NDArray:
+        """(S,) bool: what is seen of the limbs."""
+        of_limbs = [s for limb in limbs(self.body) if len(limb) > 1 for s in limb]
+        return np.isin(np.arange(len(self._good)), of_limbs) & ~result.hidden
 
     def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
