@@ -31,7 +31,7 @@ def spreads(body: Body) -> NDArray:
 
 
 class _Parts(NamedTuple):
-    """Some segments: vertices (V, 3) [m] at rest and their segments (V,), triangles (T, 3) and which are of fingers.
+    """Some segments: vertices (V, 3) [m] at rest and their segments (V,), triangles (T, 3), whose fingers each is (T,).
 
     And which pairs of segments are both among them.
     """
@@ -95,9 +95,12 @@ class Score:
 
     @cached_property
     def _fingers(self) -> NDArray:
-        """(T,) bool: triangles that are not there where a fist is made."""
+        """(T,) int: of which hand's fingers triangles are, counted from 1; 0 for the others."""
         mesh = self.mesh
-        return of_fingers(self.body, mesh.face_segment, mesh.vertices[mesh.faces].mean(axis=1))
+        bends = of_fingers(self.body, mesh.face_segment, mesh.vertices[mesh.faces].mean(axis=1))
+        out = np.zeros(len(bends), np.int64)
+        out[bends] = 1 + np.unique(mesh.face_segment[bends], return_inverse=True)[1]
+        return out
 
     def _parts(self, segments: tuple[int, ...]) -> _Parts:
         if segments not in self._chosen:
@@ -117,8 +120,8 @@ class Score:
     ) -> NDArray:  # fmt: skip
         """(B,) score of poses, 1 at best: share of the person explained, less what speaks against them.
 
-        That is: what is drawn where the sensor saw past it (but fingers, which bend), parts within parts, uncommon
-        postures.
+        That is: what is drawn where the sensor saw past it, parts within parts, uncommon postures. Fingers are
+        stretched or folded, as they are better.
 
         Parameters
         ----------
@@ -143,14 +146,20 @@ class Score:
         return scores
 
     def depth(self, state: BodyState, drawn: tuple[int, ...]) -> NDArray:
-        """(h, w) [m] depth of some segments in the view, inf where none is; negative where fingers are the nearest."""
+        """(h, w) [m] depth of some segments in the view, inf where none is; fingers are folded where that is better."""
         view, part = self.view, self._parts(drawn)
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         x = BodyMesh(part.vertices, part.faces, part.owner, np.zeros(0, np.int32)).posed(frames)
+        x = x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
         h, w = view.observed.shape
-        shown = rasterise(x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3], part.faces, *view.lens, (w, h))
-        folded = np.append(part.fingers, False)[shown.face]
-        return np.where(folded, -shown.depth, shown.depth)
+        shown, hands = rasterise(x, part.faces, *view.lens, (w, h)), np.zeros((1 + part.fingers.max(initial=0), 2))
+        if len(hands) > 1:
+            hand = np.append(part.fingers, 0)[shown.face]
+            kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, TOLERANCE, hands)
+            folded = (hands[:, 0] <= hands[:, 1]) & (np.arange(len(hands)) > 0)
+            if folded.any():
+                shown = rasterise(x, part.faces[~folded[part.fingers]], *view.lens, (w, h))
+        return shown.depth
 
     def of(self, state: BodyState) -> float:
         """Score of one state."""
@@ -159,7 +168,7 @@ class Score:
     def missing(self, state: BodyState) -> float:
         """Share of the person that nothing of the body is drawn at, nor near it."""
         observed, seen = self.view.observed, self.view.seen
-        drawn = np.abs(self.depth(state, tuple(range(len(self.body.tree.segments)))))
+        drawn = self.depth(state, tuple(range(len(self.body.tree.segments))))
         far = seen & ~(np.abs(drawn - observed) < TOLERANCE)
         return float(far.sum()) / self.pixels
 

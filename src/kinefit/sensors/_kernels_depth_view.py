@@ -20,18 +20,18 @@ def agreement(
     """How well each of B poses explains what was seen, both ways, in pixels.
 
     roots (B, 4, 4), angles (B, D); vertices (V, 3) at rest with their segments owner (V,), closed faces (T, 3) of
-    them, and which are of fingers (T,) bool: these contradict nothing, as they bend; lens (4,): fx, fy, cx, cy of the
-    view. observed (h, w) [m], 0 where the body was not seen; behind (h, w) [m]: what else was measured there, inf for
-    nothing; trust (h, w) in 0..1: how sure it is that no body is at a pixel without one; base (h, w) [m]: parts that
-    stay, drawn before, inf where none is, negative where it is of fingers. What they say is counted once, and put
-    right where the pose's own parts are drawn before them.
+    them, and of which hand's fingers they are (T,), 0 for none; lens (4,): fx, fy, cx, cy of the view. observed (h, w)
+    [m], 0 where the body was not seen; behind (h, w) [m]: what else was measured there, inf for nothing; trust (h, w)
+    in 0..1: how sure it is that no body is at a pixel without one; base (h, w) [m]: parts that stay, drawn before, inf
+    where none is. What they say is counted once, and put right where the pose's own parts are drawn before them.
+    Fingers of a hand are stretched where that explains more, else folded away.
     Out (B, 2): pixels explained, each 1 - |Δz| / tolerance; pixels contradicted: drawn where the sensor saw past it.
     """
     h, w = observed.shape
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
     x, room = np.empty(vertices.shape), np.empty((6, len(vertices)))
     depth, face = np.empty((h, w), np.float32), np.empty((h, w), np.int32)
-    whole_for, whole_against = 0.0, 0.0
+    whole_for, whole_against, hands = 0.0, 0.0, np.empty((max(fingers.max(), 0) + 1 if len(fingers) else 1, 2))
     for i in range(h):
         for j in range(w):
             if base[i, j] < math.inf:
@@ -47,20 +47,25 @@ def agreement(
             x[v, 1] = f[3] * p + f[4] * q + f[5] * r + f[10]
             x[v, 2] = f[6] * p + f[7] * q + f[8] * r + f[11]
         rasterise(x, T_view_world, faces, lens[0], lens[1], lens[2], lens[3], 0.05, True, room, depth, face)
-        out[b, 0], out[b, 1] = whole_for, whole_against
+        hands[:] = 0.0
         top, bottom, left, right = _box(room, h, w)
         for i in range(top, bottom):
             for j in range(left, right):
                 z, before = depth[i, j], base[i, j]
-                if not z < abs(before):
+                if not z < before:
                     continue
-                signed = -z if fingers[face[i, j]] else z
-                explained, contradicted = _told(signed, observed[i, j], behind[i, j], trust[i, j], tolerance)
+                hand = fingers[face[i, j]]
+                explained, contradicted = _told(z, observed[i, j], behind[i, j], trust[i, j], tolerance)
                 if before < math.inf:
                     less, fewer = _told(before, observed[i, j], behind[i, j], trust[i, j], tolerance)
                     explained, contradicted = explained - less, contradicted - fewer
-                out[b, 0] += explained
-                out[b, 1] += contradicted
+                hands[hand, 0] += explained
+                hands[hand, 1] += contradicted
+        out[b, 0], out[b, 1] = whole_for + hands[0, 0], whole_against + hands[0, 1]
+        for k in range(1, len(hands)):
+            if hands[k, 0] > hands[k, 1]:
+                out[b, 0] += hands[k, 0]
+                out[b, 1] += hands[k, 1]
 
 
 @jit
@@ -76,16 +81,26 @@ def _box(room, h, w):
 
 
 @jit
-def _told(drawn, observed, behind, trust, tolerance):
-    """How much a pixel drawn at a depth [m] explains, and how much speaks against it; a negative one is of fingers."""
-    z = abs(drawn)
+def _told(z, observed, behind, trust, tolerance):
+    """How much a pixel drawn at z [m] explains, and how much speaks against it."""
     if observed > 0.0:
         gap = (z - observed) / tolerance
         size, before = abs(gap), -0.5 * gap
         explained = 1.0 - size if size < 1.0 else 0.0
-        before = 0.0 if before < 0.0 or drawn < 0.0 else before
-        return explained, before if before < 1.0 else 1.0
-    return 0.0, float(trust) if drawn > 0.0 and z < behind else 0.0
+        return explained, 0.0 if before < 0.0 else (before if before < 1.0 else 1.0)
+    return 0.0, float(trust) if z < behind else 0.0
+
+
+@jit
+def of_hands(depth, hand, observed, behind, trust, tolerance, out):
+    """How much the fingers of each hand explain and how much speaks against them, out (H, 2), by pixels hand (h, w)."""
+    out[:] = 0.0
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            if hand[i, j] > 0:
+                explained, contradicted = _told(depth[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
+                out[hand[i, j], 0] += explained
+                out[hand[i, j], 1] += contradicted
 
 
 @jit

@@ -61,11 +61,9 @@ class Surface:
         return SurfaceSamples(segment, points.T, normals.T)
 
     @cached_property
-    def stiff_samples(self) -> SurfaceSamples:
-        """Those of them that are where they are drawn; fingers are not, as they bend."""
-        some = self.samples
-        keep = ~of_fingers(self.body, some.segment, some.point.T)
-        return SurfaceSamples(some.segment[keep], some.point[:, keep], some.normal[:, keep])
+    def fingers(self) -> NDArray:
+        """(N,) bool: samples that are not where they are drawn while a hand is a fist."""
+        return of_fingers(self.body, self.samples.segment, self.samples.point.T)
 
     @cached_property
     def areas(self) -> NDArray:

@@ -132,17 +132,17 @@ class _Contour(Measurement):
 
     def match(self, scene: Scene, reach: float) -> Matched:
         """Samples of the surface beside the outline, each with the place at it that lies along its normal."""
-        samples, f = scene.surface.stiff_samples, scene.frames[scene.surface.stiff_samples.segment]
+        samples, f = scene.surface.samples, scene.frames[scene.surface.samples.segment]
         R = f[:, :9].reshape(-1, 3, 3)
         x = np.einsum("nij,jn->ni", R, samples.point) + f[:, 9:]
         n = np.einsum("nij,jn->ni", R, samples.normal)
         out, trust = outside(self._view, x)
         sight = x - self._view.viewpoint
         across = np.abs(np.einsum("ni,ni->n", n, sight)) < _ACROSS * np.linalg.norm(sight, axis=1)
-        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & across
+        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & across & ~scene.surface.fingers
         place, normal = (np.ascontiguousarray(a[:, use].T) for a in (samples.point, samples.normal))
         anchors = SurfaceAnchors(scene.body, samples.segment[use], place, normal)
-        patches = float(scene.surface.areas.sum()) / (self._of.settings.patch**2 * len(scene.surface.samples))
+        patches = float(scene.surface.areas.sum()) / (self._of.settings.patch**2 * len(samples))
         weight = trust[use] * min(patches, 1.0) / (_CONTOUR * self._of.sigma) ** 2
         return _Receding(SurfacePairs(anchors, x[use] - out[use, None] * n[use], weight, reach, True))
 
