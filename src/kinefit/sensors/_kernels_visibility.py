@@ -50,8 +50,8 @@ def judge(
     pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image. A pixel without a
     measurement is blank where the next one with one is farther than `gap` [m] of the body, by away (h, w) [cells].
     rays (2, H, W) of the full image and axes (S, 7) of the segments (`LimbEnds.axes`) tell which part of a segment a
-    pixel shows: empty and blank ones of fingers are unknown; ends (S, 2, 2) gets, of the first and the last `end`
-    (0..1) of its length, the foremost pixels and those that agree.
+    pixel shows: empty and blank ones of fingers are unknown; ends (S, 2) gets, of the first `end` (0..1)
+    of its length, the foremost pixels and those that agree.
     """
     height, width = depth.shape
     for v in range(front.shape[0]):
@@ -75,9 +75,9 @@ def judge(
             s = owner[v, u]
             along = (z * rays[0, iv, iu] - axes[s, 0]) * axes[s, 3] + (z - axes[s, 2]) * axes[s, 5]
             along += (z * rays[1, iv, iu] - axes[s, 1]) * axes[s, 4]
-            if along < end or along > 1.0 - end:
-                ends[s, 0 if along < end else 1, 0] += 1
-                ends[s, 0 if along < end else 1, 1] += 1 if agrees else 0
+            if along < end:
+                ends[s, 0] += 1
+                ends[s, 1] += 1 if agrees else 0
             z = behind[v, u]
             if agrees:
                 kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE

@@ -89,7 +89,7 @@ class Layers:
         self.owner = np.empty((height, width), np.int32)
         self.counts = np.empty((len(body.tree.segments), kernels.COUNTS), np.int64)
         self.measured = np.empty((height, width), np.uint8)
-        self.limbs, self.ends = LimbEnds(body, mesh), np.empty((len(body.tree.segments), 2, 2), np.int64)
+        self.limbs, self.ends = LimbEnds(body, mesh), np.empty((len(body.tree.segments), 2), np.int64)
         self._parts = [_part(mesh, s) for s in np.unique(mesh.segment)]
 
     def draw(self, vertices_world: NDArray) -> None:
