@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -166,11 +167,20 @@ class Score:
         return float(self(state.T_world_root[None], state.angles[None])[0])
 
     def missing(self, state: BodyState) -> float:
-        """Share of the person that nothing of the body is drawn at, nor near it."""
-        observed, seen = self.view.observed, self.view.seen
+        """Share of the person in pieces of a limb's size that nothing of the body is drawn at, nor near it.
+
+        What is longer than half of the person is a floor, a wall, furniture.
+        """
+        view, longest = self.view, 0.5 * self.body.stature
         drawn = self.depth(state, tuple(range(len(self.body.tree.segments))))
-        far = seen & ~(np.abs(drawn - observed) < TOLERANCE)
-        return float(far.sum()) / self.pixels
+        far = view.seen & ~(np.abs(drawn - view.observed) < TOLERANCE)
+        edges = cv2.morphologyEx(view.observed, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > TOLERANCE
+        _, piece, box, _ = cv2.connectedComponentsWithStats((far & ~(edges & view.seen)).astype(np.uint8))
+        total = 0
+        for k in range(1, len(box)):
+            x = view.points[piece == k]
+            total += len(x) if np.linalg.norm(np.ptp(x, axis=0)) < longest else 0
+        return total / self.pixels
 
     def visible(self, state: BodyState) -> NDArray:
         """(S,) share of each segment's own outline that the sensor could see: within its image, behind nothing."""

@@ -26,7 +26,6 @@ _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than 
 _ANEW = 0.3  # [s] between frames in which a pose becomes any other: what limbs are not found is sought with the whole
 _TURN = 1.0  # [s] for which a person still faces about where it faced
 _STRIDE = 0.5  # [m] by which a root is found elsewhere without a step
-_ARM = 3.0 * LEAP  # of the person that no part of the body is near to, for which the whole is sought anew
 _GAIN = 0.1  # of the support, by which a start must be better than what was tracked
 
 
@@ -42,6 +41,7 @@ class Recovery:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
         self._root: NDArray | None = None  # (4, 4) where the root was then
+        self._of_limbs = np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b])
         self.forget()
 
     def forget(self) -> None:
@@ -74,7 +74,7 @@ class Recovery:
             lost = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
             seek = lost
             if self._missing(tracker, time, measurements, result) > LEAP:
-                seek = lost | self._limbs_in_view(result)
+                seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
                 self._root = result.state.T_world_root
@@ -89,7 +89,7 @@ class Recovery:
             return self._from_views(tracker, time, frames, result)
         result = self._limbs(tracker, time, frames, measurements, result, seek, lost)
         missing = self._missing(tracker, time, measurements, result)
-        if self.rate < 1.0 / _ANEW and (result.lost.any() or missing > _ARM):
+        if self.rate < 1.0 / _ANEW and (result.lost.any() or missing > LEAP):
             return self._from_views(tracker, time, frames, result, measurements, missing)
         return result
 
@@ -124,7 +124,7 @@ class Recovery:
             found = tracker.fitted(time, frames, state).result
             poor = _astray(found, self.settings.poor)
             allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-            left = self._missing(tracker, time, measurements, found) if allowed and missing > _ARM else missing
+            left = self._missing(tracker, time, measurements, found) if allowed and missing > LEAP else missing
             if allowed and (result is None or _better(found, result) or left < missing - LEAP):
                 result, self._lost_since, missing = found, time, left
                 tracker.restart(found)
@@ -162,17 +162,12 @@ class Recovery:
     def _missing(
         self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
     ) -> float:
-        """Share of the person that no part of the body is near to; 0 where frames follow each other closely.
+        """Share of the person that may be a limb and has no part of the body near it; 0 where frames follow closely.
 
         Between frames in which a pose becomes any other a limb may have come to lie on another, which then agrees.
         """
         search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
         return 0.0 if search is None else search.score.missing(result.state)
-
-    def _limbs_in_view(self, result: FrameResult) -> NDArray:
-        """(S,) bool: what is seen of the limbs."""
-        of_limbs = [s for limb in limbs(self.body) if len(limb) > 1 for s in limb]
-        return np.isin(np.arange(len(self._good)), of_limbs) & ~result.hidden
 
     def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
