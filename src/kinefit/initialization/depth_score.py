@@ -174,8 +174,11 @@ class Score:
         view, longest = self.view, 0.5 * self.body.stature
         drawn = self.depth(state, tuple(range(len(self.body.tree.segments))))
         far = view.seen & ~(np.abs(drawn - view.observed) < TOLERANCE)
-        edges = cv2.morphologyEx(view.observed, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > TOLERANCE
-        _, piece, box, _ = cv2.connectedComponentsWithStats((far & ~(edges & view.seen)).astype(np.uint8))
+        around, nothing = np.ones((3, 3), np.uint8), np.float32(1e3)
+        nearest = cv2.erode(np.where(view.seen, view.observed, nothing), around)
+        whole = cv2.dilate(view.observed, around) - nearest < TOLERANCE  # no step in depth parts it
+        thick = cv2.morphologyEx((far & whole).astype(np.uint8), cv2.MORPH_OPEN, around)  # no sliver along an outline
+        _, piece, box, _ = cv2.connectedComponentsWithStats(thick)
         total = 0
         for k in range(1, len(box)):
             x = view.points[piece == k]
