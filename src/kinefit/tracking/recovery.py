@@ -73,7 +73,8 @@ class Recovery:
         if result is not None:
             lost = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
             seek = lost
-            if self._missing(tracker, time, measurements, result) > LEAP:
+            search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
+            if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
                 seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
@@ -88,9 +89,11 @@ class Recovery:
         if result is None or _astray(result, s.poor):
             return self._from_views(tracker, time, frames, result)
         result = self._limbs(tracker, time, frames, measurements, result, seek, lost)
-        missing = self._missing(tracker, time, measurements, result)
-        if self.rate < 1.0 / _ANEW and (result.lost.any() or missing > LEAP):
-            return self._from_views(tracker, time, frames, result, measurements, missing)
+        if self.rate < 1.0 / _ANEW:
+            search = self._search(tracker, time, measurements, result)
+            missing = search is not None and search.score.missing(result.state) > LEAP
+            if result.lost.any() or missing:
+                return self._from_views(tracker, time, frames, result, search if missing else None)
         return result
 
     def _from_points(
@@ -108,25 +111,27 @@ class Recovery:
 
     def _from_views(
         self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None,
-        measurements: Sequence[Measurement] = (), missing: float = 0.0,
+        search: Search | None = None,
     ) -> FrameResult | None:  # fmt: skip
-        """A start from what shows a whole person, of which the result leaves out a share `missing`."""
+        """A start from what shows a whole person; `search`, where much about the result is left out by it."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
         own = tracker.sensors
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
+        here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         for state in starts_from_views(
             self.body, self.rig, tracker.alone(frames), self.up, scene, own.keypoints, backgrounds=own.stated,
             forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
             if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
                 continue  # somebody else
+            if here is not None and _gone(state.T_world_root, here) > _STRIDE:
+                continue  # somebody else, too: but for a limb or two, the body is where it is thought to be
             found = tracker.fitted(time, frames, state).result
             poor = _astray(found, self.settings.poor)
             allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-            left = self._missing(tracker, time, measurements, found) if allowed and missing > LEAP else missing
-            if allowed and (result is None or _better(found, result) or left < missing - LEAP):
-                result, self._lost_since, missing = found, time, left
+            if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
+                result, self._lost_since = found, time
                 tracker.restart(found)
         return result
 
@@ -158,16 +163,6 @@ class Recovery:
         scene = tracker.scene_of(result.state, time)
         view = next((v for m in measurements if (v := m.hints(scene).view) is not None), None)
         return None if view is None else Search(self.body, view, self.up, np.random.default_rng(0))
-
-    def _missing(
-        self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
-    ) -> float:
-        """Share of the person that may be a limb and has no part of the body near it; 0 where frames follow closely.
-
-        Between frames in which a pose becomes any other a limb may have come to lie on another, which then agrees.
-        """
-        search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
-        return 0.0 if search is None else search.score.missing(result.state)
 
     def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
@@ -202,6 +197,13 @@ def _astray(result: FrameResult, poor: float) -> bool:
     """Whether the whole body is lost: its root is, or too little of what is seen of it agrees."""
     seen = result.segment_quality[~result.hidden]
     return bool(result.lost[0]) or float(seen.mean() if len(seen) else 0.0) < poor
+
+
+def _explains(search: Search | None, new: FrameResult, old: FrameResult) -> bool:
+    """Less of the person is missing, by a limb at least, and nothing that was explained before is in its place."""
+    if search is None or search.score.of(new.state) <= search.score.of(old.state):
+        return False
+    return search.score.missing(new.state) < search.score.missing(old.state) - LEAP
 
 
 def _better(new: FrameResult, old: FrameResult) -> bool:
