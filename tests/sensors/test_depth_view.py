@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 from tests.tracking.depth_oracle import ARMS, BODY, camera, depth_of, facing
 
-from kinefit.bodies.surfaces import MeshSurface
+from kinefit.bodies import BodyState, load_body
+from kinefit.bodies.fingers import of_fingers
+from kinefit.bodies.surfaces import MeshSurface, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.initialization.depth_score import OVERLAP, POSTURE, TOLERANCE, Score, limbs, spreads
-from kinefit.rendering import rasterise
+from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
 
 CAMERA = camera()
@@ -128,6 +130,43 @@ def test_parts_that_stay_may_be_drawn_once():
     angles[:, BODY.tree.coordinate("elbow_flex_l")] = np.linspace(0, 2, 5)
     roots = np.repeat(state.T_world_root[None], 5, axis=0)
     assert np.allclose(score(roots, angles), score(roots, angles, everything, moving=limb, base=base), atol=1e-6)
+
+
+def test_fingers_are_stretched_or_folded_as_they_explain_more():
+    body = load_body("humanoid")
+    angles = np.array(body.tree.usual)
+    for name, value in ARMS.items():
+        angles[body.tree.coordinate(name)] = np.radians(value)
+    state = BodyState(facing().T_world_root, angles)
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    mesh = body_mesh(body)
+    fist = ~of_fingers(body, mesh.face_segment, mesh.vertices[mesh.faces].mean(axis=1))
+    hand = [s for s, name in enumerate(body.tree.segments) if name == "hand_r"]
+    seen = {}
+    for name, faces in (("stretched", mesh.faces), ("fist", mesh.faces[fist])):
+        depth = Canvas(CAMERA.size).draw_for(CAMERA, mesh.posed(frames), faces).depth
+        depth = np.where(np.isfinite(depth), depth, 5.0)
+        score = Score(body, view_of(depth, depth < 5.0, CAMERA))
+        everything = tuple(range(len(body.tree.segments)))
+        base = score.depth(state, tuple(s for s in everything if s not in hand))
+        roots, angles = state.T_world_root[None], state.angles[None]
+        parts = score(roots, angles, everything, moving=tuple(hand), base=base)
+        assert np.allclose(score(roots, angles), parts, atol=0.01)  # folded fingers that hid other parts
+        seen[name] = score, score.depth(state, everything)
+    drawn = {name: int(np.isfinite(depth).sum()) for name, (_, depth) in seen.items()}
+    assert drawn["fist"] < drawn["stretched"]
+    assert seen["fist"][0].of(state) > seen["stretched"][0].of(state) - 0.01  # nothing is missing of either
+    assert seen["fist"][0].missing(state) < 0.02 and seen["stretched"][0].missing(state) < 0.02
+
+
+def test_a_limb_that_lies_elsewhere_is_missing():
+    state = facing(**ARMS)
+    depth = depth_of(BODY, state, CAMERA)
+    score = Score(BODY, view_of(depth, depth > 0, CAMERA))
+    angles = np.array(state.angles)
+    angles[BODY.tree.coordinate("arm_add_l")] += 1.5
+    assert score.missing(state) < 0.02
+    assert score.missing(replace(state, angles=angles)) > 0.05
 
 
 def test_limbs_reach_from_the_trunk_to_their_ends():

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.fingers import of_fingers
+from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs
 from kinefit.rendering import Canvas, rasterise
@@ -20,25 +24,24 @@ OVERLAP = 0.5  # [1/m] share of the score that a metre of parts within parts cos
 POSTURE = 0.004  # share of the score that one standard deviation of every angle from the prior mean costs
 
 
-def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
-    """Segments from each leaf up to where the tree branches, the nearest to the trunk first."""
-    parents = body.tree.parents
-    children = np.bincount(parents[parents >= 0], minlength=len(parents))
-    out = []
-    for leaf in np.flatnonzero(children == 0):
-        limb = [int(leaf)]
-        while parents[limb[-1]] > 0 and children[parents[limb[-1]]] == 1:
-            limb.append(int(parents[limb[-1]]))
-        if leaf > 0:
-            out.append(tuple(limb[::-1]))
-    return tuple(out)
-
-
 def spreads(body: Body) -> NDArray:
     """(D,) [rad or m] prior standard deviation of each coordinate; half its range at most, and 1 without any limit."""
     tree = body.tree
     half = 0.5 * (tree.upper - tree.lower)
     return np.minimum(tree.spread, np.where(np.isfinite(half), half, 1.0))
+
+
+class _Parts(NamedTuple):
+    """Some segments: vertices (V, 3) [m] at rest and their segments (V,), triangles (T, 3), whose fingers each is (T,).
+
+    And which pairs of segments are both among them.
+    """
+
+    vertices: NDArray
+    owner: NDArray
+    faces: NDArray
+    fingers: NDArray
+    pairs: NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +91,28 @@ class Score:
         return np.full(self.view.observed.shape, np.inf, np.float32)
 
     @cached_property
-    def _chosen(self) -> dict[tuple[int, ...], tuple[NDArray, NDArray]]:
+    def _chosen(self) -> dict[tuple[int, ...], _Parts]:
         return {}
 
-    def _parts(self, segments: tuple[int, ...]) -> tuple[NDArray, NDArray]:
-        """(T, 3) triangles of some segments, and which pairs are both among them."""
+    @cached_property
+    def _fingers(self) -> NDArray:
+        """(T,) int: of which hand's fingers triangles are, counted from 1; 0 for the others."""
+        mesh = self.mesh
+        bends = of_fingers(self.body, mesh.face_segment, mesh.vertices[mesh.faces].mean(axis=1))
+        out = np.zeros(len(bends), np.int64)
+        out[bends] = 1 + np.unique(mesh.face_segment[bends], return_inverse=True)[1]
+        return out
+
+    def _parts(self, segments: tuple[int, ...]) -> _Parts:
         if segments not in self._chosen:
-            among = np.zeros(len(self.body.tree.segments), bool)
+            mesh, among = self.mesh, np.zeros(len(self.body.tree.segments), bool)
             among[list(segments)] = True
-            faces = np.ascontiguousarray(self.mesh.faces[among[self.mesh.face_segment]])
-            self._chosen[segments] = faces, among[self._pairs.segment[self._pairs.pairs]].all(axis=1)
+            own = among[mesh.face_segment]
+            used, faces = np.unique(mesh.faces[own], return_inverse=True)
+            self._chosen[segments] = _Parts(
+                np.ascontiguousarray(mesh.vertices[used]), mesh.segment[used], faces.reshape(-1, 3).astype(np.int32),
+                self._fingers[own], among[self._pairs.segment[self._pairs.pairs]].all(axis=1),
+            )  # fmt: skip
         return self._chosen[segments]
 
     def __call__(
@@ -106,7 +121,8 @@ class Score:
     ) -> NDArray:  # fmt: skip
         """(B,) score of poses, 1 at best: share of the person explained, less what speaks against them.
 
-        That is: what is drawn where the sensor saw past it, parts within parts, uncommon postures.
+        That is: what is drawn where the sensor saw past it, parts within parts, uncommon postures. Fingers are
+        stretched or folded, as they are better.
 
         Parameters
         ----------
@@ -114,34 +130,60 @@ class Score:
         drawn : segments that take part; default all
         moving, base : those of them that differ between the poses, and all others as `depth` draws them: faster
         """
-        tree, view, mesh, p = self.body.tree, self.view, self.mesh, self._pairs
+        tree, view, p = self.body.tree, self.view, self._pairs
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
-        faces = self._parts(drawn if moving is None else moving)[0]
+        part = self._parts(drawn if moving is None else moving)
         out, within = np.empty((len(roots), 2)), np.empty(len(roots))
         roots, angles = np.ascontiguousarray(roots, float), np.ascontiguousarray(angles, float)
         pose = tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, roots, angles
         kernels.agreement(
-            *pose, mesh.vertices, mesh.segment, faces, view.T_view_world, view.lens,
+            *pose, part.vertices, part.owner, part.faces, part.fingers, view.T_view_world, view.lens,
             view.observed, view.behind, view.trust, self._nothing if base is None else base, TOLERANCE, out,
         )  # fmt: skip
-        use = self._parts(drawn)[1]
+        use = self._parts(drawn).pairs
         kernels.overlaps(*pose, p.segment, p.starts, p.ends, p.pairs[use], p.apart[use], within)
         odd = np.mean(((angles - tree.usual) / self._spread) ** 2, axis=1) if angles.shape[1] else 0.0
         scores: NDArray = (out[:, 0] - out[:, 1]) / self.pixels - OVERLAP * within - POSTURE * odd
         return scores
 
     def depth(self, state: BodyState, drawn: tuple[int, ...]) -> NDArray:
-        """(h, w) [m] depth of some segments in the view, inf where none is."""
-        view = self.view
+        """(h, w) [m] depth of some segments in the view, inf where none is; fingers are folded where that is better."""
+        view, part = self.view, self._parts(drawn)
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
-        x = self.mesh.posed(frames) @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
+        x = BodyMesh(part.vertices, part.faces, part.owner, np.zeros(0, np.int32)).posed(frames)
+        x = x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
         h, w = view.observed.shape
-        fx, fy, cx, cy = view.lens
-        return rasterise(x, self._parts(drawn)[0], fx, fy, cx, cy, (w, h)).depth
+        shown, hands = rasterise(x, part.faces, *view.lens, (w, h)), np.zeros((1 + part.fingers.max(initial=0), 2))
+        if len(hands) > 1:
+            hand = np.append(part.fingers, 0)[shown.face]
+            kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, TOLERANCE, hands)
+            folded = (hands[:, 0] <= hands[:, 1]) & (np.arange(len(hands)) > 0)
+            if folded.any():
+                shown = rasterise(x, part.faces[~folded[part.fingers]], *view.lens, (w, h))
+        return shown.depth
 
     def of(self, state: BodyState) -> float:
         """Score of one state."""
         return float(self(state.T_world_root[None], state.angles[None])[0])
+
+    def missing(self, state: BodyState) -> float:
+        """Share of the person in pieces of a limb's size that nothing of the body is drawn at, nor near it.
+
+        What is longer than half of the person is a floor, a wall, furniture.
+        """
+        view, longest = self.view, 0.5 * self.body.stature
+        drawn = self.depth(state, tuple(range(len(self.body.tree.segments))))
+        far = view.seen & ~(np.abs(drawn - view.observed) < TOLERANCE)
+        around, nothing = np.ones((3, 3), np.uint8), np.float32(1e3)
+        nearest = cv2.erode(np.where(view.seen, view.observed, nothing), around)
+        whole = cv2.dilate(view.observed, around) - nearest < TOLERANCE  # no step in depth parts it
+        thick = cv2.morphologyEx((far & whole).astype(np.uint8), cv2.MORPH_OPEN, around)  # no sliver along an outline
+        _, piece, box, _ = cv2.connectedComponentsWithStats(thick)
+        total = 0
+        for k in range(1, len(box)):
+            x = view.points[piece == k]
+            total += len(x) if np.linalg.norm(np.ptp(x, axis=0)) < longest else 0
+        return total / self.pixels
 
     def visible(self, state: BodyState) -> NDArray:
         """(S,) share of each segment's own outline that the sensor could see: within its image, behind nothing."""
@@ -156,5 +198,6 @@ class Score:
         nearer = np.where(view.seen, np.inf, view.behind)
         shown = (raster.face[middle] >= 0) & (view.trust > 0) & (raster.depth[middle] < nearer)
         count = np.bincount(mesh.face_segment[raster.face[middle][shown]], minlength=len(tree.segments))
-        own = [np.sum(canvas.draw(x, self._parts((s,))[0], *lens).face >= 0) for s in range(len(tree.segments))]
+        faces = [mesh.faces[mesh.face_segment == s] for s in range(len(tree.segments))]
+        own = [np.sum(canvas.draw(x, f, *lens).face >= 0) for f in faces]
         return count / np.maximum(own, 1.0)

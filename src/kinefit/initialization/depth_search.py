@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.fingers import knuckles
 from kinefit.correspondences import point_rows, prior_rows, surface_rows
 from kinefit.initialization.depth_score import Score, limbs, spreads
 from kinefit.losses import geman_mcclure
@@ -163,7 +164,7 @@ class Search:
     def limb(
         self, state: BodyState, limb: tuple[int, ...], drawn: tuple[int, ...] | None, ends: NDArray, count: int
     ) -> list[tuple[BodyState, float]]:
-        """The best poses of one limb, all else held, and their scores: random ones, and its tip at each end."""
+        """The best poses of one limb, all else held, and their scores: random ones, its tip or its fist at each end."""
         tree = self.body.tree
         dofs = self._dofs(limb, False)
         d = dofs - 6
@@ -172,7 +173,7 @@ class Search:
         usual = self.rng.normal(tree.usual[d], np.minimum(spreads(self.body)[d], 0.6), size=(count, len(d)))
         angles = np.repeat(state.angles[None], 1 + count, axis=0)
         angles[1:, d] = np.clip(np.where(self.rng.random((count, 1)) < 0.35, usual, anywhere), low, high)
-        reached = [self._reach(state, limb, end) for end in (*ends, *ends)]
+        reached = [self._reach(state, limb, end, tip) for tip in self._tips[limb[-1]] for end in ends]
         angles = np.concatenate([angles, np.reshape(reached, (-1, angles.shape[1]))])
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
         others = tuple(s for s in drawn if s not in limb)
@@ -188,18 +189,19 @@ class Search:
 
     @cached_property
     def _tips(self) -> dict[int, NDArray]:
-        """Limb's last segment -> its far end (3,) [m] in that segment's frame."""
-        out, tree, mesh = {}, self.body.tree, self.score.mesh
+        """Limb's last segment -> its far end, stretched and in a fist (2, 3) [m] in that segment's frame."""
+        out, tree, mesh, folded = {}, self.body.tree, self.score.mesh, knuckles(self.body)
         for limb in self.limbs:
             x = mesh.vertices[mesh.segment == limb[-1]] - tree.rest[limb[-1]]
             far = np.linalg.norm(x, axis=1)
-            out[limb[-1]] = x[far > 0.95 * far.max()].mean(axis=0) if len(x) else np.zeros(3)
+            tip = x[far > 0.95 * far.max()].mean(axis=0) if len(x) else np.zeros(3)
+            out[limb[-1]] = np.stack([tip, folded.get(limb[-1], tip)])
         return out
 
-    def _reach(self, state: BodyState, limb: tuple[int, ...], end: NDArray) -> NDArray:
+    def _reach(self, state: BodyState, limb: tuple[int, ...], end: NDArray, tip: NDArray) -> NDArray:
         """(D,) angles that bring a limb's tip to an end of the surface, from a random pose of the limb."""
         body, d = self.body, self._dofs(limb, False) - 6
-        points = PointSet(("tip",), np.array(limb[-1:]), self._tips[limb[-1]][None])
+        points = PointSet(("tip",), np.array(limb[-1:]), tip[None])
         sight = (end - self.view.viewpoint) / np.linalg.norm(end - self.view.viewpoint)
         target = (end + 0.03 * sight)[None]  # [m] the tip lies within, half a wrist behind what was seen
         locked = np.ones(body.tree.n_dofs, bool)

@@ -14,21 +14,30 @@ from kinefit.correspondences._kernels_space import capsule_gaps
 
 @jit
 def agreement(
-    parents, dof_start, prismatic, axes, rest, roots, angles, vertices, owner, faces, T_view_world, lens,
+    parents, dof_start, prismatic, axes, rest, roots, angles, vertices, owner, faces, fingers, T_view_world, lens,
     observed, behind, trust, base, tolerance, out,
 ):  # fmt: skip
     """How well each of B poses explains what was seen, both ways, in pixels.
 
-    roots (B, 4, 4), angles (B, D); vertices (V, 3) at rest with their segments owner (V,), faces (T, 3); lens (4,):
-    fx, fy, cx, cy of the view. observed (h, w) [m], 0 where the body was not seen; behind (h, w) [m]: what else was
-    measured there, inf for nothing; trust (h, w) in 0..1: how sure it is that no body is at a pixel without one;
-    base (h, w) [m]: parts that stay, drawn before, inf where none is.
+    roots (B, 4, 4), angles (B, D); vertices (V, 3) at rest with their segments owner (V,), closed faces (T, 3) of
+    them, and of which hand's fingers they are (T,), 0 for none; lens (4,): fx, fy, cx, cy of the view. observed (h, w)
+    [m], 0 where the body was not seen; behind (h, w) [m]: what else was measured there, inf for nothing; trust (h, w)
+    in 0..1: how sure it is that no body is at a pixel without one; base (h, w) [m]: parts that stay, drawn before, inf
+    where none is. What they say is counted once, and put right where the pose's own parts are drawn before them.
+    Fingers of a hand are stretched where that explains more, else folded away.
     Out (B, 2): pixels explained, each 1 - |Δz| / tolerance; pixels contradicted: drawn where the sensor saw past it.
     """
     h, w = observed.shape
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
     x, room = np.empty(vertices.shape), np.empty((6, len(vertices)))
     depth, face = np.empty((h, w), np.float32), np.empty((h, w), np.int32)
+    whole_for, whole_against, hands = 0.0, 0.0, np.empty((max(fingers.max(), 0) + 1 if len(fingers) else 1, 2))
+    for i in range(h):
+        for j in range(w):
+            if base[i, j] < math.inf:
+                explained, contradicted = _told(base[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
+                whole_for += explained
+                whole_against += contradicted
     for b in range(len(roots)):
         forward(parents, dof_start, prismatic, axes, rest, roots[b], angles[b], frames, screws)
         for v in range(len(vertices)):
@@ -37,24 +46,61 @@ def agreement(
             x[v, 0] = f[0] * p + f[1] * q + f[2] * r + f[9]
             x[v, 1] = f[3] * p + f[4] * q + f[5] * r + f[10]
             x[v, 2] = f[6] * p + f[7] * q + f[8] * r + f[11]
-        rasterise(x, T_view_world, faces, lens[0], lens[1], lens[2], lens[3], 0.05, False, room, depth, face)
-        explained, contradicted = 0.0, 0.0
-        for i in range(h):
-            for j in range(w):
-                z = depth[i, j]
-                z = base[i, j] if base[i, j] < z else z
-                if not z < math.inf:
+        rasterise(x, T_view_world, faces, lens[0], lens[1], lens[2], lens[3], 0.05, True, room, depth, face)
+        hands[:] = 0.0
+        top, bottom, left, right = _box(room, h, w)
+        for i in range(top, bottom):
+            for j in range(left, right):
+                z, before = depth[i, j], base[i, j]
+                if not z < before:
                     continue
-                o = observed[i, j]
-                if o > 0.0:
-                    gap = (z - o) / tolerance
-                    size = abs(gap)
-                    explained += 1.0 - size if size < 1.0 else 0.0
-                    before = -0.5 * gap
-                    contradicted += 0.0 if before < 0.0 else (before if before < 1.0 else 1.0)
-                elif z < behind[i, j]:
-                    contradicted += trust[i, j]
-        out[b, 0], out[b, 1] = explained, contradicted
+                hand = fingers[face[i, j]]
+                explained, contradicted = _told(z, observed[i, j], behind[i, j], trust[i, j], tolerance)
+                if before < math.inf:
+                    less, fewer = _told(before, observed[i, j], behind[i, j], trust[i, j], tolerance)
+                    explained, contradicted = explained - less, contradicted - fewer
+                hands[hand, 0] += explained
+                hands[hand, 1] += contradicted
+        out[b, 0], out[b, 1] = whole_for + hands[0, 0], whole_against + hands[0, 1]
+        for k in range(1, len(hands)):
+            if hands[k, 0] > hands[k, 1]:
+                out[b, 0] += hands[k, 0]
+                out[b, 1] += hands[k, 1]
+
+
+@jit
+def _box(room, h, w):
+    """First and last row and column (ends excluded) that vertices as `rasterise` has left them in its room may fill."""
+    top, bottom, left, right = float(h), 0.0, float(w), 0.0
+    for v in range(room.shape[1]):
+        if not room[5, v] > 0.0:  # too near: its triangles are cut
+            return 0, h, 0, w
+        left, right = min(left, room[3, v]), max(right, room[3, v])
+        top, bottom = min(top, room[4, v]), max(bottom, room[4, v])
+    return int(max(top, 0.0)), int(min(bottom + 2.0, h)), int(max(left, 0.0)), int(min(right + 2.0, w))
+
+
+@jit
+def _told(z, observed, behind, trust, tolerance):
+    """How much a pixel drawn at z [m] explains, and how much speaks against it."""
+    if observed > 0.0:
+        gap = (z - observed) / tolerance
+        size, before = abs(gap), -0.5 * gap
+        explained = 1.0 - size if size < 1.0 else 0.0
+        return explained, 0.0 if before < 0.0 else (before if before < 1.0 else 1.0)
+    return 0.0, float(trust) if z < behind else 0.0
+
+
+@jit
+def of_hands(depth, hand, observed, behind, trust, tolerance, out):
+    """How much the fingers of each hand explain and how much speaks against them, out (H, 2), by pixels hand (h, w)."""
+    out[:] = 0.0
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            if hand[i, j] > 0:
+                explained, contradicted = _told(depth[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
+                out[hand[i, j], 0] += explained
+                out[hand[i, j], 1] += contradicted
 
 
 @jit

@@ -39,13 +39,19 @@ def measured(depth, across, down, out):
 
 
 @jit
-def judge(front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, counts):
+def judge(
+    front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, rays, axes, end, counts,
+    ends,
+):  # fmt: skip
     """Count every segment's foremost pixels by what was measured there.
 
     depth (H, W) [m], 0 for none, negative where it is known to be something else's, `across` and `down` times as wide
     and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the
     pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image. A pixel without a
     measurement is blank where the next one with one is farther than `gap` [m] of the body, by away (h, w) [cells].
+    rays (2, H, W) of the full image and axes (S, 7) of the segments (`LimbEnds.axes`) tell which part of a segment a
+    pixel shows: empty and blank ones of fingers are unknown; ends (S, 2) gets, of the first `end` (0..1)
+    of its length, the foremost pixels and those that agree.
     """
     height, width = depth.shape
     for v in range(front.shape[0]):
@@ -66,6 +72,12 @@ def judge(front, behind, owner, depth, away, across, down, focal, slack, gap, co
                 right = iu + beside if iu + beside < width else width - 1
                 agrees = abs(depth[above, iu] - z) <= bound or abs(depth[below, iu] - z) <= bound
                 agrees = agrees or abs(depth[iv, left] - z) <= bound or abs(depth[iv, right] - z) <= bound
+            s = owner[v, u]
+            along = (z * rays[0, iv, iu] - axes[s, 0]) * axes[s, 3] + (z - axes[s, 2]) * axes[s, 5]
+            along += (z * rays[1, iv, iu] - axes[s, 1]) * axes[s, 4]
+            if along < end:
+                ends[s, 0] += 1
+                ends[s, 1] += 1 if agrees else 0
             z = behind[v, u]
             if agrees:
                 kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE
@@ -75,4 +87,6 @@ def judge(front, behind, owner, depth, away, across, down, focal, slack, gap, co
                 kind = UNKNOWN
             else:
                 kind = EMPTY if abs(m) > front[v, u] else COVERED
-            counts[owner[v, u], kind] += 1
+            if along > axes[s, 6] and (kind == EMPTY or kind == BLANK):
+                kind = UNKNOWN
+            counts[s, kind] += 1

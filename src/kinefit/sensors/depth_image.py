@@ -178,7 +178,9 @@ class DepthImageMeasurement(Measurement):
         free = None
         if space is not None:
             sigma = s.through * space.cell
-            free = FreePairs.found(scene, samples, space, camera, tolerance=self._astray, sigma=sigma)
+            free = FreePairs.found(
+                scene, samples, space, camera, tolerance=self._astray, sigma=sigma, seen=pixels.group
+            )  # fmt: skip
         return DepthImageMatched(
             self, SurfacePairs.nearest(points, measured, scene, bound / 2.0, blur, camera),
             SurfacePairs.seen(pixels, samples, scene, bound / 2.0, camera), free,

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.fingers import of_fingers
 from kinefit.bodies.morphing import MorphedPose, Morphing
 from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
 from kinefit.correspondences.depth_image import SurfaceSamples
@@ -58,6 +59,11 @@ class Surface:
         """Points spread over all of it."""
         points, normals, segment = sample(self.body, self.count)
         return SurfaceSamples(segment, points.T, normals.T)
+
+    @cached_property
+    def fingers(self) -> NDArray:
+        """(N,) bool: samples that are not where they are drawn while a hand is a fist."""
+        return of_fingers(self.body, self.samples.segment, self.samples.point.T)
 
     @cached_property
     def areas(self) -> NDArray:

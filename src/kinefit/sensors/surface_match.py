@@ -97,17 +97,25 @@ class FreePairs:
 
     @classmethod
     def found(
-        cls, scene: Scene, samples: SurfaceSamples, space: FreeSpace, camera: Camera, *, tolerance: float, sigma: float
-    ) -> FreePairs:
-        """As `free_space_rows` finds them at a scene's state."""
+        cls, scene: Scene, samples: SurfaceSamples, space: FreeSpace, camera: Camera, *, tolerance: float, sigma: float,
+        seen: NDArray,
+    ) -> FreePairs:  # fmt: skip
+        """As `free_space_rows` finds them at a scene's state, without fingers of which more is in the air than `seen`.
+
+        seen : (M,) int, samples with a measurement at their pixels
+        """
         chosen = np.empty(len(samples), np.int64)
         made = free_space_rows(
             scene.body, scene.state, samples, space, camera, tolerance=tolerance, sigma=sigma, chosen=chosen,
             frames=scene.frames,
         )  # fmt: skip
-        own = made.group
+        hand = np.where(scene.surface.fingers, 1 + samples.segment, 0)
+        air, there = (np.bincount(hand[some], minlength=1 + hand.max(initial=0)) for some in (made.group, seen))
+        folded = air > there
+        folded[0] = False
+        own = made.group[~folded[hand[made.group]]]
         rest, normal = (np.ascontiguousarray(a[:, own].T) for a in (samples.point, samples.normal))
-        anchors = SurfaceAnchors(scene.body, made.segment, rest, normal)
+        anchors = SurfaceAnchors(scene.body, samples.segment[own], rest, normal)
         return cls(anchors, camera, space.middle(chosen[own]), 0.5 * space.cell, sigma)
 
     def rows(self, scene: Scene) -> Rows | DofRows:

@@ -20,6 +20,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
 from kinefit.sensors import _kernels_visibility as kernels
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.limb_ends import END, LimbEnds
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
 FEWEST = 16  # pixels of a whole outline: fewer say too little of a segment
@@ -38,10 +39,13 @@ class SegmentVerdict:
         its whole outline; foremost and supported by a measurement that nothing else of the body explains; supported,
         but explained without it; empty: something was measured behind, or it is blank (nothing was measured within
         `GAP`, by a sensor that measures nearly all of the body); covered: something was measured in front;
-        unknown: no measurement.
+        unknown: no measurement, or fingers in the air, which may be folded away.
+    unseen : (S,) bool
+        Segments whose joint is not seen, however much else of them is; see `LimbEnds`.
     """
 
     counts: NDArray
+    unseen: NDArray
 
     @property
     def supported(self) -> NDArray:
@@ -60,9 +64,10 @@ class SegmentVerdict:
 
     @property
     def evidence(self) -> Evidence:
-        """For and against each segment, in outlines of it."""
-        whole = np.maximum(self.counts[:, kernels.OWN], FEWEST)
-        return Evidence(self.supported / whole, (self.seen - self.supported) / whole)
+        """For and against each segment, in outlines of it; nothing of one that agrees and whose joint is not seen."""
+        against, whole = self.seen - self.supported, np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        share = np.where(self.unseen & (self.supported >= against), 0.0, 1.0 / whole)
+        return Evidence(share * self.supported, share * against)
 
 
 class Layers:
@@ -84,6 +89,7 @@ class Layers:
         self.owner = np.empty((height, width), np.int32)
         self.counts = np.empty((len(body.tree.segments), kernels.COUNTS), np.int64)
         self.measured = np.empty((height, width), np.uint8)
+        self.limbs, self.ends = LimbEnds(body, mesh), np.empty((len(body.tree.segments), 2), np.int64)
         self._parts = [_part(mesh, s) for s in np.unique(mesh.segment)]
 
     def draw(self, vertices_world: NDArray) -> None:
@@ -133,12 +139,14 @@ def judge_segments(
     cells = camera.size[0] / width, camera.size[1] / height
     kernels.measured(depth, *cells, layers.measured)
     away = cv2.distanceTransform(1 - layers.measured, cv2.DIST_L2, 3)
+    axes = layers.limbs.axes(vertices_world, camera)
+    layers.ends.fill(0)
     kernels.judge(
         layers.front, layers.behind, layers.owner, depth, away, *cells, camera.matrix[0, 0], slack, GAP,
-        DEVIATIONS * noise[0], DEVIATIONS * noise[1], layers.counts,
+        DEVIATIONS * noise[0], DEVIATIONS * noise[1], camera.ray_table, axes, END, layers.counts, layers.ends,
     )  # fmt: skip
     counts = layers.counts[:, : kernels.BLANK].copy()
     blank = layers.counts[:, kernels.BLANK]
     few = blank.sum() <= SEES * layers.counts[:, 1:].sum()
     counts[:, kernels.EMPTY if few else kernels.UNKNOWN] += blank
-    return SegmentVerdict(counts)
+    return SegmentVerdict(counts, layers.limbs.unseen(axes, layers.ends, camera))

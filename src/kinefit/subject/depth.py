@@ -139,7 +139,7 @@ class _Contour(Measurement):
         out, trust = outside(self._view, x)
         sight = x - self._view.viewpoint
         across = np.abs(np.einsum("ni,ni->n", n, sight)) < _ACROSS * np.linalg.norm(sight, axis=1)
-        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & across
+        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & across & ~scene.surface.fingers
         place, normal = (np.ascontiguousarray(a[:, use].T) for a in (samples.point, samples.normal))
         anchors = SurfaceAnchors(scene.body, samples.segment[use], place, normal)
         patches = float(scene.surface.areas.sum()) / (self._of.settings.patch**2 * len(samples))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.limbs import limbs
 from kinefit.frame.prediction import forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
@@ -40,6 +41,7 @@ class Recovery:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
         self._root: NDArray | None = None  # (4, 4) where the root was then
+        self._of_limbs = np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b])
         self.forget()
 
     def forget(self) -> None:
@@ -69,7 +71,11 @@ class Recovery:
         if result is None or result.support < s.support:
             result = self._from_points(tracker, time, frames, measurements, result)
         if result is not None:
-            seek = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
+            lost = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
+            seek = lost
+            search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
+            if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
+                seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
                 self._root = result.state.T_world_root
@@ -82,9 +88,12 @@ class Recovery:
         self._sought = time
         if result is None or _astray(result, s.poor):
             return self._from_views(tracker, time, frames, result)
-        result = self._limbs(tracker, time, frames, measurements, result, seek)
-        if result.lost.any() and self.rate < 1.0 / _ANEW:
-            return self._from_views(tracker, time, frames, result)
+        result = self._limbs(tracker, time, frames, measurements, result, seek, lost)
+        if self.rate < 1.0 / _ANEW:
+            search = self._search(tracker, time, measurements, result)
+            missing = search is not None and search.score.missing(result.state) > LEAP
+            if result.lost.any() or missing:
+                return self._from_views(tracker, time, frames, result, search if missing else None)
         return result
 
     def _from_points(
@@ -101,37 +110,38 @@ class Recovery:
         return result
 
     def _from_views(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None
-    ) -> FrameResult | None:
-        """A start from what shows a whole person."""
+        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None,
+        search: Search | None = None,
+    ) -> FrameResult | None:  # fmt: skip
+        """A start from what shows a whole person; `search`, where much about the result is left out by it."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
         own = tracker.sensors
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
+        here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         for state in starts_from_views(
             self.body, self.rig, tracker.alone(frames), self.up, scene, own.keypoints, backgrounds=own.stated,
             forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
             if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
                 continue  # somebody else
+            if here is not None and _gone(state.T_world_root, here) > _STRIDE:
+                continue  # somebody else, too: but for a limb or two, the body is where it is thought to be
             found = tracker.fitted(time, frames, state).result
             poor = _astray(found, self.settings.poor)
             allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-            if allowed and (result is None or _better(found, result)):
+            if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
                 result, self._lost_since = found, time
                 tracker.restart(found)
         return result
 
     def _limbs(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
-        result: FrameResult, seek: NDArray,
+        result: FrameResult, seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
-        scene = tracker.scene_of(result.state, time)
-        surfaces = [m for m in measurements if not m.settled]  # points by name show no limb that could be sought
-        view = next((v for m in surfaces if (v := m.hints(scene).view) is not None), None)
-        if view is None:
+        search = self._search(tracker, time, measurements, result)
+        if search is None:
             return result
-        search = Search(self.body, view, self.up, np.random.default_rng(0))
         free = dofs_of_limbs(self.body, seek)
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
         held = result.state, forgetting(inverse(np.diag(std**2)), free)
@@ -139,12 +149,21 @@ class Recovery:
         for state, least in find_limbs(search, result.state, seek):
             found = tracker.fitted(time, frames, state, held).result
             value = search.score.of(found.state) - LEAP * _against(tracker, found)
-            if not self._shown(tracker, found, seek):
+            if not self._shown(tracker, found, lost):
                 continue
             if value > max(best, now + least * self._leap(time, result, found, seek)):
                 best, result, self._lost_since = value, found, time
                 tracker.restart(found, np.where(free, 0.0, tracker.velocity))
         return result
+
+    def _search(
+        self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
+    ) -> Search | None:
+        """In the first view that there is of what was measured."""
+        scene = tracker.scene_of(result.state, time)
+        surfaces = [m for m in measurements if not m.settled]  # points by name show no limb that could be sought
+        view = next((v for m in surfaces if (v := m.hints(scene).view) is not None), None)
+        return None if view is None else Search(self.body, view, self.up, np.random.default_rng(0))
 
     def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
@@ -179,6 +198,13 @@ def _astray(result: FrameResult, poor: float) -> bool:
     """Whether the whole body is lost: its root is, or too little of what is seen of it agrees."""
     seen = result.segment_quality[~result.hidden]
     return bool(result.lost[0]) or float(seen.mean() if len(seen) else 0.0) < poor
+
+
+def _explains(search: Search | None, new: FrameResult, old: FrameResult) -> bool:
+    """Less of the person is missing, by a limb at least, and nothing that was explained before is in its place."""
+    if search is None or search.score.of(new.state) <= search.score.of(old.state):
+        return False
+    return search.score.missing(new.state) < search.score.missing(old.state) - LEAP
 
 
 def _better(new: FrameResult, old: FrameResult) -> bool:

@@ -1,0 +1,39 @@
+"""What is sought though nothing is lost: a thing of a limb's size that no part of the body explains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.tracking.movements import a_motion, a_rig, depth_frame
+
+from kinefit.rendering import render_body
+from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking import recovery
+from kinefit.tracking.tracker import Tracker
+
+
+def with_a_thing(i):
+    """A depth image of the body with something as large as a forearm beside its trunk."""
+    frame = depth_frame(i)
+    body = np.isfinite(render_body(a_motion().body, a_motion().state(i), a_rig()["depth"]).depth)
+    rows, columns = np.nonzero(body)
+    depth = np.array(frame.depth)
+    row, column = int(np.median(rows)), int(columns.min()) - 2
+    depth[row - 12 : row + 12, column - 10 : column] = np.median(depth[body])
+    return replace(frame, depth=depth)
+
+
+CASES = [(30.0, with_a_thing, 0), (1.0, with_a_thing, 1), (1.0, depth_frame, 0)]
+
+
+@pytest.mark.parametrize(("rate", "sees", "times"), CASES)
+def test_between_frames_far_apart_limbs_are_sought_for_what_nothing_explains(monkeypatch, rate, sees, times):
+    sought = []
+    monkeypatch.setattr(recovery, "find_limbs", lambda *_: sought.append(1) or [])
+    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    settings = TrackSettings(doubtful=0.0)
+    tracker = Tracker(a_motion().body, a_rig(), rate=rate, settings=settings, on_body=("depth",))
+    tracker.start_at(a_motion().state(0))
+    result = tracker.update([sees(0)])
+    assert not result.lost.any()
+    assert len(sought) == times
