@@ -30,7 +30,7 @@ _SPREAD = 1.4826  # standard deviation of a normal distribution over its median 
 _FEWEST = 5  # frames in which a bone must be seen
 
 # Of a bone's length, as a share, what a detector makes of one person in another pose and place: bones of limbs, trunk,
-# breadths. The real trial of two people, spans of half a second, has 2 to 3 % and 5 % (`benchmarks.people_return`).
+# breadths. As the built-in detector has them of a real man and woman in four cameras, between spans of half a second.
 _WITHIN = np.array([0.02, 0.025, 0.02, 0.02, 0.02, 0.04, 0.05])
 # Adults of both sexes: stature differs by 5 % (standard deviation), a bone by 3.5 % more from what goes with stature.
 _STATURE, _PROPORTION = 0.05, 0.035

@@ -140,7 +140,10 @@ def chains_of(
 
 def _paired(odds: NDArray) -> list[tuple[int, int]]:
     """The pairs of greatest total, each of which is better than none."""
-    return assign(np.where(odds > 0.0, -odds, np.inf), 0.0)
+    better = odds > 0.0
+    rows, columns = np.flatnonzero(better.any(axis=1)), np.flatnonzero(better.any(axis=0))
+    cost = np.where(better, -odds, np.inf)[np.ix_(rows, columns)]
+    return [(int(rows[i]), int(columns[j])) for i, j in assign(cost, 0.0)] if len(rows) else []
 
 
 def _in_reach(a: Span, b: Span, rate: float) -> bool:
