@@ -30,8 +30,8 @@ class McapVideo:
     FileError
         The extra is not installed, or the file is damaged.
     ObservationError
-        No such topic, one of another encoding, none or several that have images; more than half a second, and three frames,
-        without any.
+        No such topic, one of another encoding, none or several that have images; more than half a second, and three
+        frames, without any.
     """
 
     def __init__(self, path: Path, topic: str | None) -> None:
