@@ -11,7 +11,7 @@ from kinefit.errors import ObservationError
 from kinefit.readers.ros.images import COLOURS, colours, is_colour, refuse_encoding
 from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, reading
 
-_GAP = 0.5  # [s] without an image that a video cannot bridge
+_GAP = 0.5  # [s] without an image, or three frames if that is longer, that a video cannot bridge
 
 
 class McapVideo:
@@ -30,7 +30,8 @@ class McapVideo:
     FileError
         The extra is not installed, or the file is damaged.
     ObservationError
-        No such topic, one of another encoding, none or several that have images; half a second or more without any.
+        No such topic, one of another encoding, none or several that have images; more than half a second, and three
+        frames, without any.
     """
 
     def __init__(self, path: Path, topic: str | None) -> None:
@@ -45,7 +46,7 @@ class McapVideo:
         if not len(steps):
             problem = f"one image alone on the topic {self.topic}"
             raise ObservationError(problem, file=path, remedy="Record it for longer.")
-        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > _GAP)
+        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_GAP, 3.0 * float(np.median(steps))))
         if len(gaps):
             begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
             raise ObservationError(
