@@ -20,6 +20,7 @@ from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.view_bias import beside, trunks
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors, SceneOf
@@ -86,6 +87,7 @@ def smooth_results(
     again = _swaps(take)
     if not np.array_equal(again, swapped):
         uv, confidence = exchanged(channels, again)
+        uv = without_bias(body, channels, uv, take.roots, take.angles)
         take, swapped = replace(take, uv=uv, confidence=confidence), again
         take, covariances, others_matched = _solve(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
@@ -104,15 +106,18 @@ def smooth_results(
     covariance = np.empty((body.tree.n_dofs,) * 2)
     for f, result in enumerate(results):
         state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
+        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         pixels = tuple(
-            replace(m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f])
+            replace(
+                m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
+                beside=m.measurement.layout.beside(scene),
+            )
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
         more = () if others_matched is None else others_matched[f]
         covariance[packed] = covariance.T[packed] = covariances[f]
         if hard is not None:
             covariance = on_null_space(covariance, hard(state)[1])
-        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
         surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
@@ -161,8 +166,9 @@ def pixels_of_track(
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
+    uv, confidence = exchanged(channels, swapped_channels(channels, results))
     return SmoothTake(
-        body, channels, points, *exchanged(channels, swapped_channels(channels, results)), roots, angles, everything,
+        body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, roots, angles, everything,
         np.ones((len(roots), body.tree.n_dofs)), 1.0 / rate, settings.loss,
         (settings.acceleration_memory, settings.smooth_memory),
     )  # fmt: skip
@@ -220,6 +226,19 @@ def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
         confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
     release(uv, confidence)
     return uv, confidence
+
+
+def without_bias(body: Body, channels: Channels, uv: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
+    """Pixels (T, N, 2) without the bias by view that keypoints have at states; the same where none is known."""
+    if channels.view_bias is None:
+        return uv
+    points = channels.points
+    trunk, out = trunks(body.tree)[points.segments][channels.column], room(uv.shape)
+    for f, (root, turned) in enumerate(zip(roots, angles)):
+        x = body.positions(BodyState(root, turned), points)[channels.column]
+        frames, _ = body.tree.forward(root, turned)
+        out[f] = uv[f] - beside(channels.view_bias, trunk, x, frames, channels.rig, channels.camera)
+    return out
 
 
 def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
@@ -296,6 +315,7 @@ def _swaps(take: SmoothTake) -> NDArray:
     for some in stretches(len(out)):
         fitted, given = take.fitted(take.roots[some], take.angles[some]), channels.part(range(*some.indices(len(out))))
         uv, confidence = exchanged(given, np.zeros(fitted.shape[:2], bool))
+        uv = without_bias(take.body, channels, uv, take.roots[some], take.angles[some])
         weight = confidence / np.square(channels.sigma)
         out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted)]
     return out
