@@ -62,6 +62,13 @@ def test_two_cameras_tell_of_no_bias():
     assert learn_view_bias([frames_of(TRUE, cameras=2)]).sets == {}
 
 
+def test_a_camera_without_keypoints_changes_nothing():
+    three = frames_of(TRUE, cameras=3)
+    with_fourth = replace(three, channels=replace(three.channels, rig=RIG))
+    a, b = (learn_view_bias([take]).sets["BODY_25B"] for take in (three, with_fourth))
+    assert a.keys() == b.keys() and all(np.allclose(a[n], b[n], rtol=0.0, atol=1e-9) for n in a)
+
+
 def test_a_fit_of_the_person_finds_it_and_may_leave_it():
     take = frames_of(TRUE)
     channels = replace(take.channels, uv=take.uv)

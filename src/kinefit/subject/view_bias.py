@@ -16,8 +16,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.sensors.channels import Channels, mirror_name
 from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias, directions, trunks
 
-_PRIOR = 0.01  # [m] standard deviation of a coefficient: of 1, 1.4 and 2 cm the one that is best on the built-in detector's
-# three recordings (`benchmarks.people_bias`); 2 cm gains more on two of them, and loses 7 % on the third
+_PRIOR = 0.01  # [m] standard deviation of a coefficient: of 1, 1.4 and 2 cm the best on three recordings of the
+# built-in network (`benchmarks.people_bias`); 2 cm gains more on two of them, and loses 7 % on the third
 _NOISE = 0.01  # [m] of a keypoint beside it, in a whole take: frames are alike, all of them count as one look
 _FREE = 0.03  # [m] standard deviation of s, by which a fitted body's point is off in a frame
 _OUTLIER = 2.0  # standard deviations at which a keypoint counts a quarter
@@ -151,7 +151,8 @@ def _looks(take: SeenFrames, keys: dict[tuple[str, str], int]) -> _Looks | None:
         weight = np.where(known, np.sqrt(take.confidence[:, mine]) / (_NOISE * np.where(known, scale, 1.0)), 0.0)
         J = np.where(known[..., None, None], J, 0.0) * weight[..., None, None]
         X[k, :, c] = J.swapaxes(0, 1)
-        A[k, :, c] = (J[:, :, :, None, :] * directions(d)[:, :, None, :, None]).reshape(*J.shape[:3], -1).swapaxes(0, 1)
+        by_direction = J[:, :, :, None, :] * directions(d)[:, :, None, :, None]
+        A[k, :, c] = by_direction.reshape(*J.shape[:3], 3 * TERMS).swapaxes(0, 1)
         r[k, :, c] = (np.where(known[..., None], gap, 0.0) * weight[..., None]).swapaxes(0, 1)
     enough = np.count_nonzero(X.any(axis=(3, 4)), axis=2) >= _CAMERAS
     used = np.flatnonzero(enough.any(axis=1))
