@@ -69,7 +69,8 @@ class TrackSettings:
         markers beside keypoints may move cameras. None takes calibrations for exact.
     view_bias : bool
         Whether it is found from the take how far beside its point a detector puts each keypoint, seen from each side,
-        see `ViewBias`. It takes three cameras that show a point.
+        see `ViewBias`. It takes three cameras that show a point, and keypoints alone: beside other sensors cameras
+        are found, whose errors it would follow.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]

@@ -44,7 +44,7 @@ def fit_subject(
     height: float | None = None,
     trial: Subject | None = None,
     cameras: tuple[float, float] | None = None,
-    view_bias: bool = True,
+    view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
     """Bone lengths and the places of the detectors' points on a body, with no pose given.

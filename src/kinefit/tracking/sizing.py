@@ -111,7 +111,7 @@ def fitted_to_person(
     if cameras >= 2:
         found = fit_subject(
             body, channels, frames=frames or 25, height=height, trial=trial, cameras=settings.camera_std,
-            view_bias=settings.view_bias, progress=progress,
+            view_bias=settings.view_bias and not others, progress=progress,
         )  # fmt: skip
         person = _wearing(person, found, **_gear_of(body, found))
     elif recording.markers and recording.marker_sets[0][0]:
