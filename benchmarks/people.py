@@ -7,6 +7,7 @@ from benchmarks.figures import run_parts
 PARTS = {
     "people_real": "two people in four real videos, by the built-in detector",
     "people_detectors": "one detector and two, on the real trial",
+    "people_bias": "bias by direction of view, found in the take and out of other recordings",
     "people_turned": "a camera whose calibration is turned, on the real trial",
     "people_one_camera": "one person before one camera, against markers",
     "people_depth": "one person before real depth cameras",

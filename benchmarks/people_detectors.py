@@ -5,18 +5,15 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from benchmarks.figures import LEFT_OUT, data, figure, quick
+from benchmarks.held_out import cameras_left_out, median, persons
 from benchmarks.tracking import Trial, read_trial
-from kinefit import load_body
+from kinefit import Motion, load_body
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
 DETECTORS = ("openpose", "mediapipe")
 _GOALS = {"openpose": "<= 12", "mediapipe": "<= 13"}  # px
-_SURE = 0.3  # confidence of keypoints that are held against the fit
 
 
 def run() -> None:
@@ -43,15 +40,10 @@ def run() -> None:
 
 def _held_out(used: list[Trial], judge: Trial) -> float:
     """[px] median distance of one detector's sure keypoints in each camera from the fit to the other three."""
-    rig, body, out = judge.rig, load_body("humanoid"), []
-    whole = judge.recording
-    for record, chosen in zip(whole.keypoints, whole.people, strict=True):
-        seen = [k for trial in used for k in trial.keypoints if k.camera != record.camera]
-        motion = track(Recording.of_keypoints(rig, seen), body)
-        person = record.of_one(chosen)
-        uv = np.where((person.confidence[:, 0] > _SURE)[..., None], person.points[:, 0], np.nan)
-        points = motion.body.keypoints(record.keypoint_set)
-        names = tuple(n for n in record.names if n in points.names)
-        fitted: NDArray = rig[record.camera].project(motion.positions(points.select(names)))
-        out.append(np.linalg.norm(fitted - uv[:, [record.names.index(n) for n in names]], axis=-1).ravel())
-    return float(np.nanmedian(np.concatenate(out)))
+    rig, body = judge.rig, load_body("humanoid")
+
+    def fitted(camera: str) -> Motion:
+        seen = [k for trial in used for k in trial.keypoints if k.camera != camera]
+        return track(Recording.of_keypoints(rig, seen), body)
+
+    return median(cameras_left_out(rig, persons(rig, judge.keypoints), fitted))

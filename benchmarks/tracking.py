@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
+from benchmarks.held_out import sides_right
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, Recording, Rig, load_body, load_observations, read_take, track
 from kinefit.evaluation import angle_errors, coverage, joint_errors
@@ -85,9 +86,10 @@ def held_out(trial: Trial, whole: Motion) -> dict[str, NDArray]:
         seen = [k for k in trial.keypoints if k.camera != camera]
         motion = track(Recording.of_keypoints(trial.rig.select(others), seen), load_body("humanoid"))
         residuals = whole.residuals[camera]
-        points = motion.body.keypoints(record.keypoint_set).select(residuals.names)
-        uv = trial.rig[camera].project(motion.positions(points))
-        out[camera] = residuals.measured - uv
+        one = record.of_one(np.zeros(len(record), np.int64))
+        channels, fitted = sides_right(motion, trial.rig.select((camera,)), [one])
+        place = [channels.points.names[c] for c in channels.column]
+        out[camera] = residuals.measured - fitted[:, [place.index(n) for n in residuals.names]]
     return out
 
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from multiprocessing import get_context
 from typing import Any
 
@@ -118,6 +119,7 @@ def fitted_body(
     """The body with the person's lengths, from keypoints of some steps."""
     records = _records(steps)
     recording = Recording.of_keypoints(rig, records, accuracy=[sigma.get(k.camera, 8.0) for k in records], up=up)
+    settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
     person = fitted_to_person(
         recording, body, channels_of(recording, body), settings, subject=None, trial=None, height=height, size=True,
         frames=None, progress=None,

@@ -34,6 +34,9 @@ class Channels:
     sigma : (N,) [px] standard deviation at full confidence.
     uv : (F, N, 2) [px], NaN where unseen.
     confidence : (F, N) in 0..1
+    view_bias : (N, 5, 3) [m] how far beside their points keypoints are seen from each side, see `ViewBias`; None for
+        nothing known of it.
+    view_followed : (N,) share of a channel's lasting errors that was taken for such a bias, and hides from residuals.
     """
 
     rig: Rig
@@ -47,6 +50,8 @@ class Channels:
     sigma: NDArray
     uv: NDArray
     confidence: NDArray
+    view_bias: NDArray | None = None
+    view_followed: NDArray | None = None
 
     @property
     def weight(self) -> NDArray:

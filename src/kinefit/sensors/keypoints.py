@@ -25,6 +25,7 @@ from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.triangulation import triangulated_frame
+from kinefit.sensors.view_bias import beside, trunks
 
 NAME = "keypoints"
 
@@ -65,6 +66,19 @@ class Layout:
             mine = np.flatnonzero(self.channels.source == q)
             out.append((label, mine, tuple(self.points.names[k] for k in mine), self.points.segments[mine]))
         return out
+
+    @cached_property
+    def trunk(self) -> NDArray:
+        """(N,) segment in whose axes a channel's bias by view is."""
+        return trunks(self.body.tree)[self.points.segments]
+
+    def beside(self, scene: Scene) -> NDArray | None:
+        """(N, 2) [px] how far beside its point each keypoint is seen at a scene's state; None for nothing known."""
+        bias = self.channels.view_bias
+        if bias is None:
+            return None
+        x = scene.positions(self.points_of(scene.body))
+        return beside(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
 
     def points_of(self, body: Body) -> PointSet:
         """The same of another body of this make; those of the body that was asked for last are kept."""
@@ -178,16 +192,20 @@ class KeypointMeasurement(Measurement):
         """Left and right of each source as they fit the body better; which points another sensor saw to be hidden."""
         channels = self.layout.channels
         fitted = projected(scene, self.layout)
-        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, fitted)
+        beside = self.layout.beside(scene)
+        looked_for = fitted if beside is None else fitted + beside
+        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for)
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
         uv, weight = np.ascontiguousarray(self.uv[order]), np.ascontiguousarray(self.weight[order])
+        if beside is not None:
+            uv -= beside
         hidden: tuple[Hidden, ...] = ()
         if scene.measurements:
             sure = self.confidence[order] >= SEEN
             hidden = tuple(hidden_points(scene, self.layout.points_of(scene.body), channels.camera, sure))
         loss = self.of.loss
         loss = replace(loss, scale=loss.scale * max(reach / self.of.near, 1.0))
-        return KeypointMatched(self, uv, weight, swapped, loss, hidden)
+        return KeypointMatched(self, uv, weight, swapped, loss, hidden, beside)
 
     def hints(self, scene: Scene) -> Hints:
         """Points on which two cameras agree."""
@@ -203,10 +221,11 @@ class KeypointMatched(Matched):
     Parameters
     ----------
     measurement : KeypointMeasurement
-    uv, weight : (N, 2) [px] and (N,) [1/px²] as used
+    uv, weight : (N, 2) [px] and (N,) [1/px²] as used, without the bias by view
     swapped : (N,) bool, channels exchanged with their partner
     loss : Loss
     hidden : what other sensors measured in front of points
+    beside : (N, 2) [px] the bias by view that was taken out; None for none
     """
 
     measurement: KeypointMeasurement
@@ -215,6 +234,7 @@ class KeypointMatched(Matched):
     swapped: NDArray
     loss: Loss
     hidden: tuple[Hidden, ...] = ()
+    beside: NDArray | None = None
 
     sensor = NAME
 
@@ -258,6 +278,7 @@ class KeypointMatched(Matched):
         layout, seen = self.measurement.layout, self.weight > 0
         uv = np.where(seen[:, None], self.uv, np.nan)
         values = uv - projected(scene, layout)
+        uv = uv if self.beside is None else uv + self.beside  # as it was measured
         factor = np.where(seen, self.loss.factor(self.squares(scene)), 0.0)
         return [
             Leftover(

@@ -67,6 +67,10 @@ class TrackSettings:
     camera_std : (2,) [m] and [rad], or None
         Standard deviations of each camera's calibrated position and of its direction, for error bars; and how far
         markers beside keypoints may move cameras. None takes calibrations for exact.
+    view_bias : bool
+        Whether it is found from the take how far beside its point a detector puts each keypoint, seen from each side,
+        see `ViewBias`. It takes three cameras that show a point, and keypoints alone: beside other sensors cameras
+        are found, whose errors it would follow.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
@@ -121,6 +125,7 @@ class TrackSettings:
     skin_shift: float = 0.02
     skin_turn: float = 0.1
     camera_std: tuple[float, float] | None = (0.003, 0.001745)
+    view_bias: bool = True
     angle_acceleration: float = 60.0
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import release, room
+from kinefit._mapped import release
 from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
@@ -24,6 +24,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import Linearised, OtherSensors, SceneOf
+from kinefit.smoothing.pixels import exchanged, without_bias
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
@@ -87,6 +88,7 @@ def smooth_results(
     again = _swaps(take)
     if not np.array_equal(again, swapped):
         uv, confidence = exchanged(channels, again)
+        uv = without_bias(body, channels, uv, take.roots, take.angles)
         take, swapped = replace(take, uv=uv, confidence=confidence), again
         take, covariances, others_matched = _solve(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
@@ -105,15 +107,18 @@ def smooth_results(
     covariance = np.empty((body.tree.n_dofs,) * 2)
     for f, result in enumerate(results):
         state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
+        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         pixels = tuple(
-            replace(m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f])
+            replace(
+                m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
+                beside=m.measurement.layout.beside(scene),
+            )
             for m in result.matched if isinstance(m, KeypointMatched)
         )  # fmt: skip
         more = () if others_matched is None else others_matched[f]
         covariance[packed] = covariance.T[packed] = covariances[f]
         if hard is not None:
             covariance = on_null_space(covariance, hard(state)[1])
-        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
         surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
@@ -162,8 +167,9 @@ def pixels_of_track(
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
+    uv, confidence = exchanged(channels, swapped_channels(channels, results))
     return SmoothTake(
-        body, channels, points, *exchanged(channels, swapped_channels(channels, results)), roots, angles, everything,
+        body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, roots, angles, everything,
         np.ones((len(roots), body.tree.n_dofs)), 1.0 / rate, settings.loss,
         (settings.acceleration_memory, settings.smooth_memory),
     )  # fmt: skip
@@ -206,21 +212,6 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
                 std = np.sqrt(np.maximum(np.diag(inverse(H + prior)), 0.0))[6:]
                 out[which][f] = std <= BLIND * tree.spread
     return out, rows
-
-
-def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
-    """Pixels (F, N, 2) and confidences (F, N) with sides put right, 0 where unseen."""
-    if len(swapped) == len(channels.uv) and not swapped.any():
-        unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
-        return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
-    uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
-    for some in stretches(len(swapped)):
-        order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))
-        uv[some] = np.take_along_axis(channels.uv[some], order[:, :, None], axis=1)
-        sure = np.take_along_axis(channels.confidence[some], order, axis=1)
-        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
-    release(uv, confidence)
-    return uv, confidence
 
 
 def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
@@ -304,6 +295,7 @@ def _swaps(take: SmoothTake) -> NDArray:
     for some in stretches(len(out)):
         fitted, given = take.fitted(take.roots[some], take.angles[some]), channels.part(range(*some.indices(len(out))))
         uv, confidence = exchanged(given, np.zeros(fitted.shape[:2], bool))
+        uv = without_bias(take.body, channels, uv, take.roots[some], take.angles[some])
         weight = confidence / np.square(channels.sigma)
         out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted)]
     return out

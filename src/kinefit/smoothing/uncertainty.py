@@ -85,6 +85,8 @@ def with_lasting_errors(
     values, factor = _left_over(take)
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
+    if channels.view_followed is not None:
+        hidden = 1.0 - (1.0 - hidden) * (1.0 - channels.view_followed)
     noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
     del values, factor
     known = Known.of(subject, channels, cameras)

@@ -15,7 +15,9 @@ from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import Channels, fitted_pixels
 from kinefit.sensors.keypoints import NAME, KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.triangulation import triangulated
+from kinefit.sensors.view_bias import ViewBias
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
@@ -24,6 +26,7 @@ from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
+from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
 _BELIEF = 5.0  # axes of points that this counts for
@@ -41,6 +44,7 @@ def fit_subject(
     height: float | None = None,
     trial: Subject | None = None,
     cameras: tuple[float, float] | None = None,
+    view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
     """Bone lengths and the places of the detectors' points on a body, with no pose given.
@@ -53,6 +57,7 @@ def fit_subject(
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
     cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
         default: the calibration is exact.
+    view_bias : whether the detectors' bias by direction of view is found along, of points that three cameras show.
 
     Raises
     ------
@@ -87,24 +92,27 @@ def fit_subject(
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
-    found, covariance = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras)
+    found, covariance, bias = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras, view_bias)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
-    return Subject(found.body, np.exp(found.mean[: len(scales)]), found, covariance, sets=sets)
+    scales = np.exp(found.mean[: len(scales)])
+    return Subject(found.body, scales, found, covariance, sets=sets, view_bias=bias)
 
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
-) -> tuple[SubjectFit, NDArray]:  # fmt: skip
+    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None, by_view: bool,
+) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
+
+    And the detectors' bias by view, which the first round tells and the others do without.
 
     How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
     one centimetre, which counts as much as `_BELIEF` points seen along one axis. What a detector errs by lasts, and
     would move cameras: their calibration counts for more by the excess of the round before.
     """
-    spread, excess_of, start, gear = _SHIFT, 1.0, None, Gear(body)
+    spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     for k in range(_ROUNDS):
@@ -125,6 +133,8 @@ def _fitted(
         )
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
+        if k == 0 and by_view:
+            bias, steps = _without_bias(body, channels, found, steps)
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
@@ -135,7 +145,20 @@ def _fitted(
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
-    return found, wider[:, None] * covariance * wider
+    return found, wider[:, None] * covariance * wider, bias
+
+
+def _without_bias(
+    body: Body, channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
+) -> tuple[ViewBias, list[Sequence[KeypointMeasurement]]]:
+    """The detectors' bias by view in frames whose poses a fit found, and the same frames with it known."""
+    sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
+    seen = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
+    uv, weight = (np.stack([getattr(one, what) for one in seen]) for what in ("uv", "weight"))
+    frames = SeenFrames(sized, channels, found.states, uv, weight * np.square(channels.sigma))
+    bias = learn_view_bias([frames])
+    layout = Layout(bias.known_to(channels), body)
+    return bias, [[KeypointMeasurement(m.of, layout, m.uv, m.confidence, m.time) for m in several] for several in steps]
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:

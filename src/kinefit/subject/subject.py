@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
+from kinefit.sensors.view_bias import ViewBias
 from kinefit.solvers.border import Prior
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World
@@ -119,7 +120,8 @@ class Subject:
 
     `fit` is the fit of keypoints that it came from, `covariance` (p, p) how sure each of its parameters is, logarithms
     of the scales first; both None for a body that was given. `length_share` (G,) is each scale's standard deviation
-    over it, where other sensors gave it. `sets` are the detectors' keypoint sets that it was found from.
+    over it, where other sensors gave it. `sets` are the detectors' keypoint sets that it was found from, `view_bias`
+    how far beside its points they see them from each side.
     """
 
     body: Body
@@ -128,6 +130,7 @@ class Subject:
     covariance: NDArray | None = None
     length_share: NDArray | None = None
     sets: tuple[str, ...] = ()
+    view_bias: ViewBias | None = None
 
     @property
     def length_std(self) -> dict[str, float]:

@@ -147,6 +147,8 @@ def motion_of(
     )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)
+    if channels.view_bias is not None and subject.view_bias is not None:
+        provenance["view bias"] = subject.view_bias.as_told()
     provenance["length_std_m"] = subject.length_std
     provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
     return Motion(

@@ -111,7 +111,7 @@ def fitted_to_person(
     if cameras >= 2:
         found = fit_subject(
             body, channels, frames=frames or 25, height=height, trial=trial, cameras=settings.camera_std,
-            progress=progress,
+            view_bias=settings.view_bias and not others, progress=progress,
         )  # fmt: skip
         person = _wearing(person, found, **_gear_of(body, found))
     elif recording.markers and recording.marker_sets[0][0]:
@@ -133,6 +133,8 @@ def _others(recording: Recording) -> bool:
 
 def _wearing(person: Person, subject: Subject, **told: Any) -> Person:
     channels = person.channels.with_points(subject.body)
+    if subject.view_bias is not None:
+        channels = subject.view_bias.known_to(channels)
     return replace(person, subject=subject, channels=channels, told={**person.told, **told})
 
 
