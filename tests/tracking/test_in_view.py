@@ -9,11 +9,10 @@ from tests.tracking.depth_oracle import BODY, camera, facing
 from kinefit import Recording, track
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.images.depth_scene import Blob
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.in_view import _alone, people_in_depth
+from kinefit.tracking.in_view import people_in_depth
 
 RATE, COUNT = 15.0, 12
 
@@ -73,20 +72,6 @@ def test_furniture_is_nobody():
     steps = [[DepthFrame("depth", k / RATE, with_a_box(k))] for k in (0, COUNT - 1)]
     recording = Recording.of_frames(steps, rig, rate=RATE, up="y")
     assert people_in_depth(None, replace(recording, depth={0: steps[0][0], 1: steps[1][0]}), BODY).people == ()
-
-
-def test_a_thing_is_of_the_one_who_is_much_nearer_to_it():
-    def thing(x, area):
-        return Blob(np.ones((2, 2), bool), np.array([x, 0.0, 2.0]), area, 1.0, False)
-
-    near, far = thing(0.0, 0.5), thing(1.0, 0.5)
-    one, between, both = thing(0.1, 0.6), thing(0.45, 0.6), thing(0.1, 0.9)
-    assert _alone([near, far], [near, far]) == [near, far]
-    assert _alone([near, far], [one, one]) == [one, None]
-    assert _alone([far, near], [one, one]) == [None, one]
-    assert _alone([near, far], [between, between]) == [None, None]
-    assert _alone([near, far], [both, both]) == [None, None]  # they stand close together
-    assert _alone([near, far], [None, far]) == [None, far]
 
 
 def with_a_box(k):

@@ -152,14 +152,15 @@ class Score:
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         x = BodyMesh(part.vertices, part.faces, part.owner, np.zeros(0, np.int32)).posed(frames)
         x = x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
-        h, w = view.observed.shape
-        shown, hands = rasterise(x, part.faces, *view.lens, (w, h)), np.zeros((1 + part.fingers.max(initial=0), 2))
+        size, (fx, fy, cx, cy) = view.observed.shape[::-1], view.lens.tolist()
+        shown = rasterise(x, part.faces, fx, fy, cx, cy, (size[0], size[1]))
+        hands = np.zeros((1 + part.fingers.max(initial=0), 2))
         if len(hands) > 1:
             hand = np.append(part.fingers, 0)[shown.face]
             kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, TOLERANCE, hands)
             folded = (hands[:, 0] <= hands[:, 1]) & (np.arange(len(hands)) > 0)
             if folded.any():
-                shown = rasterise(x, part.faces[~folded[part.fingers]], *view.lens, (w, h))
+                shown = rasterise(x, part.faces[~folded[part.fingers]], fx, fy, cx, cy, (size[0], size[1]))
         return shown.depth
 
     def of(self, state: BodyState) -> float:

@@ -32,8 +32,6 @@ _STILL = 0.8  # overlap of the pixels of a thing that stands still: 0.95 and mor
 _MOST = 4  # things in a depth image that are looked at
 _SAME = 0.3  # [m] two roots that are nearer are of one person
 _WALK = 3.0  # [m/s]
-_NEARER = 0.5  # of the distance to the next one, within which a thing is of one person
-_GROWN = 1.5  # of its area, to which a person's outline grows: two people's is twice as large
 _STRIDE = 0.5  # [m] by which the middle of what is seen of a person moves without a step
 
 
@@ -174,38 +172,13 @@ def _of_blob(
     out = {}
     for at, frame in recording.depth.items():
         reach = _STRIDE + _WALK * abs(at - step) / recording.rate
-        near = _alone(every, [_nearest(blob, found[at], reach) for blob in every])
-        if near[k] is None:
+        near = [_nearest(blob, found[at], reach) for blob in every]
+        if near[k] is None or any(near[k] is other for j, other in enumerate(near) if j != k):
             continue
         theirs = [b.mask for j, b in enumerate(near) if b is not None and j != k]
         hidden = np.logical_or.reduce(theirs) if theirs else np.zeros(frame.depth.shape, bool)
         out[at] = replace(frame, depth=np.where(hidden, 0.0, frame.depth).astype(np.float32))
     return out
-
-
-def _alone(every: Sequence[Blob], near: Sequence[Blob | None]) -> list[Blob | None]:
-    """Of each person the thing that is this person and nobody else, where there is one.
-
-    A thing that is the nearest of several people is of the one who was much nearer to it, unless it is too large for
-    one person: then they stand close together.
-    """
-    out = list(near)
-    for thing in near:
-        claims = [k for k, other in enumerate(near) if other is thing]
-        if thing is None or len(claims) < 2:
-            continue
-        claims.sort(key=lambda k: _gap(every[k], thing))
-        for k in claims:
-            out[k] = None
-        first, second = claims[:2]
-        if thing.area < _GROWN * every[first].area and _gap(every[first], thing) < _NEARER * _gap(every[second], thing):
-            out[first] = thing
-    return out
-
-
-def _gap(one: Blob, other: Blob) -> float:
-    """[m] between two middles."""
-    return float(np.linalg.norm(one.centre - other.centre))
 
 
 def _moves(blob: Blob, step: int, found: Mapping[int, Sequence[Blob]]) -> bool:
@@ -222,7 +195,7 @@ def _overlap(one: NDArray, other: NDArray) -> float:
 def _nearest(blob: Blob, among: Sequence[Blob], reach: float) -> Blob | None:
     if not among:
         return None
-    away = [_gap(blob, other) for other in among]
+    away = [float(np.linalg.norm(other.centre - blob.centre)) for other in among]
     best = int(np.argmin(away))
     return among[best] if away[best] < reach else None
 
