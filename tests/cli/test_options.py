@@ -128,6 +128,7 @@ OWN = {
     "keypoints": {
         "sigma": "sigma = 20.0", "frames": "frames = [0, 3]", "rate": "rate = 15.0", "set": 'set = "BODY_25"',
         "frame": 'frame = "calibration"', "face": "face = [1.0, 1.0, 9.0, 9.0]",
+        "stream": 'stream = "coming"',
     },
     "markers": {
         "sigma": "sigma = 0.05", "unit": 'unit = "mm"', "set": 'set = "no such"', "model": 'model = "none.npz"',
@@ -139,7 +140,7 @@ OWN = {
         "time_offset": "time_offset = 0.2", "on_body": "on_body = true", "background": 'background = "tof"',
         "segment": 'segment = "torso"', "size": "size = [9, 9]", "intrinsics": "intrinsics = [9.0, 9.0, 9.0, 9.0]",
         "distortion": "distortion = [0.1, 0.0, 0.0, 0.0]", "time_unit": "time_unit = 0.2",
-        "camera": 'camera = "no such"',
+        "camera": 'camera = "no such"', "stream": 'stream = "coming"', "topic": 'topic = "/depth"',
     },
     "silhouettes": {
         "sigma": "sigma = 40.0", "rate": "rate = 5.0", "frame": 'frame = "video"', "low": "low = [0, 0, 0]",
