@@ -95,6 +95,22 @@ def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monke
     assert not (tmp_path / "person-1" / "motion.npz").exists() and (tmp_path / "person-2" / "motion.npz").exists()
 
 
+def test_one_report_leads_to_all(take, tmp_path, monkeypatch):
+    told = run("track", take, "--no-overlays", "--formats", "motion", "--out", tmp_path)
+    assert told.exit_code == 0 and "all people:" in told.output
+    page = (tmp_path / "report.html").read_text()
+    for k in (1, 2):
+        assert f'href="person-{k}/report.html"' in page and (tmp_path / f"person-{k}" / "report.html").is_file()
+    assert "2 of 2 people in view were tracked" in page and "Range of motion" in page and "<figure" not in page
+
+    from kinefit.batch.people_report import write_people_report
+    from kinefit.batch.work import Row, failed
+
+    rows = [failed(Row(take="a", person=1, folder="person-1"), "nothing <of> it"), Row(take="a", person=2)]
+    page = write_people_report(rows, tmp_path / "other", pictures=True).read_text()
+    assert "1 of 2 people" in page and "nothing &lt;of&gt; it" in page and "href=\"person" not in page
+
+
 def test_the_report_says_who_is_shown(take, tmp_path):
     told = run("track", take, "--person", "2", "--no-overlays", "--formats", "motion", "--out", tmp_path)
     assert told.exit_code == 0

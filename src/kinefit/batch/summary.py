@@ -60,7 +60,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
         p.section("Takes", _takes(rows, folder)),
     ]
     if done:
-        parts += [p.section("Range of motion", p.paragraph(_ABOUT, small=True), _by_joint(done))]
+        parts += [p.section("Range of motion", p.paragraph(_ABOUT, small=True), by_joint(done))]
     notes = [(row.take, _person(row), note) for row in rows for note in row.notes]
     if notes:
         parts.append(p.section("Notes", p.table(("take", "person", "note"), notes, first_left=3)))
@@ -93,7 +93,7 @@ def _takes(rows: Sequence[Row], folder: Path) -> Html:
     return p.table(columns, cells, first_left=7)
 
 
-def _by_joint(rows: Sequence[Row]) -> Html:
+def by_joint(rows: Sequence[Row]) -> Html:
     """A menu of coordinates: each over takes, and over subjects and sessions."""
     from kinefit.exporters.report import page as p
     from kinefit.exporters.report.names import spoken

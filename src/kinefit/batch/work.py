@@ -168,7 +168,12 @@ def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[R
             rows.append(failed(msgspec.structs.replace(row, folder=""), str(error)))
             continue
         made += [path.relative_to(job.out).as_posix() for path in files.values()]
-        rows.append(_of_motion(row, done.motion, (*said, *done.notes)))
+        rows.append(of_motion(row, done.motion, (*said, *done.notes)))
+    if len(rows) > 1 and job.choices.report:
+        from kinefit.batch.people_report import write_people_report
+
+        beside = [msgspec.structs.replace(row, folder=row.folder and f"person-{row.person}") for row in rows]
+        made.append(write_people_report(beside, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made
 
 
@@ -181,7 +186,8 @@ def _of_session(row: Row, take: Take) -> Row:
     return msgspec.structs.replace(row, **{key: told.get(key, "") for key in ("subject", "visit", "date", "movement")})
 
 
-def _of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
+def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
+    """A row with what a motion shows."""
     from kinefit.exporters.report.ranges import ranges_of
 
     ranges = []

@@ -13,7 +13,7 @@ from kinefit.batch import results
 from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
-    from kinefit.batch.one import Choices
+    from kinefit.batch.one import Choices, Tracked
     from kinefit.readers.take.file import Take
     from kinefit.tracking.in_view import InView
 
@@ -132,6 +132,8 @@ def track(
 def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wanted: bool = False) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.batch.one import asked_take, check_drawable, people_of
+    from kinefit.batch.people_report import write_people_report
+    from kinefit.batch.work import Row, failed, of_motion
     from kinefit.errors import KinefitError
 
     take = asked_take(path, choices)
@@ -141,24 +143,32 @@ def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wante
     with _screen.bars() as step:
         view, people = people_of(take, out, step, _screen.note)
     if len(people) == 1:
-        return _track_one(*people[0], choices, view, verbose=verbose)
-    code = 0
+        return _track_one(*people[0], choices, view, verbose=verbose)[0]
+    code, rows = 0, []
     for k, (person, folder) in enumerate(people, 1):
         _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
         folder.mkdir(parents=True, exist_ok=True)
+        row = Row(take=take.name, person=k, folder=folder.name)
         try:
-            own = _track_one(person, folder, choices, view, verbose=verbose)
+            own, done = _track_one(person, folder, choices, view, verbose=verbose)
+            rows.append(of_motion(row, done.motion, done.notes))
         except KinefitError as error:  # of one person: the others are tracked all the same
             _screen.tell_error(error)
             own = error.exit_code
+            rows.append(failed(row, str(error)))
         if own == _screen.INTERRUPTED:
             return own
         code = max(code, own)
+    if choices.report:
+        page = write_people_report(rows, out, pictures=choices.draws)
+        _screen.say(f"all people: {page}", style="bold")
     return code
 
 
-def _track_one(take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool) -> int:
-    """Track one person of a take, write what comes of it and tell it; returns the exit code."""
+def _track_one(
+    take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool
+) -> tuple[int, Tracked]:  # fmt: skip
+    """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._summary import print_files, print_summary
@@ -183,5 +193,5 @@ def _track_one(take: Take, out: Path, choices: Choices, view: InView | None, *, 
     if done.total:
         told = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."
         _screen.tell_interrupted(f"{told} The same command goes on.")
-        return _screen.INTERRUPTED
-    return 0
+        return _screen.INTERRUPTED, done
+    return 0, done

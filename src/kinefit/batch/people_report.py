@@ -1,0 +1,78 @@
+"""One page over all people of a take: who they are, how far to trust each, and the way to each one's report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kinefit.batch.summary import by_joint
+from kinefit.batch.work import DONE, Row
+
+if TYPE_CHECKING:
+    from kinefit.exporters.report.page import Html
+
+
+def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) -> Path:
+    """Write report.html into the folder of a take of several people; their results lie in `person-K` beside it.
+
+    Parameters
+    ----------
+    rows : one a person, those who failed too
+    folder : of the take's results
+    pictures : bool, whether each one's montage, which this run drew, is shown
+
+    Raises
+    ------
+    ExportError
+        It cannot be written.
+    """
+    from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.report import page as p
+
+    done = [row for row in rows if row.status == DONE]
+    told = f"{len(done)} of {len(rows)} people in view were tracked; each has results and a report of their own."
+    parts: list[p.Section | str] = [
+        p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", told), _people(rows, folder)
+    ]  # fmt: skip
+    parts += [p.section(f"Person {row.person}", *_person(row, folder, pictures)) for row in rows]
+    if done:
+        parts.append(p.section("Range of motion", by_joint(done)))
+    path = folder / "report.html"
+    write_text(path, p.page(rows[0].take, parts, subtitle=f"{len(rows)} people"))
+    return path
+
+
+def _people(rows: Sequence[Row], folder: Path) -> Html:
+    from kinefit.exporters.report import page as p
+
+    cells = []
+    for row in rows:
+        quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
+        lost = "" if row.lost is None else f"{100 * row.lost:.1f} %"
+        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
+        cells.append((_linked(row, folder), row.status, str(row.frames or ""), seconds, quality, lost))
+    return p.table(("person", "status", "frames", "seconds", "quality", "lost"), cells, first_left=2)
+
+
+def _person(row: Row, folder: Path, pictures: bool) -> list[str]:
+    """The picture of all cameras, and what the command says."""
+    import cv2
+
+    from kinefit.exporters.report import page as p
+
+    montage = folder / row.folder / "montage.png"
+    read = cv2.imread(str(montage)) if pictures and row.folder and montage.is_file() else None
+    parts: list[str] = [] if read is None else [p.picture(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), width=1400)]
+    if row.error:
+        parts.append(p.callout("bad", row.error))
+    if row.notes:
+        parts.append(p.bullets(row.notes))
+    return [*parts, p.paragraph(_linked(row, folder, "Report of person"))] if row.status == DONE else parts
+
+
+def _linked(row: Row, folder: Path, text: str = "person") -> str:
+    from kinefit.exporters.report import page as p
+
+    report, text = f"{row.folder}/report.html", f"{text} {row.person}"
+    return p.file_link(report, text) if row.folder and (folder / report).is_file() else text
