@@ -6,13 +6,14 @@ A rendered person (the catalogue's humanoid, painted in parts) sways before a wa
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import ring, swaying
-from kinefit.bodies import Body, load_body
+from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.observations import ColourFrame
@@ -25,12 +26,12 @@ PAINT = {"head": (200, 150, 130), "hand": (200, 150, 130), "forearm": (205, 155,
          "thigh": (50, 45, 40), "shank": (55, 50, 45), "foot": (220, 220, 215), "toes": (220, 220, 215)}  # fmt: skip
 
 
-def pictures(body: Body, rig: Rig, seed: int = 0) -> list[dict[str, NDArray]]:
-    """(480, 640, 3) uint8 of every camera at every time."""
+def pictures(body: Body, rig: Rig, states: Sequence[BodyState], seed: int = 0) -> list[dict[str, NDArray]]:
+    """(480, 640, 3) uint8 of every camera at every state."""
     random, mesh, out = np.random.default_rng(seed), body_mesh(body), []
     colour = np.array([PAINT[name.removesuffix("_r").removesuffix("_l")] for name in body.tree.segments], float)
     walls = {c.name: random.uniform(60, 200, (24, 32, 3)).repeat(20, axis=0).repeat(20, axis=1) for c in rig}
-    for state in swaying(body, FRAMES):
+    for state in states:
         one = {}
         for camera in rig:
             drawn = render_body(body, state, camera, mesh=mesh)
@@ -44,7 +45,7 @@ def run() -> None:
     """Print the processor time of a frame with one camera and with seven."""
     body = load_body("humanoid")
     rig, truth = ring(7), swaying(body, FRAMES)
-    seen = pictures(body, rig)
+    seen = pictures(body, rig, truth)
     print(f"# {len(body_mesh(body).faces)} triangles, 640 x 480, image processing included; processor time")
     for count, goal in ((1, "<= 10"), (7, "<= 70")):
         spent, off = [], []

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
-from benchmarks.regions_speed import PAINT
+from benchmarks.regions_speed import pictures
 from benchmarks.silhouettes_scene import ring, swaying
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import body_mesh
@@ -106,16 +106,8 @@ def masks(body: Body, truth: Sequence[BodyState], rig: Rig) -> Frames:
 
 def colours(body: Body, truth: Sequence[BodyState], rig: Rig) -> Frames:
     """Pictures of a painted person before a wall of many colours."""
-    mesh, random = body_mesh(body), np.random.default_rng(0)
-    paint = np.array([PAINT[name.removesuffix("_r").removesuffix("_l")] for name in body.tree.segments], float)
-    walls = {c.name: random.uniform(60, 200, (24, 32, 3)).repeat(20, axis=0).repeat(20, axis=1) for c in rig}
-
-    def frame(camera: Camera, state: BodyState, at: float) -> ColourFrame:
-        drawn = render_body(body, state, camera, mesh=mesh)
-        image = np.where(drawn.seen[..., None], paint[drawn.segment], walls[camera.name])
-        return ColourFrame(camera.name, at, np.clip(image + random.normal(0, 6, image.shape), 0, 255).astype(np.uint8))
-
-    return by_cameras(truth, rig, frame)
+    seen = pictures(body, rig, truth)
+    return [[ColourFrame(name, i / RATE, image) for name, image in one.items()] for i, one in enumerate(seen)]
 
 
 def depth(body: Body, truth: Sequence[BodyState], rig: Rig) -> Frames:

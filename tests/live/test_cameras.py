@@ -5,22 +5,12 @@ import time
 import cv2
 import numpy as np
 import pytest
+from tests.live.taking import image, taken
 
 from kinefit.errors import FileError
 from kinefit.live import cameras
 from kinefit.live.cameras import CameraStream, Clock, VideoReplay
 from kinefit.live.inbox import Inbox
-
-
-def image(value):
-    return np.full((48, 64, 3), value, np.uint8)
-
-
-def taken(inbox, count, limit=20.0):
-    out, until = [], time.monotonic() + limit
-    while len(out) < count and time.monotonic() < until:
-        out += inbox.take(0.1)
-    return out
 
 
 class Webcam:

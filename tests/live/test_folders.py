@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from tests.docs.drawn import write_openpose
+from tests.live.taking import image, taken
 
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import Rig
@@ -20,17 +21,6 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import TOF, cut, in_front, simulate_depth, squat_and_wave
-
-
-def image(value):
-    return np.full((48, 64, 3), value, np.uint8)
-
-
-def taken(inbox, count, limit=20.0):
-    out, until = [], time.monotonic() + limit
-    while len(out) < count and time.monotonic() < until:
-        out += inbox.take(0.1)
-    return out
 
 
 def test_new_images_of_a_folder_are_taken_once_and_in_order(tmp_path):

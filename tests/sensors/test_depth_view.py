@@ -7,9 +7,10 @@ from tests.tracking.depth_oracle import ARMS, BODY, camera, depth_of, facing
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.fingers import of_fingers
+from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces import MeshSurface, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
-from kinefit.initialization.depth_score import OVERLAP, POSTURE, TOLERANCE, Score, limbs, spreads
+from kinefit.initialization.depth_score import OVERLAP, POSTURE, TOLERANCE, Score, spreads
 from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.batch.summary import by_joint
+from kinefit.batch.summary import OUTCOME, by_joint, outcome
 from kinefit.batch.work import DONE, Row
 
 if TYPE_CHECKING:
@@ -46,13 +46,7 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
 def _people(rows: Sequence[Row], folder: Path) -> Html:
     from kinefit.exporters.report import page as p
 
-    cells = []
-    for row in rows:
-        quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
-        lost = "" if row.lost is None else f"{100 * row.lost:.1f} %"
-        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
-        cells.append((_linked(row, folder), row.status, str(row.frames or ""), seconds, quality, lost))
-    return p.table(("person", "status", "frames", "seconds", "quality", "lost"), cells, first_left=2)
+    return p.table(("person", *OUTCOME), [(_linked(row, folder), *outcome(row)) for row in rows], first_left=2)
 
 
 def _person(row: Row, folder: Path, pictures: bool) -> list[str]:

@@ -84,13 +84,21 @@ def _takes(rows: Sequence[Row], folder: Path) -> Html:
     for row in rows:
         report = f"{row.folder}/report.html"
         linked = p.file_link(report, row.take) if row.folder and (folder / report).is_file() else row.take
-        quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
-        lost = "" if row.lost is None else f"{100 * row.lost:.1f} %"
-        seconds = "" if row.seconds is None else f"{row.seconds:.2f}"
-        cells.append((linked, _person(row), row.subject, row.visit, row.date, row.movement, row.status,
-                      str(row.frames or ""), seconds, quality, lost, row.error))  # fmt: skip
-    columns = ("take", "person", *_WHO[2:], "status", "frames", "seconds", "quality", "lost", "error")
+        cells.append((linked, _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row), row.error))
+    columns = ("take", "person", *_WHO[2:], *OUTCOME, "error")
     return p.table(columns, cells, first_left=7)
+
+
+OUTCOME = "status", "frames", "seconds", "quality", "lost"
+
+
+def outcome(row: Row) -> tuple[str, ...]:
+    """The cells of `OUTCOME`, empty where a row failed."""
+    from kinefit.exporters.report import page as p
+
+    quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
+    lost = "" if row.lost is None else f"{100 * row.lost:.1f} %"
+    return row.status, str(row.frames or ""), "" if row.seconds is None else f"{row.seconds:.2f}", quality, lost
 
 
 def by_joint(rows: Sequence[Row]) -> Html:

@@ -172,8 +172,8 @@ def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[R
     if len(rows) > 1 and job.choices.report:
         from kinefit.batch.people_report import write_people_report
 
-        beside = [msgspec.structs.replace(row, folder=row.folder and f"person-{row.person}") for row in rows]
-        made.append(write_people_report(beside, job.out, pictures=job.choices.draws).name)
+        own = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
+        made.append(write_people_report(own, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made
 
 

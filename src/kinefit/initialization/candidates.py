@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.limbs import limbs
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.initialization.depth_score import limbs
 from kinefit.initialization.depth_search import Search
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.fingers import knuckles
+from kinefit.bodies.limbs import limbs
 from kinefit.correspondences import point_rows, prior_rows, surface_rows
-from kinefit.initialization.depth_score import Score, limbs, spreads
+from kinefit.initialization.depth_score import Score, spreads
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.depth_view import DepthView, geodesic_ends

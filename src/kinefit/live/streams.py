@@ -17,6 +17,7 @@ from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointF
 from kinefit.live.session import Source
 from kinefit.preparing.detecting import Tell, hush, networks
 from kinefit.readers.depth.recordings import read_depth
+from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.file import CameraEntry, DepthEntry, Take
 from kinefit.readers.take.load import image_frame, read_rig
 from kinefit.readers.take.one_camera import assumed_camera, is_alone
@@ -136,12 +137,13 @@ def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: Clock)
 
 
 def _depth_camera(entry: DepthEntry, rig: Rig | None, take: Take) -> Camera:
-    """The sensor's camera: of the calibration, or of its intrinsics in the take."""
-    if rig is not None:
-        return replace(rig[entry.camera or entry.name], name=entry.name)
-    if entry.intrinsics is None or entry.size is None:
-        remedy = "Write intrinsics = [fx, fy, cx, cy] and size = [width, height] [px], or add [calibration]."
-        raise CalibrationError("nothing states its intrinsics", file=take.path, place=f"depth {entry.name}",
-                               remedy=remedy)  # fmt: skip
-    fx, fy, cx, cy = entry.intrinsics
-    return Camera(entry.name, entry.size, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry.distortion)  # type: ignore[arg-type]
+    """The sensor's camera as it is stated; errors name the take and the sensor."""
+    remedy = "Write intrinsics = [fx, fy, cx, cy] and size = [width, height] [px], or add [calibration]."
+    try:
+        camera = stated_camera(entry, entry.size, rig)
+        if camera is None:
+            raise CalibrationError("nothing states its intrinsics", remedy=remedy)
+    except (CalibrationError, TakeError) as error:
+        place = f"depth {entry.name}"
+        raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
+    return camera

@@ -131,8 +131,7 @@ def bones_of(rig: Rig, keypoints: Sequence[Keypoints], views: Mapping[int, Seque
     views : {frame: (record, person in it)}, of two cameras and more
     """
     joints = joints_of(keypoints[0].names)
-    frames = sorted(views)
-    frames = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _FRAMES).astype(int))] if frames else []
+    frames = _spread(views, _FRAMES)
     columns = list(joints.values())
     uv = np.full((len(frames), len(columns), len(rig), 2), np.nan)
     limit = []
@@ -164,6 +163,12 @@ def bones_of(rig: Rig, keypoints: Sequence[Keypoints], views: Mapping[int, Seque
     return Looks(np.array([t[0] for t in told]), np.array([t[1] for t in told]), unknown.colours)
 
 
+def _spread(frames: Iterable[int], count: int) -> list[int]:
+    """At most so many of some frames, spread over them."""
+    every = sorted(frames)
+    return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, count).astype(int))] if every else []
+
+
 def _length(a: NDArray, b: NDArray) -> NDArray:
     with np.errstate(divide="ignore"):
         return np.log(np.linalg.norm(a - b, axis=-1))
@@ -191,8 +196,7 @@ def colours_of(
     pictures : Pictures
     """
     joints = joints_of(keypoints[0].names)
-    frames = sorted(views)
-    frames = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, _VIEWS).astype(int))] if frames else []
+    frames = _spread(views, _VIEWS)
     found: list[list[NDArray]] = [[], []]
     for f in frames:
         for q, p in views[f]:

@@ -65,7 +65,8 @@ class Recovery:
         result: FrameResult | None,
     ) -> FrameResult | None:  # fmt: skip
         """The result of one time, or a better one that was found."""
-        s = self.settings
+        s, search = self.settings, None
+        rare = s.search and self.rate < 1.0 / _ANEW
         if np.isnan(self._good[0]):
             self._good[0] = time
         if result is None or result.support < s.support:
@@ -73,7 +74,8 @@ class Recovery:
         if result is not None:
             lost = result.lost | (~result.hidden & (result.segment_quality < s.doubtful))
             seek = lost
-            search = None if self.rate >= 1.0 / _ANEW else self._search(tracker, time, measurements, result)
+            if rare:
+                search = self._search(tracker, time, measurements, result)
             if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
                 seek = lost | self._of_limbs
             self._good[~seek] = time
@@ -88,8 +90,10 @@ class Recovery:
         self._sought = time
         if result is None or _astray(result, s.poor):
             return self._from_views(tracker, time, frames, result)
-        result = self._limbs(tracker, time, frames, measurements, result, seek, lost)
-        if self.rate < 1.0 / _ANEW:
+        search = search or self._search(tracker, time, measurements, result)
+        if search is not None:
+            result = self._limbs(tracker, time, frames, search, result, seek, lost)
+        if rare:
             search = self._search(tracker, time, measurements, result)
             missing = search is not None and search.score.missing(result.state) > LEAP
             if result.lost.any() or missing:
@@ -136,12 +140,9 @@ class Recovery:
         return result
 
     def _limbs(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
-        result: FrameResult, seek: NDArray, lost: NDArray,
+        self, tracker: Tracker, time: float, frames: Sequence[Any], search: Search, result: FrameResult,
+        seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
-        search = self._search(tracker, time, measurements, result)
-        if search is None:
-            return result
         free = dofs_of_limbs(self.body, seek)
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
         held = result.state, forgetting(inverse(np.diag(std**2)), free)

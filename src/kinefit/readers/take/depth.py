@@ -108,25 +108,40 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
     return replace(video, background=background, on_body=entry.on_body)
 
 
-def _camera(entry: DepthEntry, video: DepthVideo, rig: Rig | None) -> Camera:
-    """The sensor's camera: of the calibration, of its intrinsics in the take, or of the recording itself."""
+def stated_camera(entry: DepthEntry, size: tuple[int, int] | None, rig: Rig | None) -> Camera | None:
+    """A sensor's camera for images of a size [px]: of the calibration, or of its intrinsics in the take; None for none.
+
+    Raises
+    ------
+    CalibrationError
+        A camera that is not calibrated, or at another size.
+    TakeError
+        A principal point outside of the image.
+    """
     if rig is not None:
         camera = replace(rig[entry.camera or entry.name], name=entry.name)
-        if camera.size != video.size:
+        if size is not None and camera.size != tuple(size):
             raise CalibrationError(
-                f"its images have {video.size[0]}x{video.size[1]} px, its calibration is of {camera.size}",
+                f"its images have {size[0]}x{size[1]} px, its calibration is of {camera.size}",
                 remedy="Calibrate it at the size that it records in.",
             )  # fmt: skip
         return camera
-    if entry.intrinsics is not None:
-        fx, fy, cx, cy = entry.intrinsics
-        camera = Camera(entry.name, video.size, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry.distortion)  # type: ignore[arg-type]
-        if not (0 < cx < video.size[0] and 0 < cy < video.size[1]):
-            raise TakeError(
-                f"principal point ({cx:g}, {cy:g}) outside of {video.size[0]}x{video.size[1]} px",
-                remedy="Give intrinsics = [fx, fy, cx, cy] of images of this size.",
-            )  # fmt: skip
-        return camera
+    if entry.intrinsics is None or size is None:
+        return None
+    fx, fy, cx, cy = entry.intrinsics
+    camera = Camera(entry.name, size, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry.distortion)  # type: ignore[arg-type]
+    if not (0 < cx < size[0] and 0 < cy < size[1]):
+        raise TakeError(
+            f"principal point ({cx:g}, {cy:g}) outside of {size[0]}x{size[1]} px",
+            remedy="Give intrinsics = [fx, fy, cx, cy] of images of this size.",
+        )  # fmt: skip
+    return camera
+
+
+def _camera(entry: DepthEntry, video: DepthVideo, rig: Rig | None) -> Camera:
+    """The sensor's camera: as it is stated, or of the recording itself."""
+    if (stated := stated_camera(entry, video.size, rig)) is not None:
+        return stated
     if video.camera is None:
         raise CalibrationError(
             "nothing states its intrinsics",
