@@ -101,7 +101,7 @@ def overhead(takes: int) -> None:
         figure("batch_dask_overhead_ms", None, *goal, "the extra cluster is not installed")
         return
     jobs = [Job(Path(f"s{k}/take.toml"), f"s{k}", Path(f"out/s{k}"), f"s{k}", Choices()) for k in range(takes)]
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, protocol="tcp://") as cluster:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", protocol="tcp://") as cluster:
         began = time.monotonic()
         rows = dict(run_there(nothing, jobs, address=cluster.scheduler_address, retries=2))
         seconds = time.monotonic() - began

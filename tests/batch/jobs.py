@@ -34,5 +34,11 @@ def killed(number):
     return number
 
 
+def killed_later(number):
+    """Beside 0, which takes longer, 1 kills them both."""
+    time.sleep(0.2 if number == 1 else 1.0)
+    return killed(number)
+
+
 def threads(_):
     return os.environ["OMP_NUM_THREADS"], os.getpid()

@@ -27,7 +27,7 @@ def test_without_the_package_the_extra_is_named(monkeypatch):
 def cluster():
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp://"
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=":0", protocol="tcp://"
     ) as made:
         yield made.scheduler_address
 
@@ -68,7 +68,7 @@ def processes():
     """A cluster of two worker processes, each with a nanny that starts it anew."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, protocol="tcp://"
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", protocol="tcp://"
     ) as made:
         yield made
 
@@ -82,6 +82,18 @@ def test_a_worker_that_dies_is_tried_again_then_told(processes, tmp_path):
     found = results(jobs.killed, [0, 1, 2, 3], address, retries=1)
     assert [found[k] for k in (0, 2, 3)] == [0, 2, 3]
     assert isinstance(found[1], Failure) and found[1] == "the worker died, again and again"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGKILL")
+@pytest.mark.filterwarnings("default::ResourceWarning")
+def test_jobs_on_the_same_worker_as_one_that_kills_it_are_not_blamed():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0", protocol="tcp://"
+    ) as made:
+        found = results(jobs.killed_later, [0, 1], made.scheduler_address)
+    assert found == {0: 0, 1: "the worker died, again and again"}
 
 
 @pytest.mark.slow

@@ -27,7 +27,9 @@ def run_there(
     jobs : anything that can be pickled
     address : of the scheduler, such as "tcp://host:8786"
     retries : int, how often a job is tried again that raised an error; of one whose worker died, the scheduler decides
-        (`distributed.scheduler.allowed-failures`, 3 unless configured).
+        (`distributed.scheduler.allowed-failures`, 3 unless configured). A scheduler blames a death on all jobs that
+        the worker had been given, so each that is blamed too often is tried once more with none of the others beside
+        it: what kills a worker then stands alone.
 
     Raises
     ------
@@ -35,7 +37,7 @@ def run_there(
         The extra "cluster" is not installed, no scheduler answers, or a worker has another kinefit.
     """
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
     except ImportError as error:
         remedy = "Install it: pip install 'kinefit[cluster]'."
         raise ExportError("a cluster needs the package distributed", place="--cluster", remedy=remedy) from error
@@ -50,11 +52,17 @@ def run_there(
         keys = [f"kinefit-{run}-{k}" for k in range(len(jobs))]
         futures = client.map(do, jobs, key=keys, retries=retries, pure=False)
         numbers = {future.key: k for k, future in enumerate(futures)}
-        ended = as_completed(futures, loop=client.loop, with_results=True, raise_errors=False)
-        for future, result in ended:
+        blamed = []
+        for future, result in _ended(client, futures):
             number = numbers[future.key]
-            yield number, result if future.status == "finished" else _failure(result)
+            if future.status != "finished" and _killed(result):
+                blamed.append(number)
+            else:
+                yield number, _result(future, result)
             future.release()
+        for number in sorted(blamed):
+            future = client.submit(do, jobs[number], key=f"{keys[number]}-alone", retries=retries, pure=False)
+            yield from ((number, _result(*ended)) for ended in _ended(client, [future]))
 
 
 def _check_workers(client: Any, address: str) -> None:
@@ -70,8 +78,23 @@ def _check_workers(client: Any, address: str) -> None:
         raise ExportError(f"another kinefit on {len(other)} of the workers ({other[0]})", place=address, remedy=remedy)
 
 
-def _failure(result: Any) -> Failure:
-    error = result[1] if isinstance(result, tuple) and len(result) == 3 else result
-    if type(error).__name__ == "KilledWorker":
-        return Failure("the worker died, again and again")
-    return Failure(f"{type(error).__name__}: {error}")
+def _ended(client: Any, futures: list[Any]) -> Iterator[tuple[Any, Any]]:
+    """Futures as they end, each with its result or error."""
+    from distributed import as_completed
+
+    return as_completed(futures, loop=client.loop, with_results=True, raise_errors=False)  # type: ignore[no-any-return]
+
+
+def _result(future: Any, result: Any) -> Any:
+    if future.status == "finished":
+        return result
+    error = _error(result)
+    return Failure("the worker died, again and again" if _killed(error) else f"{type(error).__name__}: {error}")
+
+
+def _error(result: Any) -> Any:
+    return result[1] if isinstance(result, tuple) and len(result) == 3 else result
+
+
+def _killed(result: Any) -> bool:
+    return type(_error(result)).__name__ == "KilledWorker"
