@@ -27,13 +27,13 @@ SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
 GROUPS = (*SIMULATED, "misfit", "real", "memory")
-DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 2, 1.2
+DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 1.2
 
 
 def main() -> None:
     """Print the figures that the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mixed", description="Figures of sensors together.")
-    parser.add_argument("--quick", action="store_true", help="two draws, short takes, fewer runs; within two minutes")
+    parser.add_argument("--quick", action="store_true", help="one draw, short takes, fewer runs; within two minutes")
     parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
     parser.add_argument("--each", type=int, help="so many takes of each draw, in turn, in place of all: of intervals")
     parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")

@@ -13,6 +13,7 @@ PARTS = {
     "people_depth": "one person before real depth cameras",
     "people_return": "people who leave and come back elsewhere, simulated and in four real videos",
     "people_simulated": "people who cross, shake hands, hide each other, leave and come back",
+    "people_rough": "the same as detectors see people in real rooms: missed, doubled, merged, behind furniture",
 }
 
 if __name__ == "__main__":

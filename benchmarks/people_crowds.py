@@ -44,7 +44,7 @@ class Crowd:
     there: NDArray
 
 
-def crowd(kind: str, seed: int, frames: int = 150) -> Crowd:
+def crowd(kind: str, seed: int, frames: int = 150, keypoint_set: str = SET, noise_px: float = 3.0) -> Crowd:
     """People of one kind of scene; 3 px of noise, 10 % outliers, 10 % missing, four or five cameras."""
     random = np.random.default_rng(seed)
     count = {"crowd": 5, "leave": 3}.get(kind, 2 + seed % 2)
@@ -59,18 +59,20 @@ def crowd(kind: str, seed: int, frames: int = 150) -> Crowd:
     if kind == "leave":
         there[frames // 3 : frames // 3 + 45, 1] = False
     rig = studio_rig(_together(motions), cameras=4 + seed % 2)
-    each = [simulate_keypoints(m, rig, SET, seed=100 * seed + k) for k, m in enumerate(motions)]
+    each = [
+        simulate_keypoints(m, rig, keypoint_set, noise_px=noise_px, seed=100 * seed + k) for k, m in enumerate(motions)
+    ]
     records, orders = [], []
     for c, camera in enumerate(rig):
         order = np.stack([random.permutation(count) for _ in range(frames)])
         points = np.stack([e[c].points[:, 0] for e in each], axis=1)
         confidence = np.stack([e[c].confidence[:, 0] for e in each], axis=1)
-        hidden = _hidden(motions, camera, there) & (random.uniform(size=confidence.shape) > _SEEN_THROUGH)
+        hidden = _hidden(motions, camera, there, keypoint_set) & (random.uniform(size=confidence.shape) > _SEEN_THROUGH)
         gone = hidden | ~there[..., None]
         points[gone], confidence[gone] = np.nan, 0.0
         points = np.take_along_axis(points, order[:, :, None, None], axis=1)
         confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        records.append(Keypoints(camera.name, SET, each[0][c].names, RATE, points, confidence))
+        records.append(Keypoints(camera.name, keypoint_set, each[0][c].names, RATE, points, confidence))
         orders.append(np.argsort(order, axis=1))
     return Crowd(tuple(motions), rig, tuple(records), tuple(orders), there)
 
@@ -135,9 +137,9 @@ def _together(motions: Sequence[Motion]) -> Motion:
     return replace(motions[0], Ts_world_root=T)
 
 
-def _hidden(motions: Sequence[Motion], camera: Camera, there: NDArray) -> NDArray:
+def _hidden(motions: Sequence[Motion], camera: Camera, there: NDArray, keypoint_set: str = SET) -> NDArray:
     """(F, P, K) whether a body in front of it hides a point from a camera."""
-    x = np.stack([m.positions(m.body.keypoints(SET)) for m in motions], axis=1)
+    x = np.stack([m.positions(m.body.keypoints(keypoint_set)) for m in motions], axis=1)
     joints = np.stack([m.segment_poses()[..., :3, 3] for m in motions], axis=1)
     parents = motions[0].body.tree.parents
     ends = [(int(p), s) for s, p in enumerate(parents) if p >= 0]

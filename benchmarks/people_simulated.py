@@ -26,7 +26,7 @@ def run() -> None:
     for kind, seed in sequences[:2] if quick() else sequences:
         seen = crowd(kind, seed, amount(150, 45))
         people = people_of(seen.rig, seen.keypoints)
-        whose = [_owner(seen, one.chosen) for one in people]
+        whose = [owners_of(seen, one.chosen) for one in people]
         others = [(w >= 0) & (w != np.bincount(w[w >= 0]).argmax()) for w in whose]
         exchanged += sum(int(np.any(2 * o.sum(axis=0) > (w >= 0).sum(axis=0))) for o, w in zip(others, whose))
         mixed = sum(int(o.sum()) for o in others)
@@ -36,7 +36,7 @@ def run() -> None:
         told = []
         for k in range(len(people)):
             owner = int(np.bincount(whose[k][whose[k] >= 0]).argmax())
-            told.append(_errors(seen, k, owner))
+            told.append(errors_of(seen, k, owner))
             errors.append(told[-1][0])
             right.append(told[-1][1])
         print(
@@ -53,7 +53,7 @@ def run() -> None:
     _speed()
 
 
-def _owner(seen: Crowd, chosen: tuple) -> np.ndarray:
+def owners_of(seen: Crowd, chosen: tuple) -> np.ndarray:
     """(C, F) whose detections somebody has, -1 for none."""
     out = []
     for mine, order in zip(chosen, seen.order):
@@ -62,7 +62,7 @@ def _owner(seen: Crowd, chosen: tuple) -> np.ndarray:
     return np.array(out)
 
 
-def _errors(seen: Crowd, k: int, owner: int) -> tuple[float, float]:
+def errors_of(seen: Crowd, k: int, owner: int) -> tuple[float, float]:
     """[mm] mean distance of joints and share of limbs found while the person is there; smoothed, as by the command."""
     recording = Recording.of_keypoints(seen.rig, seen.keypoints, accuracy=4.0, person=k + 1, up="y")
     motion = track(recording, load_body("humanoid"))

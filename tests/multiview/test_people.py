@@ -117,6 +117,24 @@ def test_who_leaves_and_comes_back_is_the_same():
     assert found[0].surety > other.surety
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_second_detections_of_one_do_not_stand_in_for_another_who_left(seed):
+    a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 100), 1)
+    b = along(line((0.7, 0.0, 0.3), (0.7, 0.0, 0.5), 100), 2)
+    random = np.random.default_rng(seed)
+    keypoints, truth = records([a, b, a], unseen=[(1, None, 35, 65)], seed=seed)
+    partial = []
+    for k, places in zip(keypoints, truth):
+        less = np.array(k.confidence)
+        for f, place in enumerate(places[:, 2]):
+            less[f, place] *= 0.6 * (random.uniform(size=len(NAMES)) < 0.7) * (random.uniform() < 0.5)
+        partial.append(replace(k, confidence=less))
+    found = people_of(RIG, partial)
+    same = [np.where(places == 2, 0, places) for places in owners(found, truth)]
+    assert sorted(int(w[w >= 0][0]) for w in same) == [0, 1]
+    assert all(len(np.unique(w[w >= 0])) == 1 for w in same)
+
+
 def test_who_is_seen_by_too_few_at_first_has_their_beginning_too():
     a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 60), 1)
     b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)

@@ -114,3 +114,20 @@ def test_what_is_said_of_those_who_come_back():
     found = people_of(RIG, keypoints)
     said = sentences(Followed(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
     assert sum("leaves it open" in s for s in said) == 2
+
+
+def test_what_few_views_took_for_somebody_beside_who_follows_is_left_out():
+    from kinefit.multiview.returns import Span, chains_of
+
+    def span(views, x=0.0):
+        nodes = {f: [(c, 0) for c in range(n)] for f, n in enumerate(views) if n}
+        return Span(nodes, {f: np.tile([x, 0.0, 0.0], (3, 1)) + 0.01 * f for f in nodes})
+
+    def views(spans):
+        keypoints, _ = records([stay([AT[0]] * 2, 7)])
+        chains = chains_of(RIG, keypoints, spans, 3, None)
+        return [[len(chain.span.nodes.get(f, ())) for f in range(100)] for chain in chains]
+
+    assert views([span([4] * 50 + [2] * 50), span([0] * 30 + [2] * 20 + [4] * 50)]) == [[4] * 100]
+    another = [0] * 80 + [4] * 20  # who comes while the first one is there
+    assert views([span([4] * 100), span(another, x=1.0)]) == [[4] * 100, another]

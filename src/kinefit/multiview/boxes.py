@@ -1,4 +1,4 @@
-"""One person in the records of two detectors of one camera: by the boxes that they give."""
+"""Detections of one person in one picture: those of two detectors, by their boxes, and two of the same detector."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from kinefit.observations import Keypoints
 from kinefit.solvers.assignment import assign
 
 _BOX = 0.3  # boxes that two detectors give one person differ by less, as a share of their height
+_DOUBLE = 0.03  # points of two detections of one person differ by less, as a share of the height: detectors' noise
+_SHARED = 4  # points that both have, at the least
+_MOST = 0.5  # of them that must be so near
 
 
 def same_people(people: Sequence[NDArray], theirs: Keypoints, mine: Keypoints) -> list[NDArray]:
@@ -31,6 +34,27 @@ def same_people(people: Sequence[NDArray], theirs: Keypoints, mine: Keypoints) -
                 cost[i] = np.where(np.isfinite(off), off, np.inf)
         for i, p in assign(cost, _BOX):
             out[i][f] = p
+    return out
+
+
+def once(record: Keypoints, surety: NDArray) -> NDArray:
+    """(F, P) how sure each detection is, as given, and 0 for the less sure of two detections of one person.
+
+    They are of one person where they share points enough, half of which lie on their likes.
+    """
+    out = surety.copy()
+    frames, count = surety.shape
+    points = np.where((record.confidence[:frames] > 0.1)[..., None], record.points[:frames], np.nan)
+    height = _boxes(record)[:frames, :, 3]
+    for a in range(count):
+        for b in range(a + 1, count):
+            both = np.flatnonzero((surety[:, a] > 0) & (surety[:, b] > 0))
+            if both.size:
+                off = np.linalg.norm(points[both, a] - points[both, b], axis=-1)
+                near = np.sum(off < _DOUBLE * np.maximum(height[both, a], height[both, b])[:, None], axis=1)
+                double = both[near >= np.maximum(_SHARED, _MOST * np.isfinite(off).sum(axis=1))]
+                less = np.where(surety[double, a] < surety[double, b], a, b)
+                out[double, less] = 0.0
     return out
 
 

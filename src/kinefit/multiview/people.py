@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, links_of, some_points, surety_of
-from kinefit.multiview.boxes import same_people
+from kinefit.multiview.boxes import once, same_people
 from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
 from kinefit.multiview.returns import BRIEF, Chain, Return, Span, chains_of
@@ -28,6 +28,7 @@ from kinefit.solvers.assignment import assign
 _NEAR = 0.25  # a person's points and a detection differ by less, as a share of the detection's height, and by ...
 _TALL = 1.7  # [m] ... how far people go from frame to frame, for one of this stature; half a height at most
 _FITS = 0.08  # views of one person all lie within this share of the height; two, see association, within half of it
+_LEAP = 0.05  # [m] points that two views alone tell are no farther from where somebody is expected, who hardly went on
 _SAME = 0.2  # [m] points of two people are further apart than detections of one and the same
 _LASTING = 1.0  # [s] for which somebody must be seen to be a person; half of a take that is shorter than two
 STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as large as a motion
@@ -133,8 +134,9 @@ class _Track:
 
     x: NDArray  # (k, 3) [m] last known points
     v: NDArray  # (k, 3) [m] a frame
-    last: int
+    last: int  # frame in which it was seen, and ...
     born: int
+    met: int  # ... in which by two cameras or more
     nodes: dict[int, list[Node]] = field(default_factory=dict)
     path: dict[int, NDArray] = field(default_factory=dict)
 
@@ -155,7 +157,7 @@ class _Track:
         step = (x - self.x) / max(abs(frame - self.last), 1)
         step *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9))
         self.v = np.nan_to_num(0.5 * self.v + 0.5 * step)
-        self.x, self.last = x, frame
+        self.x, self.last, self.met = x, frame, frame
         self.path[frame] = x
 
 
@@ -166,7 +168,7 @@ class _Search:
         self.rig, self.keypoints = rig, keypoints
         self.frames = min(len(k) for k in keypoints)
         self.rate = keypoints[0].rate
-        self.surety = [surety_of(k, self.frames) for k in keypoints]
+        self.surety = [once(k, surety_of(k, self.frames)) for k in keypoints]
         self.cameras = [rig[k.camera] for k in keypoints]
         self.tracks: list[_Track] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
@@ -199,7 +201,7 @@ class _Search:
         for k, (nodes, x) in enumerate(came):
             track = back.get(k)
             if track is None:
-                track = _Track(x, np.zeros_like(x), frame, frame)
+                track = _Track(x, np.zeros_like(x), frame, frame, frame)
                 self.tracks.append(track)
             else:
                 track.x, track.v, track.last = x, np.zeros_like(x), frame
@@ -231,7 +233,8 @@ class _Search:
         """Who was there before enough cameras saw it."""
         for track in self.tracks:
             if track.born == frame + 1:
-                track.x, track.last, track.v = track.path[track.born], track.born, np.zeros_like(track.x)
+                track.x, track.v = track.path[track.born], np.zeros_like(track.x)
+                track.last = track.met = track.born
         early = [t for t in self.tracks if t.born > frame and t.last - frame <= self.rate]
         self._go_on(frame, early)
 
@@ -254,20 +257,30 @@ class _Search:
                 views[t].append((q, mine[p]))
                 if turned[t, p] < as_is[t, p]:
                     sides.add((q, mine[p]))
-        for track, x, nodes in zip(tracks, expected, views, strict=True):
-            if nodes:
-                kept, found = self._agreeing(frame, nodes, x, sides)
-                track.seen(frame, kept, found, SPEED / self.rate)
+        places: list[NDArray] = []
+        for k in sorted(range(len(tracks)), key=lambda k: abs(frame - tracks[k].met)):
+            if not views[k]:
+                continue
+            waited = abs(frame - tracks[k].met)
+            reach = _LEAP + SPEED * waited / self.rate
+            kept, found = self._agreeing(frame, views[k], expected[k], sides, reach)
+            if found is not None and waited > 1 and any(_apart(found, x) < _SAME for x in places):
+                continue  # other detections of somebody who is there
+            tracks[k].seen(frame, kept, found, SPEED / self.rate)
+            if found is not None:
+                places.append(tracks[k].x)
 
     def _off(self, x: NDArray, node: Node, uv: NDArray) -> float:
         """How far a detection's points (k, 2) [px] are from points (k, 3), as a share of its height."""
         return float(distances(self.cameras[node[0]], x[None], uv[None])[0, 0])
 
     def _agreeing(
-        self, frame: int, nodes: list[Node], expected: NDArray | None, sides: Collection[Node] = ()
+        self, frame: int, nodes: list[Node], expected: NDArray | None, sides: Collection[Node] = (),
+        reach: float = np.inf,
     ) -> tuple[list[Node], NDArray | None]:
         """The views that are of one person, and its points (k, 3) [m]; None where a single one is left.
 
+        Two views alone agree on much that is nobody: their points must lie within `reach` [m] of those expected.
         Of those in `sides` left is taken for right: the detector did so, which the fit of the person sets right.
         """
         while len(nodes) > 1:
@@ -277,7 +290,8 @@ class _Search:
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
             x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_FITS * height, 1.0))
             off = np.array([self._off(x, node, own) for node, own in zip(nodes, each)])
-            if off.max() <= _FITS:
+            leapt = expected is not None and len(nodes) == 2 and _apart(x, expected) > reach
+            if off.max() <= _FITS and not leapt:
                 return nodes, x
             if len(nodes) == 2 and expected is not None:
                 off = np.array([self._off(expected, node, own) for node, own in zip(nodes, each)])

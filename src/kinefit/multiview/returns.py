@@ -22,6 +22,7 @@ from kinefit.solvers.assignment import assign
 
 BRIEF = 1.0  # [s] who is away for no longer goes on by place alone: in it people walk less far than they stand apart
 _SHORTEST = 0.3  # [s] of spans that are compared: in less, detectors err once and for all
+_BESIDE = 0.05  # share of the frames in which enough cameras see somebody that may be wrong, beside who follows
 _RETURNS = 2.0  # odds, before anything is known of them, that who comes after somebody left is that one
 _SURE = 10.0  # odds, from which on somebody is taken for another: one in ten such returns would be wrong
 _WAY = 0.3, 0.7  # [m], [m/s] standard deviation of the way: a stride, and those who turn round out of view
@@ -98,6 +99,7 @@ def chains_of(
     pictures : of the cameras, where there are any
     """
     rate, n = keypoints[0].rate, len(spans)
+    spans = _parted(spans, needed, rate)
     ends = [s.ends for s in spans]
     seen = [sum(len(nodes) >= needed for nodes in s.nodes.values()) for s in spans]
     long = [k for k in range(n) if seen[k] >= _SHORTEST * rate]
@@ -136,6 +138,39 @@ def chains_of(
             chain = replace(chain, span=joined, members=(*chain.members, following), returns=(*chain.returns, back))
         out.append(chain)
     return out
+
+
+def _parted(spans: Sequence[Span], needed: int, rate: float) -> list[Span]:
+    """Spans of which one may go on with another, without what one or two views took for them beside the other.
+
+    Who is gone is followed on by single views of things and of others' second detections, and found so before having
+    come, too. Enough cameras never see both then.
+    """
+    out = list(spans)
+    for i, j in ((i, j) for i in range(len(out)) for j in range(len(out)) if i != j):
+        a, b = out[i], out[j]
+        if not (a.ends[0] < b.ends[1] and b.ends[0] <= a.ends[1]):
+            continue
+        well = [np.sort([f for f, nodes in s.nodes.items() if len(nodes) >= needed]) for s in (a, b)]
+        if min(map(len, well)) < _SHORTEST * rate:
+            continue
+        cuts = np.concatenate([well[0] + 1, well[1]])
+        dropped = np.stack([len(well[0]) - np.searchsorted(well[0], cuts), np.searchsorted(well[1], cuts)])
+        best = int(dropped.sum(axis=0).argmin())
+        if np.all(dropped[:, best] <= _BESIDE * np.array([len(w) for w in well])):
+            cut = int(cuts[best])
+            before, after = _within(a, -1, cut), _within(b, cut, np.inf)
+            if _in_reach(before, after, rate):
+                out[i], out[j] = before, after
+    return out
+
+
+def _within(span: Span, first: float, end: float) -> Span:
+    """What of a span lies in frames from `first` to before `end`."""
+    return Span(
+        {f: v for f, v in span.nodes.items() if first <= f < end},
+        {f: x for f, x in span.path.items() if first <= f < end},
+    )
 
 
 def _paired(odds: NDArray) -> list[tuple[int, int]]:
