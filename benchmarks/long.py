@@ -78,9 +78,9 @@ def run() -> None:
             seconds, memory = _tracked(take, out)
             figure(f"long_memory_{frames}", memory, "MB", "<= 700")
             print(f"  {seconds:.0f} s, {sum(p.stat().st_size for p in out.rglob('*')) / 1e6:.0f} MB of results")
-        figure("long_resume_equal", _resumed(folder, amount(3_000, 900)), "of 1", "== 1")
+        figure("long_resume_equal", _resumed(folder, amount(3_000, 450)), "of 1", "== 1")
         motion = read_motion(folder / f"{LENGTHS[0]}-out" / "motion.npz")
-        hour, page = _repeated(motion, amount(HOUR, HOUR // 20)), folder / "report.html"
+        hour, page = _repeated(motion, amount(HOUR, HOUR // 60)), folder / "report.html"
         began = time.process_time()
         write_report(hour, page)
         figure("long_page_108000", page.stat().st_size / 1e6, "MB", "<= 15")
