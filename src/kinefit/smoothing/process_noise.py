@@ -129,6 +129,14 @@ class SmoothTake:
         return out
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
+        """All frames together, from where they are, and how sure they are."""
+        fit = self.solved(strength, tolerance=tolerance)
+        if self.linear is None or self.linear.unsure is None:
+            return fit, posterior(self.body, fit)
+        sure = replace(fit.system, C=fit.system.C - self.linear.unsure)
+        return fit, posterior(self.body, replace(fit, system=sure))
+
+    def solved(self, strength: Strength, *, tolerance: float = 1e-5) -> Smoothed:
         """All frames together, from where they are."""
         lower, upper, usual = boxes(self.body.tree, self.angles)
         never = ~self.told.any(axis=0)  # stays at the prior mean
@@ -142,11 +150,7 @@ class SmoothTake:
         if self.linear is not None:
             make = with_quadratic(self.body, make, self.linear)
         bounds = lower, upper
-        fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
-        if self.linear is None or self.linear.unsure is None:
-            return fit, posterior(self.body, fit)
-        sure = replace(fit.system, C=fit.system.C - self.linear.unsure)
-        return fit, posterior(self.body, replace(fit, system=sure))
+        return smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
 
 
 def estimate(
