@@ -79,11 +79,12 @@ def smooth_results(
     others : what all sensors but the keypoints measured
     contacts : bool
         Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
-    eye : (3,) [m] of the camera that is the only sensor, for the contacts; see `find_contacts`
+    eye : (3,) [m] of the camera that is the only sensor, for the contacts, see `find_contacts`; its pixels then stay
+        no surer than they are stated, since no other view shows what they are off by
     window, overlap : frames of a part that is solved at once, and how many it shares with the next.
     """
     swapped = swapped_channels(channels, results)
-    take = _take(body, channels, results, swapped, rate, settings, others)
+    take = replace(_take(body, channels, results, swapped, rate, settings, others), one_view=eye is not None)
     strength, take, rounds = _estimate(take, settings, window, overlap)
     take, covariances, others_matched = _solved_surely(take, strength, window, overlap)
     again = _swaps(take)
