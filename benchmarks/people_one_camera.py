@@ -4,6 +4,8 @@ The trials of `video_mono_opencap` have joint centres from markers of the same p
 motions at the video's frames, clocks set by the shift of at most 0.12 s that fits best, the estimate laid on the
 markers once for the whole trial by a turn and a shift. OpenCap Monocular's own answers go through the same lines. The
 stature that is stated is the markers': as much of the humanoid's as their thighs, shanks and upper arms are of its own.
+
+Settings were chosen on each camera of the balancing trial alone, against the motion from all four: `_balancing`.
 """
 
 from __future__ import annotations
@@ -66,6 +68,8 @@ def run() -> None:
         with tempfile.TemporaryDirectory() as folder:
             shutil.copy(root / trial / "video.mp4", Path(folder, f"{trial}.mp4"))
             errors.append(_of_trial(root / trial, Path(folder), trial))
+    if not quick():
+        _balancing()
     for name, (unit, goal) in _GOALS.items():
         if name == "one_camera_frames":
             figure(name, sum(e["frames"] for e in errors) / sum(e["seconds"] for e in errors), unit, goal)
@@ -93,6 +97,40 @@ def _of_trial(markers: Path, folder: Path, trial: str) -> Mapping[str, float]:
     print(f"{trial}: {lost:.1%} of segments lost, quality {quality:.2f}, height {stature:.2f} m", flush=True)
     print(f"{trial}: {len(motion)} frames in {took:.1f} s", flush=True)
     return {**ours, "frames": len(motion), "seconds": took}
+
+
+def _balancing() -> None:
+    """Each camera of the balancing trial alone, not calibrated, against all four: told, no figures."""
+    root = data("video_balancing_4cam")
+    if root is None:
+        return
+    alone = []
+    with tempfile.TemporaryDirectory() as where:
+        together = Path(where, "all")
+        together.mkdir()
+        for file in (*(root / "videos").glob("*.mp4"), root / "Calib_refined_static.toml"):
+            shutil.copy(file, together)
+        _kinefit("init", str(together))
+        truth = _tracked(together / "take.toml")
+        x = _joints_of(truth, 1.0)
+        for video in sorted(together.glob("*.mp4")):
+            folder = Path(where, video.stem)
+            (folder / "take-detect").mkdir(parents=True)
+            shutil.copy(video, folder)
+            shutil.copy(together / "take-detect" / f"{video.stem}.npz", folder / "take-detect")
+            _kinefit("init", str(folder))
+            take = folder / "take.toml"
+            take.write_text(take.read_text().replace("# height = 1.75", f"height = {truth.body.stature:.2f}  #"))
+            motion = _tracked(take)
+            alone.append(_against(motion.times, _joints_of(motion, 1.0), truth.times, x, _std_of(motion)))
+    for name in ("relative", "absolute", "knee", "inside_least"):
+        values = [one[f"one_camera_{name}"] for one in alone]
+        print(f"# balancing trial, each camera alone: {name} {np.mean(values):.1f} ({np.round(values, 1)})", flush=True)
+
+
+def _tracked(take: Path) -> Motion:
+    _kinefit("track", str(take), "--person", "first", "--pictures", "none", "--no-report")
+    return read_motion(take.with_name("take-kinefit") / "motion.npz")
 
 
 def _kinefit(*words: str) -> None:

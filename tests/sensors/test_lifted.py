@@ -40,7 +40,7 @@ def test_what_errs_nowhere_leaves_nothing():
     state = posture(BODY, 3)
     matched, rows = rows_of(lifted(state), state, state)
     assert isinstance(rows, PairRows) and np.allclose(rows.weight, 25.0)
-    middle = BODY.positions(state, matched.measurement.hips_of(BODY))[0]
+    middle = BODY.positions(state, matched.measurement.on(BODY).hips)[0]
     hips = BODY.positions(state, POINTS.select(HIPS)).mean(axis=0)
     assert np.linalg.norm(middle - hips) < 2e-3  # in the usual posture they are the same
     assert np.abs(rows.residual).max() < 2e-2  # the network's size is told by bones, seen a little askew

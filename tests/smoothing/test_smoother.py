@@ -101,6 +101,8 @@ def test_windows_cover_a_take_once_and_overlap():
             assert whole.start <= kept.start < kept.stop <= whole.stop
             assert kept.start == 0 or kept.start - whole.start >= overlap // 2
         assert all(b[0].start <= a[0].stop - overlap for a, b in itertools.pairwise(found))
+        solved = sum(whole.stop - whole.start for whole, _ in found)
+        assert solved < frames + (len(found) - 1) * overlap + len(found)  # no frame more than they share
 
 
 def test_degrees_of_freedom_are_grouped_by_name_and_by_limb():

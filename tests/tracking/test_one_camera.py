@@ -65,6 +65,8 @@ def test_a_person_is_followed_in_space_by_one_camera(folder):
     inside = np.abs(found - x) < 1.96 * motion.joint_std
     assert 0.8 < inside.mean() <= 1.0
     assert motion.joint_std[:, 0, 1].mean() > 2 * motion.joint_std[:, 0, 0].mean()  # y is away from the camera
+    sigma = motion.provenance["smoothing"]["pixel_sigma"]["phone"]
+    assert set(sigma.values()) == {8.0}  # as stated, though nothing is left over but a jitter of 3 px
     assert {"phone", "lifted phone"} <= set(motion.residuals)
     assert any("field of view of 64°, the usual one" in note for note in seen.notes)
 

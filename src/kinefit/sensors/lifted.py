@@ -55,24 +55,30 @@ class LiftedSensor(Sensor):
 
 
 @dataclass(frozen=True, eq=False)
-class _OnBody:
-    """Landmarks on a body: points (K,), the middle of the hips, and pairs (M,) that stay `length` [m] apart."""
+class OnBody:
+    """Landmarks on a body: points (K,), the middle of the hips, both (K + 1,), and pairs (M,) `length` [m] apart."""
 
     points: PointSet
     hips: PointSet
+    both: PointSet
+    against: NDArray  # (K, 2) segments of the points, and of the hips
     first: NDArray
     second: NDArray
     length: NDArray
 
 
 @lru_cache(maxsize=64)
-def _on(body: Body, keypoint_set: str, names: tuple[str, ...]) -> _OnBody:
+def _on(body: Body, keypoint_set: str, names: tuple[str, ...]) -> OnBody:
     known = known_points(body, keypoint_set)
     points, middle = known.select(names), body.points_rest(known.select(HIPS)).mean(axis=0)
     pairs = rigid_pairs(body, points)
     first, second = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
     hips = PointSet(("hips",), np.zeros(1, np.int64), middle[None] - body.tree.rest[0])
-    return _OnBody(points, hips, first, second, np.array([pair[3] for pair in pairs], float))
+    both = PointSet(
+        (*points.names, "hips"), np.append(points.segments, 0), np.concatenate([points.points, hips.points])
+    )
+    against = np.column_stack([points.segments, np.zeros(len(points), np.int64)])
+    return OnBody(points, hips, both, against, first, second, np.array([pair[3] for pair in pairs], float))
 
 
 class LiftedMeasurement(Measurement):
@@ -91,17 +97,13 @@ class LiftedMeasurement(Measurement):
         self.sensor, self.time, self.of, self.keypoint_set = of.name, frame.time, of, frame.keypoint_set
         self.names, self.x, self.uv = names, x, uv
 
-    def points_of(self, body: Body) -> PointSet:
-        """(K,) the landmarks on a body."""
-        return _on(body, self.keypoint_set, self.names).points
-
-    def hips_of(self, body: Body) -> PointSet:
-        """(1,) the middle of the hips, on the root."""
-        return _on(body, self.keypoint_set, self.names).hips
+    def on(self, body: Body) -> OnBody:
+        """The landmarks on a body."""
+        return _on(body, self.keypoint_set, self.names)
 
     def size_on(self, body: Body) -> float:
         """How much larger this body is than the person that the network takes for granted."""
-        bones = _on(body, self.keypoint_set, self.names)
+        bones = self.on(body)
         if not len(bones.length):
             return 1.0
         apart = self.x[bones.first] - self.x[bones.second]
@@ -111,12 +113,12 @@ class LiftedMeasurement(Measurement):
     def match(self, scene: Scene, reach: float) -> LiftedMatched:
         """As they are named."""
         camera = scene.rig[self.of.camera]
-        ray = scene.positions(self.hips_of(scene.body))[0] - camera.centre_world
+        ray = scene.positions(self.on(scene.body).hips)[0] - camera.centre_world
         return LiftedMatched(self, ray / np.linalg.norm(ray), self.size_on(scene.body))
 
     def hints(self, scene: Scene) -> Hints:
         """The landmarks in space, at the distance at which they appear as large as they do."""
-        points = self.points_of(scene.body)
+        points = self.on(scene.body).points
         return Hints(points, placed(scene.rig[self.of.camera], self.x * self.size_on(scene.body), self.uv))
 
 
@@ -144,14 +146,12 @@ class LiftedMatched(Matched):
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """A row a landmark: its depth behind the middle of the hips."""
         m = self.measurement
-        points, hips = m.points_of(scene.body), m.hips_of(scene.body)
-        x, ref = scene.positions(points), scene.positions(hips)
-        count = len(points.names)
-        segments = np.column_stack([points.segments, np.zeros(count, np.int64)])
+        bones = m.on(scene.body)
+        x = scene.positions(bones.both)
+        ref, x = np.broadcast_to(x[-1], (len(x) - 1, 3)), x[:-1]
         residual = self.size * m.x[:, 2] - (x - ref) @ self.ray
-        weight = np.full(count, 1.0 / m.of.sigma**2)
-        direction = np.broadcast_to(self.ray, x.shape)
-        return [PairRows(segments, x, np.broadcast_to(ref, x.shape), direction, residual, weight)]
+        weight = np.full(len(x), 1.0 / m.of.sigma**2)
+        return [PairRows(bones.against, x, ref, np.broadcast_to(self.ray, x.shape), residual, weight)]
 
     def evidence(self, scene: Scene) -> Evidence:
         """Nothing for a segment or against it: what they are off by lasts, and says little of any one."""

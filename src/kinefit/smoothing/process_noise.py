@@ -58,7 +58,8 @@ class SmoothTake:
 
     `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): its process noise
     over time, as a factor; `others`: what all sensors but the keypoints measured, `linear` the same about
-    the states; `speed_std` (n,) [m/s, rad/s] of the rates of change, which nine tenths of the frames fall below.
+    the states; `speed_std` (n,) [m/s, rad/s] of the rates of change, which nine tenths of the frames fall below;
+    `one_view`: nothing but one camera saw the person, and nothing contradicts what its pixels are off by.
     """
 
     body: Body
@@ -77,6 +78,7 @@ class SmoothTake:
     others: OtherSensors | None = None
     linear: Linearised | None = None
     speed_std: NDArray | None = None
+    one_view: bool = False
 
     def renewed(self, *, keep: bool = False) -> SmoothTake:
         """With all other sensors matched and linearised anew about the states; `keep` keeps the matches."""
@@ -129,6 +131,14 @@ class SmoothTake:
         return out
 
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
+        """All frames together, from where they are, and how sure they are."""
+        fit = self.solved(strength, tolerance=tolerance)
+        if self.linear is None or self.linear.unsure is None:
+            return fit, posterior(self.body, fit)
+        sure = replace(fit.system, C=fit.system.C - self.linear.unsure)
+        return fit, posterior(self.body, replace(fit, system=sure))
+
+    def solved(self, strength: Strength, *, tolerance: float = 1e-5) -> Smoothed:
         """All frames together, from where they are."""
         lower, upper, usual = boxes(self.body.tree, self.angles)
         never = ~self.told.any(axis=0)  # stays at the prior mean
@@ -142,11 +152,7 @@ class SmoothTake:
         if self.linear is not None:
             make = with_quadratic(self.body, make, self.linear)
         bounds = lower, upper
-        fit = smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
-        if self.linear is None or self.linear.unsure is None:
-            return fit, posterior(self.body, fit)
-        sure = replace(fit.system, C=fit.system.C - self.linear.unsure)
-        return fit, posterior(self.body, replace(fit, system=sure))
+        return smooth(self.body, self.roots, self.angles, make, prior, bounds=bounds, dense=dense, tolerance=tolerance)
 
 
 def estimate(
@@ -187,7 +193,10 @@ def estimate(
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
         looks = min(takes[0].dt / _LOOK, 1.0)
         r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
-        found = Strength(acceleration, _noise(channels, r2, variance, looks))
+        sigma = _noise(channels, r2, variance, looks)
+        if takes[0].one_view:  # a pose follows what its only view is off by: residuals show the jitter alone
+            sigma = np.maximum(sigma, channels.sigma)
+        found = Strength(acceleration, sigma)
         change = found.change(strength)
         strength = found
         if takes[0].others is not None:
