@@ -45,14 +45,14 @@ class Networks:
     def search(self, image):
         return []
 
-    def pose(self, crop):
+    def pose(self, crop, *, mask=True):
         with self.lock:
             Networks.pictures += 1
-        mask = np.zeros((SIZE, SIZE), np.float32)
-        mask[64:192, 64:192] = 1
+        inside = np.zeros((SIZE, SIZE), np.float32)
+        inside[64:192, 64:192] = 1
         middle = np.array([128.0, 128.0])
         one, lifted = np.ones(33), np.zeros((33, 3))
-        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, mask, lifted)
+        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, inside if mask else None, lifted)
 
 
 def write_video(path, frames):
@@ -97,7 +97,7 @@ def run(*args):
 
 def test_only_the_take_s_frames_are_looked_through(take, networks, change):
     change(take, "[take]\n", "[take]\nframes = [2, 5]\n")
-    ensure_detections(read_take(take))
+    ensure_detections(read_take(take), masks=True)
     first = networks.pictures
     assert 4 * 5 <= first < 4 * 8  # one more at both ends; the first picture is looked at twice
     found = read_detections(detections_file(take, "cam03"))
@@ -147,7 +147,7 @@ def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # of a worker here: it stops the others as an error does
-        ensure_detections(read_take(take), progress=stop)
+        ensure_detections(read_take(take), masks=True, progress=stop)
     assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
     told = run(take)
     assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
