@@ -52,7 +52,8 @@ class Networks:
         inside[64:192, 64:192] = 1
         middle = np.array([128.0, 128.0])
         one, lifted = np.ones(33), np.zeros((33, 3))
-        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, inside if mask else None, lifted)
+        seen = inside if mask else None
+        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, seen, lifted)
 
 
 def write_video(path, frames):
