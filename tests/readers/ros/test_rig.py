@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.readers.ros.bags import Bag
+from benchmarks.bags import Bag
 
 from kinefit import read_calibration
 from kinefit.errors import CalibrationError
