@@ -37,19 +37,19 @@ def mcap_rig(path: Path) -> Rig:
         infos, names = _infos(topics), camera_names(topics)
         tree = _tree(topics) if _STATIC in topics.kinds else {}
         images = topics.of(IMAGE, COMPRESSED)
-    if not infos:
-        remedy = "Record camera_info of each camera."
-        raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
-    cameras = []
-    for folder, info in infos.items():
-        beside = [topic for topic in images if topic.startswith(f"{folder}/")]
-        rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
-        found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
-        if found is None:
-            told = f"the CameraInfo of {folder} is not calibrated"
-            raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
-        cameras.append(found)
-    frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
+        if not infos:
+            remedy = "Record camera_info of each camera."
+            raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
+        cameras = []
+        for folder, info in infos.items():
+            beside = [topic for topic in images if topic.startswith(f"{folder}/")]
+            rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
+            found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
+            if found is None:
+                told = f"the CameraInfo of {folder} is not calibrated"
+                raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
+            cameras.append(found)
+        frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
     if len(frames) == 1 and frames[0] not in tree:
         return Rig(tuple(cameras))
     roots = [_root(frame, tree) for frame in frames]
