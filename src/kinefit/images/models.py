@@ -104,7 +104,7 @@ def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any
         given = {"model_content": _reduced(path, without)} if without else {"model_path": str(path)}
         interpreter = runtime(**given, num_threads=threads)
         interpreter.allocate_tensors()
-    except (ValueError, RuntimeError, struct.error) as error:
+    except (ValueError, RuntimeError, TypeError, LookupError, AttributeError, struct.error) as error:
         raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=_REMEDY) from error
     return interpreter
 
