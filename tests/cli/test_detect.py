@@ -17,7 +17,7 @@ from kinefit.images.person_detector import Person
 from kinefit.images.pose_model import SIZE, Pose
 from kinefit.observations import Detections
 from kinefit.preparing import detecting
-from kinefit.preparing.take import ensure_detections
+from kinefit.preparing.take import ensure_detections, with_detections
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -319,3 +319,17 @@ def test_python_detects_where_a_take_names_no_keypoints_as_the_command_does(draw
     assert CliRunner().invoke(main, args).exit_code == 0
     same = read_motion(tmp_path / "out" / "motion.npz")
     np.testing.assert_array_equal(same.angles, motion.angles)
+
+
+def test_outlines_are_made_where_a_take_follows_them_and_missing_ones_are_told(take, networks):
+    text = take.read_text().replace("[take]\n", "[take]\nframes = [0, 10]\n", 1)
+    wanted = text + '\n[[keypoints]]\ncamera = "cam01"\nformat = "detect"\n'
+    take.write_text(wanted)
+    with_detections(read_take(take))
+    assert read_detections(detections_file(take, "cam01")).mask(5, 0) is None
+    take.write_text(wanted + '\n[[silhouette]]\ncamera = "cam01"\nformat = "detect"\n')
+    with pytest.raises(TakeError, match="has no outlines.*kinefit detect"):
+        load_observations(read_take(take))
+    with_detections(read_take(take))
+    assert read_detections(detections_file(take, "cam01")).mask(5, 0).any()
+    assert len(load_observations(read_take(take)).silhouettes) == 1
