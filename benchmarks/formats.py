@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.bags import Bag
 from benchmarks.figures import LEFT_OUT, figure, peers
 from benchmarks.peers.environments import run_peer
 from benchmarks.retarget import validated
@@ -24,6 +25,9 @@ from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import bone_names
 from kinefit.geometry import se3
 from kinefit.motion import Motion
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.depth.recordings import read_depth
+from kinefit.readers.video import Video
 from kinefit.simulation import squat_and_wave
 
 GOAL = "<= 1e-05"
@@ -43,7 +47,39 @@ def run() -> None:
             except (ImportError, ExportError) as error:
                 told = (None, str(error))
             figure(f"formats_{name}", told[0], "m", GOAL, told[1])
+        _recorded(folder)
         _programs(motion, folder)
+
+
+def _recorded(folder: Path) -> None:
+    """A recording of ROS 2 that rosbags wrote, read by kinefit: depth, colours, and where cameras stand."""
+    names = "formats_mcap_read_depth", "formats_mcap_read_colours", "formats_mcap_read_cameras"
+    random, size = np.random.default_rng(0), (64, 48)
+    counts = random.integers(500, 4000, (5, 48, 64)).astype(np.uint16)
+    metres = (0.001 * counts).astype(np.float32)
+    colours = random.integers(0, 256, (5, 48, 64, 3)).astype(np.uint8)
+    K, T = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]]), np.eye(4)
+    T[:3, :3], T[:3, 3] = se3.exp_so3(np.array([0.3, -1.2, 0.7])), (1.0, -2.0, 1.5)
+    try:
+        bag = Bag().images("/a/depth/image", "16UC1", counts).images("/b/depth/image", "16UC1 png", counts)
+        bag.images("/c/depth/image", "32FC1", metres).images("/a/color/image", "rgb8", colours)
+        places = [("map", "rig", T)]
+        for topic in ("a/depth", "b/depth", "c/depth", "a/color"):
+            bag.info(f"/{topic}/camera_info", K, size, frame=topic)
+            places.append(("rig", topic, T))
+        file = bag.static(*places).write(folder / "bag")
+    except ImportError as error:
+        for name in names:
+            figure(name, None, "", "> 0", str(error))
+        return
+    videos = [read_depth(file / topic / "depth" / "image") for topic in "abc"]
+    off = [np.abs(video.frame(i).depth - metres[i]).max() for video in videos for i in range(5)]
+    figure(names[0], float(max(off)), "m", "<= 1e-6")
+    with Video(file / "a" / "color" / "image") as video:
+        wrong = sum(int((video.read(i) != colours[i]).any(axis=-1).sum()) for i in range(5))
+    figure(names[1], wrong, "pixels", "== 0")
+    apart = [np.abs(camera.T_world_camera - T @ T).max() for camera in read_calibration(file)]
+    figure(names[2], float(max(apart)), "m", GOAL)
 
 
 def difference(motion: Motion, found: Places, up: str) -> float:

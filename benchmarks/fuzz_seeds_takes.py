@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.bags import Bag
 from benchmarks.fuzz_seeds import Seed, body_of, calibration_of, depth_counts, finite
 
 _CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
@@ -234,10 +235,51 @@ def _depth_take(folder: Path) -> Seed:
     return Seed((folder / "take.toml",), read)
 
 
+def _recording(read: str) -> Callable[[Path], Seed]:
+    """A recording of ROS 2 with depth, raw and compressed, colour, lenses and places; what of it is read."""
+
+    def make(folder: Path) -> Seed:
+        size, K = (64, 48), np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
+        counts, place = depth_counts(), np.eye(4)
+        bag = Bag().images("/a/depth/image_raw", "16UC1", counts).images("/b/depth/image", "16UC1 png", counts)
+        bag.images("/a/color/image_raw", "rgb8", [np.full((48, 64, 3), 40 * i, np.uint8) for i in range(3)])
+        for name in ("a/depth", "b/depth", "a/color"):
+            bag.info(f"/{name}/camera_info", K, size, frame=name)
+        bag.static(*[("map", name, place) for name in ("a/depth", "b/depth", "a/color")])
+        file = bag.write(folder / "bag")
+
+        def depth() -> object:
+            from kinefit.readers.depth.recordings import read_depth
+
+            videos = [read_depth(file / topic) for topic in ("a/depth/image_raw", "b/depth/image")]
+            return [video.frame(i) for video in videos for i in range(min(len(video), 3))]
+
+        def video() -> object:
+            from kinefit.readers.video import Video
+
+            with Video(file / "a/color/image_raw") as found:
+                return [found.read(i) for i in range(min(len(found), 3))]
+
+        def rig() -> object:
+            from kinefit.readers.calibration.read import read_calibration
+
+            return finite(read_calibration(file))
+
+        def init() -> object:
+            from kinefit.readers.guess.folder import guess_take
+
+            return guess_take(file.parent)
+
+        return Seed((file,), {"depth": depth, "video": video, "rig": rig, "init": init}[read])
+
+    return make
+
+
 LATER: dict[str, Callable[[Path], Seed]] = {
     "surface points": _surface_points, "bar": _bar, "norms": _norms, "surface seeds": _seeds,
     "metaballs toml": body_of("arm_metaballs"), "closures toml": body_of("cyclist"),
     "couplings toml": body_of("humanoid"), "lifter toml": body_of("weight_lifter"), "body skin": _skin,
     "take of all sensors": _sensors, "take of depth": _depth_take,
+    **{f"mcap {read}": _recording(read) for read in ("depth", "video", "rig", "init")},
 }  # fmt: skip
 """{reader: maker of its seed}."""

@@ -116,8 +116,8 @@ def followed(folder, frames, rate, more=()):
         time.sleep(0.05)
     out = Path(folder) / "out"
     receivers = [
-        served, Vmc("127.0.0.1", 39539, up="z"), JsonLines(Path(folder) / "poses.jsonl"),
-        MotionRecord(out, rate=RATE, up="z", name="balancing"), *more,
+        JsonLines(Path(folder) / "poses.jsonl"), Vmc("127.0.0.1", 39539, up="z"),
+        MotionRecord(out, rate=RATE, up="z", name="balancing"), served, *more,
     ]  # fmt: skip
     session = LiveSession(whole.tracker, [Loop(keypoints, frames, rate)], receivers, size=whole.size)
     warm_keypoints()

@@ -17,7 +17,7 @@ from kinefit.images.person_detector import Person
 from kinefit.images.pose_model import SIZE, Pose
 from kinefit.observations import Detections
 from kinefit.preparing import detecting
-from kinefit.preparing.take import ensure_detections
+from kinefit.preparing.take import ensure_detections, with_detections
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
@@ -45,14 +45,15 @@ class Networks:
     def search(self, image):
         return []
 
-    def pose(self, crop):
+    def pose(self, crop, *, mask=True):
         with self.lock:
             Networks.pictures += 1
-        mask = np.zeros((SIZE, SIZE), np.float32)
-        mask[64:192, 64:192] = 1
+        inside = np.zeros((SIZE, SIZE), np.float32)
+        inside[64:192, 64:192] = 1
         middle = np.array([128.0, 128.0])
         one, lifted = np.ones(33), np.zeros((33, 3))
-        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, mask, lifted)
+        seen = inside if mask else None
+        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, seen, lifted)
 
 
 def write_video(path, frames):
@@ -97,7 +98,7 @@ def run(*args):
 
 def test_only_the_take_s_frames_are_looked_through(take, networks, change):
     change(take, "[take]\n", "[take]\nframes = [2, 5]\n")
-    ensure_detections(read_take(take))
+    ensure_detections(read_take(take), masks=True)
     first = networks.pictures
     assert 4 * 5 <= first < 4 * 8  # one more at both ends; the first picture is looked at twice
     found = read_detections(detections_file(take, "cam03"))
@@ -147,7 +148,7 @@ def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatc
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):  # of a worker here: it stops the others as an error does
-        ensure_detections(read_take(take), progress=stop)
+        ensure_detections(read_take(take), masks=True, progress=stop)
     assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
     told = run(take)
     assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
@@ -318,3 +319,17 @@ def test_python_detects_where_a_take_names_no_keypoints_as_the_command_does(draw
     assert CliRunner().invoke(main, args).exit_code == 0
     same = read_motion(tmp_path / "out" / "motion.npz")
     np.testing.assert_array_equal(same.angles, motion.angles)
+
+
+def test_outlines_are_made_where_a_take_follows_them_and_missing_ones_are_told(take, networks):
+    text = take.read_text().replace("[take]\n", "[take]\nframes = [0, 10]\n", 1)
+    wanted = text + '\n[[keypoints]]\ncamera = "cam01"\nformat = "detect"\n'
+    take.write_text(wanted)
+    with_detections(read_take(take))
+    assert read_detections(detections_file(take, "cam01")).mask(5, 0) is None
+    take.write_text(wanted + '\n[[silhouette]]\ncamera = "cam01"\nformat = "detect"\n')
+    with pytest.raises(TakeError, match="has no outlines.*kinefit detect"):
+        load_observations(read_take(take))
+    with_detections(read_take(take))
+    assert read_detections(detections_file(take, "cam01")).mask(5, 0).any()
+    assert len(load_observations(read_take(take)).silhouettes) == 1

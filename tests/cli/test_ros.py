@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+from benchmarks.bags import Bag
 from click.testing import CliRunner
-from tests.readers.ros.bags import Bag
 
 from kinefit import read_motion
 from kinefit.cli import main
@@ -61,6 +61,18 @@ def test_the_result_is_that_of_the_same_images_in_files(seen, tmp_path):
     assert len(a) == len(b) == 4
     np.testing.assert_allclose(b.angles, a.angles, atol=1e-6)
     np.testing.assert_allclose(b.positions(), a.positions(), atol=1e-6)
+
+
+def test_a_folder_with_a_recording_becomes_a_take_that_tracks(seen, tmp_path):
+    folder, _ = seen
+    told = CliRunner().invoke(main, ["init", str(folder / "bag"), "--out", str(tmp_path / "take.toml")])
+    assert told.exit_code == 0, told.output
+    assert "/front/depth/image_raw, 4 images, 10 Hz" in told.output
+    take = read_take(tmp_path / "take.toml")
+    assert [(d.name, d.topic) for d in take.depth] == [("depth", "/front/depth/image_raw")] and take.rate == 10.0
+    text = (tmp_path / "take.toml").read_text().replace("[take]", f'[take]\nstart = "{folder / "start.npz"}"', 1)
+    (tmp_path / "take.toml").write_text(text.replace('up = "-y"', 'up = "z"'))
+    assert len(tracked(tmp_path / "take.toml", tmp_path / "out")) == 4
 
 
 @pytest.mark.parametrize(("lines", "error", "told"), [

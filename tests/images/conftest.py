@@ -23,18 +23,18 @@ class DiscModels:
     def search(self, image):
         return []
 
-    def pose(self, crop):
+    def pose(self, crop, *, mask=True):
         near = sorted(discs(crop), key=lambda disc: np.linalg.norm(disc[0] - SIZE / 2))
         if not near or np.linalg.norm(near[0][0] - SIZE / 2) > SIZE / 4:
             nobody = np.zeros((33, 2)), np.zeros(33), np.zeros(33), *np.zeros((2, 2))
-            return Pose(*nobody, 0.0, np.zeros((SIZE, SIZE)), np.zeros((33, 3)))
+            return Pose(*nobody, 0.0, np.zeros((SIZE, SIZE)) if mask else None, np.zeros((33, 3)))
         centre, radius = near[0]
         turn = np.linspace(0, 2 * np.pi, 33, endpoint=False)
         points = centre + radius * np.column_stack([np.cos(turn), np.sin(turn)])
         v, u = np.mgrid[:SIZE, :SIZE]
-        mask = (np.hypot(u - centre[0], v - centre[1]) <= radius).astype(np.float32)
+        inside = (np.hypot(u - centre[0], v - centre[1]) <= radius).astype(np.float32) if mask else None
         lifted = np.tile([0.1, 0.2, 0.3], (33, 1))
-        return Pose(points, np.full(33, 0.9), np.ones(33), centre, centre - (0, 1.2 * radius), 0.99, mask, lifted)
+        return Pose(points, np.full(33, 0.9), np.ones(33), centre, centre - (0, 1.2 * radius), 0.99, inside, lifted)
 
 
 def discs(image):

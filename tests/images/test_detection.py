@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detection import detect_people, mask_runs
-from kinefit.images.pose_model import SIZE, Pose
+from kinefit.images.pose_model import SIZE
 from kinefit.images.roi import Roi
 from kinefit.observations import MEDIAPIPE_33, Detections
 
@@ -79,7 +79,7 @@ def test_others_are_painted_over_in_the_region_of_one(draw, models):
     """The networks would draw the limbs of one towards another: a person's region shows nobody else."""
     image = draw((100, 120, 25), (154, 120, 25))
     seen, pose = [], models.pose
-    models.pose = lambda crop: seen.append((crop.min(axis=2) > 200).mean()) or pose(crop)
+    models.pose = lambda crop, *, mask: seen.append((crop.min(axis=2) > 200).mean()) or pose(crop, mask=mask)
     found = detect([image] * 8, models)
     assert found.seen[-4:].all() and found.points.shape[1] == 2
     assert np.allclose(seen[-2:], np.pi / 3.0**2, rtol=0.06)  # a disc in a square of three radii
@@ -155,11 +155,28 @@ def test_runs_are_those_of_the_mask_drawn_into_the_whole_picture(turn, side, cen
     noise = np.random.default_rng(seed).normal(size=(SIZE, SIZE)).astype(np.float32)
     soft = np.clip(0.5 + 8 * cv2.GaussianBlur(noise, (0, 0), 12), 0, 1)
     soft[[0, 1, -2, -1]] = soft[:, [0, 1, -2, -1]] = 0
-    pose = Pose(*np.zeros((5, 1)), 1.0, soft, np.zeros((33, 3)))
-    runs = mask_runs(pose, roi, (height, width))
+    runs = mask_runs(soft, roi, (height, width))
     found = Detections(
         "c", 1.0, (width, height), np.zeros((1, 1, 33, 2)), np.zeros((1, 1, 33)), runs, np.array([0, len(runs)])
     )
     whole = cv2.warpAffine(soft, roi.A_image_crop(SIZE), (width, height), flags=cv2.INTER_LINEAR) > 0.5
     assert runs.sum() == width * height
     assert (found.mask(0, 0) != whole).sum() <= 0.002 * width * height  # OpenCV rounds places to 1/32 px
+
+
+@pytest.mark.parametrize("people", [1, 2, 3])
+def test_without_outlines_the_points_are_the_same_and_few_masks_are_made(draw, models, people):
+    """Masks are made where they are needed to tell people apart, and nowhere else."""
+    crossing = [draw((70 + 6 * f, 100, 25), (250 - 6 * f, 110, 22)) for f in range(30)]
+    coming = [draw((80, 100, 25))] * 7 + [draw((80, 100, 25), (240, 120, 40))] * 13 + [draw()] * 3
+    pose, asked = models.pose, []
+    models.pose = lambda crop, *, mask: asked.append(mask) or pose(crop, mask=mask)
+    for pictures in (crossing, coming + coming, coming[:7] * 4):
+        asked.clear()
+        with_masks = detect(pictures, models, people=people)
+        asked.clear()
+        without = detect(pictures, models, people=people, masks=False)
+        np.testing.assert_array_equal(without.points, with_masks.points)
+        np.testing.assert_array_equal(without.confidence, with_masks.confidence)
+        assert not len(without.mask_runs) and len(with_masks.mask_runs)
+    assert sum(asked) == (0 if people == 1 else 6), "one alone: every half second"

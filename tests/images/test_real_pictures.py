@@ -57,6 +57,14 @@ def test_landmarks_and_masks_are_those_of_mediapipe(networks, trial, camera):
         assert (mine & theirs).sum() / (mine | theirs).sum() > 0.95
 
 
+def test_the_network_without_its_mask_says_the_same_of_all_else(networks, trial):
+    crop = cv2.resize(pictures(trial, "cam01", [0])[0][400:1480], (256, 256))
+    whole, part = networks.pose(crop), networks.pose(crop, mask=False)
+    assert whole.mask is not None and part.mask is None
+    for name in ("points", "visibility", "presence", "middle", "rim", "score", "lifted"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name))
+
+
 def test_two_people_side_by_side_keep_their_columns(networks, trial):
     frames = range(0, 30, 3)
     images, others = pictures(trial, "cam02", frames), pictures(trial, "cam03", frames)

@@ -168,6 +168,13 @@ class _Told(Family):
     def joints(self) -> dict[str, str]:
         return {segment: name for segment, name in self.trunk.items() if segment in SEGMENTS}
 
+    @property
+    def recorded(self) -> dict[str, str]:
+        """Of what kinefit exported: the head's joint is at the root of the neck; ends of bones are the joints' own."""
+        out = {"sacrum": "abdomen", "spine": "thorax", "neck": "head", "head": "head"}
+        out |= {segment: segment for segment in self.joints if segment.rpartition("_")[0] in LIMBS}
+        return {role: self.trunk[segment] for role, segment in out.items()}
+
 
 def plain(name: str) -> str:
     """A name without namespace, program's prefix, capitals and separators: "mixamorig1:LeftArm" is "leftarm"."""
@@ -255,6 +262,8 @@ class Recorded:
 def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None, *, source: str = "") -> Recorded:
     """What the joints of a recorded skeleton are, by their names; by a table alone where one is given.
 
+    Names are those of `FAMILIES`, or else of a convention under which kinefit exports.
+
     Parameters
     ----------
     names : (J,) of the joints.
@@ -276,6 +285,9 @@ def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None
         short = {family: [n for n in family.recorded.values() if find(names, n) is None] for family in FAMILIES}
         exact = {family: sum(n not in names for n in family.recorded.values()) for family in FAMILIES}
         family = min(FAMILIES, key=lambda f: (len(short[f]) / len(f.recorded), exact[f]))
+        exported = (f for f in conventions() if isinstance(f, _Told))
+        own = (f for f in exported if all(find(names, n) is not None for n in f.recorded.values()))
+        family = next(own, family) if short[family] else family
         wanted = family.recorded
     lost = {role: name for role, name in wanted.items() if find(names, name) is None}
     if lost:

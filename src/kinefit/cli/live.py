@@ -91,15 +91,15 @@ def live(
             from kinefit.live.receivers.lsl import Lsl
 
             receivers.append(Lsl(lsl, rate=rate))
-        if page:
+        kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=told.name)
+        if kept is not None:
+            receivers.append(kept)
+        if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
             from kinefit.live.receivers.websocket import WebSockets
 
             served = WebSockets(port, host=host, title=told.name, ask=session.ask)
             receivers.append(served)
             _screen.say(f"page and poses at {served.address}", stderr=quiet)
-        kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=told.name)
-        if kept is not None:
-            receivers.append(kept)
     except BaseException:
         for receiver in receivers:
             receiver.close()

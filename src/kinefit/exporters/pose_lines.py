@@ -91,6 +91,9 @@ def _rounded(values: NDArray) -> Any:
 
 def _told(std: NDArray) -> Any:
     """Standard deviations as JSON has them."""
-    if np.isfinite(std).all():
+    finite = np.isfinite(std)
+    if finite.all():
         return _rounded(std)
-    return [_told(one) if np.ndim(one) else (round(float(one), _DIGITS) if np.isfinite(one) else None) for one in std]
+    out = np.round(std, _DIGITS).astype(object)
+    out[~finite] = None
+    return out.tolist()

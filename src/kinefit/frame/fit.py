@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import STIFF, closed_at, hard_equations, looped, soft_closures
+from kinefit.correspondences.closures import STIFF, hard_equations, looped, soft_closures
 from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
+from kinefit.frame.minimum import ROUGH, Minimum, minimum
 from kinefit.frame.prediction import belief, released_from
 from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, together
 from kinefit.frame.skin import skin_of
@@ -22,15 +23,12 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.closed import closed_fit, closed_step, on_null_space
-from kinefit.solvers.equations import Equations, inverse, joint_moves, normal_equations
-from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.solvers.closed import closed_step, on_null_space
+from kinefit.solvers.equations import inverse, joint_moves, normal_equations
+from kinefit.solvers.least_squares import gauss_newton
 
-_LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _TRACE = 1e-6  # of the prior that stays, so that what nothing observes has a large variance and not none
 _ROUNDS = 3  # of matching and solving, where a match changes in what is discrete alone
-_OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
-_ROUGH = 10, 1e-2  # iterations and tolerance of a round whose loss is still wide: the next one begins there
 
 Held = tuple[BodyState, NDArray]
 """What is known beforehand: a state, and the information (n, n) of it, without the posture prior."""
@@ -155,41 +153,22 @@ class FrameFit:
         """
         s, iterations = self.settings, 0
         while reach > s.near:
-            scene, _, tried = self._minimum(scene, held, _match(scene, measurements, reach), *_ROUGH)
-            reach, iterations = reach * s.shrink, iterations + tried
+            found = self._minimum(scene, held, _match(scene, measurements, reach), *ROUGH)
+            scene, reach, iterations = found.scene, reach * s.shrink, iterations + found.iterations
         matched = _match(scene, measurements, s.near)
         for last in [False] * (_ROUNDS - 1) + [True]:
-            scene, equations, tried = self._minimum(scene, held, matched, 40, 1e-4)
-            iterations += tried
+            found = self._minimum(scene, held, matched, 40, 1e-4)
+            scene, iterations = found.scene, iterations + found.iterations
             again = matched if last else _match(scene, measurements, s.near)
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return _Found(scene, equations.matrix, equations.cost, tuple(matched), iterations)
+        return _Found(scene, found.H, found.cost, tuple(matched), iterations)
 
     def _minimum(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
-    ) -> tuple[Scene, Equations, int]:
-        def rows(state: BodyState) -> list[AnyRows]:
-            return self.rows(scene.at(state), held, matched)
-
-        damping, tried = None if held is None else _LIGHT, 0
-        if self._hard is None:
-            fit = levenberg_marquardt(
-                self.body, scene.state, rows, max_iterations=most, tolerance=tolerance, damping=damping
-            )
-        else:
-            start = scene.state
-            if np.abs(self._hard(start)[0]).max() > _OPEN:  # the nearest closed pose may be far from what is seen
-                near = levenberg_marquardt(
-                    self.body, start, lambda state: [*rows(state), closed_at(self.body, state).rows(_OPEN)],
-                    max_iterations=_ROUGH[0], tolerance=_ROUGH[1], damping=damping,
-                )  # fmt: skip
-                start, tried = near.state, near.iterations
-            fit = closed_fit(
-                self.body, start, rows, self._hard, max_iterations=most, tolerance=tolerance, damping=damping
-            )
-        return scene.at(fit.state), fit.equations, fit.iterations + tried
+    ) -> Minimum:
+        return minimum(scene, held, matched, lambda at: self.rows(at, held, matched), self._hard, most, tolerance)
 
     def _uncertain(self, held: Held | None) -> float:
         """[m] how far some joint centre may be from where it is expected, one standard deviation; `far` at least."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.images.models import Models
 from kinefit.images.person_detector import Person
-from kinefit.images.pose_model import SIZE, Pose
+from kinefit.images.pose_model import SIZE
 from kinefit.images.roi import Roi, Steady
 from kinefit.observations import Detections
 
@@ -84,9 +84,10 @@ class Follower:
     def update(self, image: NDArray[np.uint8]) -> list[Sighting]:
         """Everybody in the next picture (H, W, 3) RGB."""
         self._frame += 1
-        seen = self._follow(image)
         self._lost = [t for t in self._lost if self._frame - t.last <= _MEMORY * self.rate]
-        due = self._frame % max(round((_SOON if self._lost else _LOOK) * self.rate), 1) == 0
+        crowd = len(self._tracks) > 1 or (self.people > 1 and self._is_due)  # somebody is to be painted over
+        seen = self._follow(image, self.masks or crowd)
+        due = self._is_due
         look = due or len(seen) < len(self._tracks) or not seen
         self._tracks = [track for track, _ in seen]
         if look and len(seen) < self.people:
@@ -94,11 +95,17 @@ class Follower:
             self._tracks = [track for track, _ in seen]
         return [sighting for _, sighting in seen]
 
-    def _follow(self, image: NDArray[np.uint8]) -> list[tuple[_Track, Sighting]]:
+    @property
+    def _is_due(self) -> bool:
+        """Whether the whole picture is looked at whatever is seen."""
+        return self._frame % max(round((_SOON if self._lost else _LOOK) * self.rate), 1) == 0
+
+    def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_Track, Sighting]]:
         """Those who are still there; two that have become one are the one that moved less."""
         seen: list[tuple[_Track, Sighting, float]] = []
         for track in self._tracks:
-            found = self._look_at(image, track, others=[t.shape for t in self._tracks if t is not track and t.shape])
+            others = [t.shape for t in self._tracks if t is not track and t.shape]
+            found = self._look_at(image, track, others=others, mask=mask)
             if found is None:
                 self._lost.append(track)
                 continue
@@ -118,9 +125,10 @@ class Follower:
     def _find(self, image: NDArray[np.uint8], *, thorough: bool) -> list[tuple[_Track, Sighting]]:
         """Those whom nobody follows yet, the surest first, as many as there is room for."""
         found: list[tuple[_Track, Sighting]] = []
-        covered = cover(image, [track.shape for track in self._tracks if track.shape])
+        covered = image
         while len(self._tracks) + len(found) < self.people:
             known = [*self._tracks, *(t for t, _ in found)]
+            covered = cover(covered, [t.shape for t in (known[-1:] if found else known) if t.shape])
             new = self._first(image, self.models.find_people(covered), known)
             if new is None and thorough and not known:
                 new = self._first(image, self.models.search(covered), known, searched=True)
@@ -128,8 +136,6 @@ class Follower:
                 break
             column = self._column_of(new[0])
             found.append((replace(new[0], column=column), replace(new[1], column=column)))
-            assert new[0].shape
-            covered = cover(covered, [new[0].shape])
         return found
 
     def _first(
@@ -138,8 +144,8 @@ class Follower:
         """The first who is a person at a second look too, and nobody known; more is asked of who was searched for."""
         score, clear = (_SURE, _CLEAR) if searched else (_THERE, _VISIBLE)
         for person in people:
-            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score)
-            new = once and self._look_at(image, once[0], score)
+            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score, mask=False)
+            new = once and self._look_at(image, once[0], score, mask=self.masks or self.people > 1)
             if new and _clearness(new[1], image) >= clear and not any(_is_part(new[0], t) for t in known):
                 return new
         return None
@@ -154,8 +160,8 @@ class Follower:
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE,
-        others: Sequence[tuple[Roi, NDArray]] = (),
+        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE, *,
+        mask: bool, others: Sequence[tuple[Roi, NDArray]] = (),
     ) -> tuple[_Track, Sighting] | None:  # fmt: skip
         """Landmarks of a person in the region where they are expected; None where there is nobody.
 
@@ -164,15 +170,18 @@ class Follower:
         roi = track.steady.roi
         if not _SMALLEST < roi.side < _LARGEST * max(image.shape[:2]):
             return None
-        pose = self.models.pose(_alone(roi.crop(image, SIZE), roi, track.shape, others))
+        pose = self.models.pose(_alone(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
         if pose.score < score:
             return None
         points = roi.to_image(pose.points, SIZE)
         ends = roi.to_image(np.stack([pose.middle, pose.rim]), SIZE)
         steady = track.steady.follow(ends) if track.points is not None else Steady.at(ends)
-        runs = mask_runs(pose, roi, image.shape[:2]) if self.masks else np.zeros(0, np.uint32)
+        runs = np.zeros(0, np.uint32)
+        if self.masks and pose.mask is not None:
+            runs = mask_runs(pose.mask, roi, image.shape[:2])
         sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted))
-        return replace(track, steady=steady, points=points, last=self._frame, shape=(roi, pose.mask)), sighting
+        shape = None if pose.mask is None else (roi, pose.mask)
+        return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
 
 
 def _alone(
@@ -227,11 +236,11 @@ def _apart(a: _Track, b: _Track, points: slice) -> float:
     return float(np.median(np.linalg.norm(a.points[points] - b.points[points], axis=1))) / side
 
 
-def mask_runs(pose: Pose, roi: Roi, shape: tuple[int, int]) -> NDArray[np.uint32]:
+def mask_runs(mask: NDArray[np.float32], roi: Roi, shape: tuple[int, int]) -> NDArray[np.uint32]:
     """Run lengths, down the columns of a picture (height, width), of the pixels that are likely the person's."""
     height, width = shape
     nothing = np.array([width * height], np.uint32)
-    rows, columns = (np.flatnonzero((pose.mask > _RATHER).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((mask > _RATHER).any(axis=axis)) for axis in (1, 0))
     if not len(rows):
         return nothing
     box = np.array([[u, v] for u in (columns[0] - 1, columns[-1] + 1) for v in (rows[0] - 1, rows[-1] + 1)])
@@ -242,7 +251,7 @@ def mask_runs(pose: Pose, roi: Roi, shape: tuple[int, int]) -> NDArray[np.uint32
         return nothing
     A = roi.A_image_crop(SIZE)[::-1]  # each row of what is drawn is a column of the picture, between two empty pixels
     A[:, 2] -= v0 - 1, u0
-    soft = cv2.warpAffine(pose.mask, A, (int(v1 - v0) + 2, int(u1 - u0)), flags=cv2.INTER_LINEAR)
+    soft = cv2.warpAffine(mask, A, (int(v1 - v0) + 2, int(u1 - u0)), flags=cv2.INTER_LINEAR)
     inside = soft > _RATHER
     inside[:, [0, -1]] = False
     u, v = np.divmod(np.flatnonzero(inside[:, 1:] != inside[:, :-1]), v1 - v0 + 1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
+from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.images.person_detector import Person, PersonDetector
-from kinefit.images.pose_model import PoseModel
+from kinefit.images.pose_model import MASK, Pose, PoseModel
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
 _REMEDY = "Delete its folder; it is then fetched again."
@@ -37,8 +39,17 @@ class Models:
     """
 
     def __init__(self, folder: str | PathLike[str], threads: int = 1) -> None:
-        self.pose = PoseModel(_interpreter(Path(folder) / LANDMARKS, threads))
+        self._landmarks, self._threads = Path(folder) / LANDMARKS, threads
+        self._points = PoseModel(_interpreter(self._landmarks, threads, without=MASK))
         self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR, threads))
+
+    @cached_property
+    def _outlines(self) -> PoseModel:
+        return PoseModel(_interpreter(self._landmarks, self._threads))
+
+    def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> Pose:
+        """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
+        return (self._outlines if mask else self._points)(crop)
 
     def find_people(self, image: NDArray[np.uint8]) -> list[Person]:
         """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""
@@ -84,13 +95,38 @@ def _runtime() -> Any:
     return Interpreter
 
 
-def _interpreter(path: Path, threads: int) -> Any:
+def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
+    """A network, ready to run; `without` the output of a shape, and what makes it alone."""
     runtime = _runtime()
     if not path.is_file():
         raise FileError("no such network", file=path, remedy=_REMEDY)
     try:
-        interpreter = runtime(str(path), num_threads=threads)
+        given = {"model_content": _reduced(path, without)} if without else {"model_path": str(path)}
+        interpreter = runtime(**given, num_threads=threads)
         interpreter.allocate_tensors()
-    except (ValueError, RuntimeError) as error:
+    except (ValueError, RuntimeError, TypeError, LookupError, AttributeError, struct.error) as error:
         raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=_REMEDY) from error
     return interpreter
+
+
+@lru_cache(maxsize=2)
+def _reduced(path: Path, without: tuple[int, ...]) -> bytes:
+    """A network's file without one of its outputs, told by its shape: its other answers are the same, bit for bit."""
+    import flatbuffers
+    from ai_edge_litert import schema_py_generated as schema
+
+    content = path.read_bytes()
+    if not schema.Model.ModelBufferHasIdentifier(content, 0):
+        raise ValueError("it is no file of TensorFlow Lite")
+    model = schema.ModelT.InitFromObj(schema.Model.GetRootAs(content, 0))
+    graph = model.subgraphs[0]
+    graph.outputs = [k for k in graph.outputs if tuple(graph.tensors[k].shape) != without]
+    needed, kept = set(graph.outputs), []
+    for operator in reversed(graph.operators):
+        if needed.intersection(operator.outputs):
+            kept.append(operator)
+            needed.update(operator.inputs)
+    graph.operators = kept[::-1]
+    builder = flatbuffers.Builder(len(content))
+    builder.Finish(model.Pack(builder), b"TFL3")
+    return bytes(builder.Output())

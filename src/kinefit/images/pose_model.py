@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIZE = 256  # [px] side of the network's picture
+MASK = (1, SIZE, SIZE, 1)  # shape of the output that is the mask
 _POINTS = 33  # landmarks of MEDIAPIPE_33; two more tell where the person is in the next picture
 _HEAT = 64  # [px] side of the heatmaps
 _WINDOW = np.arange(-3, 4)  # of a heatmap around a landmark
@@ -31,7 +32,7 @@ class Pose:
         Middle of the hips and a point above it on the circle around the body: the next region.
     score : float, 0..1
         That there is a person.
-    mask : (256, 256) float32, probability that a pixel of the crop is the person's.
+    mask : (256, 256) float32, probability that a pixel of the crop is the person's; None where none was asked for.
     lifted : (33, 3) [m]
         The points in space from the middle of the hips, along the crop's u and v and away from the camera, of a person
         of the network's idea of size.
@@ -43,7 +44,7 @@ class Pose:
     middle: NDArray
     rim: NDArray
     score: float
-    mask: NDArray[np.float32]
+    mask: NDArray[np.float32] | None
     lifted: NDArray
 
 
@@ -53,7 +54,7 @@ class PoseModel:
     Parameters
     ----------
     interpreter
-        Of `pose_landmark_full.tflite`.
+        Of `pose_landmark_full.tflite`, with or without the output that is the mask.
     """
 
     def __init__(self, interpreter: Any) -> None:
@@ -61,7 +62,7 @@ class PoseModel:
         self._input = interpreter.get_input_details()[0]["index"]
         outputs = {tuple(int(n) for n in o["shape"]): o["index"] for o in interpreter.get_output_details()}
         self._landmarks, self._score = outputs[1, 195], outputs[1, 1]
-        self._mask, self._heat = outputs[1, SIZE, SIZE, 1], outputs[1, _HEAT, _HEAT, 39]
+        self._mask, self._heat = outputs.get(MASK), outputs[1, _HEAT, _HEAT, 39]
         self._lifted = outputs[1, 117]
 
     def __call__(self, crop: NDArray[np.uint8]) -> Pose:
@@ -72,9 +73,10 @@ class PoseModel:
         landmarks = read(self._landmarks).reshape(39, 5).astype(float)
         points = refine(landmarks[:, :2], read(self._heat)[0])
         visibility, presence = _sigmoid(landmarks[:_POINTS, 3:].T)
+        mask = None if self._mask is None else _sigmoid(read(self._mask)[0, :, :, 0])
         return Pose(
             points[:_POINTS], visibility, presence, points[_POINTS], points[_POINTS + 1],
-            float(read(self._score).item()), _sigmoid(read(self._mask)[0, :, :, 0]),
+            float(read(self._score).item()), mask,
             read(self._lifted).reshape(39, 3)[:_POINTS].astype(float),
         )
 

@@ -109,7 +109,7 @@ def detect(
     if not todo:
         return []
     folder = networks(progress, tell)
-    number, outlines = people or PEOPLE, True if masks is None else masks
+    number, outlines = people or PEOPLE, bool(masks)
     stop, lock = threading.Event(), threading.Lock()
 
     def step(camera: str, done: int, total: int) -> None:

@@ -57,7 +57,7 @@ def ensure_detections(
     people : int, optional
         How many are followed at most; default: as it was done, or `PEOPLE`.
     masks : bool, optional
-        Whether outlines are wanted; default: as it was done, or yes.
+        Whether outlines are wanted; default: as it was done, or no, as they nearly double the time.
     force : bool
         Make them anew.
     progress : called with (camera, pictures done, pictures in all).
@@ -87,7 +87,8 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
     )
     if not asked and (take.keypoints or take.skin or take.lines or take.surface_points or not videos):
         return take
-    files = ensure_detections(take, progress=progress, tell=tell)
+    outlines = any(entry.format == "detect" and entry.file is None for entry in take.silhouettes)
+    files = ensure_detections(take, masks=True if outlines else None, progress=progress, tell=tell)
     if take.keypoints:
         return replace(take, keypoints=tuple(_with_file(entry, take) for entry in take.keypoints))
     entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.readers.ros.bags import Bag
+from benchmarks.bags import Bag
 
 from kinefit import read_calibration
-from kinefit.errors import CalibrationError
+from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3
+from kinefit.readers.ros.recordings import reading
 
 pytest.importorskip("rosbags.rosbag2")
 pytest.importorskip("mcap_ros2")
@@ -47,3 +48,20 @@ def test_what_places_no_camera_is_told(tmp_path):
         read_calibration(Bag().static(("map", "base", T_map_base)).write(tmp_path / "b"))
     with pytest.raises(CalibrationError, match="not calibrated"):
         read_calibration(Bag().info("/c/camera_info", np.zeros((3, 3)), (640, 480)).write(tmp_path / "c"))
+
+
+def test_a_message_without_a_field_is_damage(tmp_path):
+    file = Bag().info("/camera/camera_info", K, (640, 480)).write(tmp_path / "bag")
+    whole = file.read_bytes()
+    assert b"uint32 binning_x" in whole
+    file.write_bytes(whole.replace(b"uint32 binning_x", b"uint32 binning_q"))
+    with pytest.raises(FileError, match="binning_x"):
+        read_calibration(file)
+
+
+def test_no_more_is_asked_of_a_file_than_there_is(tmp_path):
+    file = Bag().info("/camera/camera_info", K, (640, 480)).write(tmp_path / "bag")
+    with reading(file) as reader:
+        stream = reader._stream
+        stream.seek(0)
+        assert stream.read(2**50) == file.read_bytes()  # which would be room for all of it first

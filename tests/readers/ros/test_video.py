@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.readers.ros.bags import START, Bag
+from benchmarks.bags import START, Bag
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.video import Video

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from os import PathLike
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.pictures.drawing import WHITE, write_lines
-from kinefit.exporters.pictures.overlay import _encoder, frames_of, nearest_frame
+from kinefit.exporters.pictures.overlay import frames_of, nearest_frame, write_pictures
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations import DepthVideo
@@ -69,11 +68,11 @@ def write_depth_overlay(
         The file cannot be written.
     """
     height, width = (n - n % 2 for n in depth_picture(depth.frame(0).depth, motion, None, camera).shape[:2])
-    with writing(path) as temporary, _encoder(path, temporary, depth.rate, width, height) as encode:
-        span = frames_of(motion, depth.times)
-        for i in span:
+
+    def drawn() -> Iterator[NDArray[np.uint8]]:
+        for i in frames_of(motion, depth.times):
             at = nearest_frame(motion, float(depth.times[i]))
             label = f"{camera.name}   frame {i}" + ("" if at is not None else "   no motion here")
-            encode(depth_picture(depth.frame(i).depth, motion, at, camera, label=label)[:height, :width])
-            if progress:
-                progress(i + 1 - span.start)
+            yield depth_picture(depth.frame(i).depth, motion, at, camera, label=label)[:height, :width]
+
+    write_pictures(drawn(), path, depth.rate, (width, height), progress)

@@ -77,8 +77,27 @@ def write_overlay(
                 image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, blur=blur
             )[:height, :width]
 
-    with writing(path) as temporary, _encoder(path, temporary, video.rate, width, height) as encode:
-        for done, image in enumerate(ahead(drawn()), start=1):
+    write_pictures(drawn(), path, video.rate, (width, height), progress)
+
+
+def write_pictures(
+    pictures: Iterator[NDArray[np.uint8]], path: str | PathLike[str], rate: float, size: tuple[int, int],
+    progress: Callable[[int], None] | None = None,
+) -> None:  # fmt: skip
+    """Write a video of pictures (H, W, 3) uint8 RGB at a rate [Hz], each drawn while the one before it is encoded.
+
+    Parameters
+    ----------
+    size : (width, height) [px] of all, even
+    progress : called with the number of pictures done
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+    with writing(path) as temporary, _encoder(path, temporary, rate, *size) as encode:
+        for done, image in enumerate(ahead(pictures), start=1):
             encode(image)
             if progress:
                 progress(done)

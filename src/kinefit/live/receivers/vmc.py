@@ -31,6 +31,8 @@ BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s
 """Segment -> bone of Unity's humanoid."""
 
 _MOST = 1400  # [bytes] of one packet on most networks
+_NOTHING = (0.0,) * 7  # place and turn, of which the bones' messages are made once, and the numbers put behind
+_ROOT = osc.message("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Vmc:
@@ -60,7 +62,7 @@ class Vmc:
         self._socket.setblocking(False)
         self._turn = se3.transform(rotation_between_up(up, "y"), np.zeros(3))
         self._rest: Rest | None = None
-        self._bones: list[str] = []
+        self._heads: list[bytes] = []
         self._segments = self._above = np.zeros(0, int)
         self.unsent = 0
 
@@ -76,7 +78,9 @@ class Vmc:
             while above >= 0 and segments[above] not in BONES:
                 above = int(parents[above])
             lowest.append(above)
-        self._bones = [BONES[segments[s]] for s in kept]
+        self._heads = [
+            osc.message("/VMC/Ext/Bone/Pos", BONES[segments[s]], *_NOTHING)[: -4 * len(_NOTHING)] for s in kept
+        ]
         self._segments, self._above = np.array(kept), np.array(lowest)
 
     def pose(self, posed: Posed, packet: bytes) -> None:
@@ -96,13 +100,12 @@ class Vmc:
         parents = np.where((above >= 0)[:, None, None], T[np.maximum(above, 0)], np.eye(4))
         local = se3.inverse(parents) @ T[segments]
         q = se3.quaternion(local[:, :3, :3])
-        numbers = np.concatenate([local[:, :3, 3] * (-1, 1, 1), q[:, 1:] * (1, -1, -1), q[:, :1]], axis=1).tolist()
-        out: list[tuple[str | int | float, ...]] = [
-            ("/VMC/Ext/OK", 1), ("/VMC/Ext/T", float(time)),
-            ("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
-        ]  # fmt: skip
-        out += [("/VMC/Ext/Bone/Pos", bone, *own) for bone, own in zip(self._bones, numbers)]
-        return _parts(out)
+        numbers = np.concatenate([local[:, :3, 3] * (-1, 1, 1), q[:, 1:] * (1, -1, -1), q[:, :1]], axis=1)
+        size = 4 * numbers.shape[1]
+        data = numbers.astype(">f4").tobytes()
+        bones = [head + data[k * size : (k + 1) * size] for k, head in enumerate(self._heads)]
+        ok, now = osc.message("/VMC/Ext/OK", 1), osc.message("/VMC/Ext/T", float(time))
+        return _parts([ok, now, _ROOT, *bones])
 
     def close(self) -> None:
         """End it."""
@@ -115,10 +118,9 @@ class Vmc:
             self.unsent += 1
 
 
-def _parts(messages: list[tuple[str | int | float, ...]]) -> list[bytes]:
+def _parts(messages: list[bytes]) -> list[bytes]:
     out, part, size = [], list[bytes](), 0
-    for address, *values in messages:
-        one = osc.message(str(address), *values)
+    for one in messages:
         if part and size + len(one) + 4 > _MOST:
             out.append(osc.bundle(part))
             part, size = [], 0

@@ -61,7 +61,7 @@ class Draft:
     calibration : the file, and keys of [calibration]
     others : calibrations that were not taken.
     cameras : name -> keys of its [[camera]]
-    keypoints, markers, surface_points : (whether in use or a comment, keys) of each table
+    keypoints, depth, markers, surface_points : (whether in use or a comment, keys) of each table
     """
 
     folder: Path
@@ -72,6 +72,7 @@ class Draft:
     others: list[Path] = field(default_factory=list)
     cameras: dict[str, dict[str, Told]] = field(default_factory=dict)
     keypoints: list[tuple[bool, Entry]] = field(default_factory=list)
+    depth: list[tuple[bool, Entry]] = field(default_factory=list)
     markers: list[tuple[bool, Entry]] = field(default_factory=list)
     surface_points: list[tuple[bool, Entry]] = field(default_factory=list)
     comments: list[str] = field(default_factory=list)
@@ -100,6 +101,7 @@ class Draft:
             parts.append(_table("[calibration]", self.calibration[1], self) + others)
         parts += [_table("[[camera]]", {"name": Told(name), **keys}, self) for name, keys in self.cameras.items()]
         parts += [_table("[[keypoints]]", keys, self, active) for active, keys in self.keypoints]
+        parts += [_table("[[depth]]", keys, self, active) for active, keys in self.depth]
         parts += [_table("[[markers]]", keys, self, active) for active, keys in self.markers]
         parts += [_table("[[surface_points]]", keys, self, active) for active, keys in self.surface_points]
         return "\n".join(parts)

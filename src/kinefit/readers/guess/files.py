@@ -21,6 +21,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.names import natural
 from kinefit.readers.image_folders import ENDINGS, ImageFolder
+from kinefit.readers.ros.recordings import inside
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
@@ -89,6 +90,21 @@ def list_files(folder: Path) -> list[Path]:
         folders[:] = [n for n in folders if not n.startswith(".") and not n.endswith(_RESULTS) and depth < _DEEPEST]
         found += [Path(parent) / name for name in names if not name.startswith(".")]
     return sorted(found, key=lambda path: natural(str(path)))
+
+
+def find_recordings(files: list[Path]) -> list[Path]:
+    """Recordings of ROS 2 among files: those in MCAP, the largest first; of a kind that is not read, the error says so.
+
+    Raises
+    ------
+    FileError
+        Recordings in SQLite alone, or one that is split into several files.
+    """
+    found = [path for path in files if path.suffix.lower() in (".mcap", ".db3")]
+    whole = [path for path in found if path.suffix.lower() == ".mcap"]
+    for path in whole or found:
+        inside(path.parent if (path.parent / "metadata.yaml").is_file() else path)
+    return sorted(whole, key=lambda path: -path.stat().st_size)
 
 
 def find_calibrations(files: list[Path]) -> tuple[list[CalibrationFile], list[Path], list[KinefitError]]:

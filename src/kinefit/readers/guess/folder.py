@@ -15,6 +15,7 @@ from kinefit.readers.guess.cameras import describe_cameras, describe_one
 from kinefit.readers.guess.draft import Draft, Note, Told
 from kinefit.readers.guess.files import STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
+from kinefit.readers.guess.recordings import describe_recordings
 from kinefit.readers.markers import read_markers
 
 _CALIBRATE = (
@@ -48,7 +49,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     CalibrationError
         Videos or keypoints without a calibration.
     FileError
-        A video that is damaged.
+        A video or a recording of ROS 2 that is damaged, or of a kind that is not read.
     """
     folder = Path(folder).absolute()
     if folder.is_file():
@@ -60,17 +61,21 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     files = guess_files.list_files(folder)
     videos, markers = guess_files.find_videos(files, folder), guess_files.find_markers(files)
     keypoints, remarks = guess_files.find_keypoints(files)
+    recordings = guess_files.find_recordings(files)
     for remark in remarks:
         draft.note("keypoints", "open", remark)
-    if not (videos or keypoints or markers):
+    if not (videos or keypoints or markers or recordings):
         raise TakeError(
             f"nothing here that a take is made of, among {len(files)} files", file=folder,
-            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d or .trc.",
+            remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d, .trc or "
+            ".mcap (ROS 2).",
         )
     if videos or keypoints:
         calibration = _choose_calibration(draft, files, videos + [k.path for k in keypoints], bool(markers))
         if calibration is not None:
             describe_cameras(draft, calibration, videos, keypoints)
+    if recordings:
+        describe_recordings(draft, recordings, alone=not (videos or keypoints or markers))
     _describe_markers(draft, markers)
     for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
         told = Told(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")

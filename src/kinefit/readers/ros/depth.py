@@ -35,7 +35,7 @@ def mcap_source(path: Path, name: str, topic: str | None = None) -> DepthSource:
         times, logged = topics.times(topic)
         info, first = info_of(topics, topic), deep[topic]
         size = counts(first, path).shape[::-1]
-    seen_by = None if info is None else camera(info, name, size, path, rectified=is_rectified(topic))
+        seen_by = None if info is None else camera(info, name, size, path, rectified=is_rectified(topic))
     messages = Messages(path, topic, logged)
     return DepthSource(
         len(times), lambda i: counts(messages(i), path).astype(np.float32), (size[0], size[1]), UNITS[encoding(first)],

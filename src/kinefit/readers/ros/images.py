@@ -103,14 +103,20 @@ def _raw(message: Any, kind: np.dtype, channels: int, path: Path) -> NDArray:
     return rows.view(kind).reshape(height, width, channels)
 
 
-def info_of(topics: Topics, image: str) -> Any:
-    """The first CameraInfo of the topic in the folder of the image's, or in one above; None where there is none."""
+def info_topic(topics: Topics, image: str) -> str | None:
+    """The topic with CameraInfo in the folder of the image's, or in one above; None where there is none."""
     folder = image.rpartition("/")[0]
     while folder:
         if f"{folder}/camera_info" in topics.of(INFO):
-            return topics.first(f"{folder}/camera_info")
+            return f"{folder}/camera_info"
         folder = folder.rpartition("/")[0]
     return None
+
+
+def info_of(topics: Topics, image: str) -> Any:
+    """The first CameraInfo of an image's camera; None where there is none."""
+    topic = info_topic(topics, image)
+    return None if topic is None else topics.first(topic)
 
 
 def camera(info: Any, name: str, size: tuple[int, ...], path: Path, *, rectified: bool = False) -> Camera | None:

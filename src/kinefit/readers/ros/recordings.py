@@ -6,6 +6,8 @@ leaves stands for the one MCAP file in it.
 
 from __future__ import annotations
 
+import io
+import os
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -20,6 +22,7 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 _ENDING = ".mcap"
+_MUCH = 2**20  # [bytes] that are asked for at once, from which on it is seen whether they are there
 
 
 def inside(path: Path) -> tuple[Path, str | None] | None:
@@ -197,12 +200,21 @@ def reading(path: Path) -> Iterator[Any]:
             remedy="pip install 'kinefit[ros]'",
         ) from None  # fmt: skip
     try:
-        with open(path, "rb") as file:
+        with _Bounded(io.FileIO(path)) as file:
             yield make_reader(file, decoder_factories=[DecoderFactory()])
     except KinefitError:
         raise
     except Exception as error:  # of damaged files libraries raise anything
         raise _damaged(error, path) from error
+
+
+class _Bounded(io.BufferedReader):
+    """A file from which no more is asked than there is: a damaged length would else be room in memory first."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > _MUCH:
+            size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
+        return super().read(size)
 
 
 def _damaged(error: Exception, path: Path) -> FileError:

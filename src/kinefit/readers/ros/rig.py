@@ -34,24 +34,22 @@ def mcap_rig(path: Path) -> Rig:
     """
     with reading(path) as reader:
         topics = Topics(reader, path)
-        infos = {topic.rpartition("/")[0]: topics.first(topic) for topic in topics.of(INFO)}
-        infos = {folder: info for folder, info in infos.items() if info is not None}
+        infos, names = _infos(topics), camera_names(topics)
         tree = _tree(topics) if _STATIC in topics.kinds else {}
         images = topics.of(IMAGE, COMPRESSED)
-    if not infos:
-        remedy = "Record camera_info of each camera."
-        raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
-    names = _names(list(infos))
-    cameras = []
-    for folder, info in infos.items():
-        beside = [topic for topic in images if topic.startswith(f"{folder}/")]
-        rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
-        found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
-        if found is None:
-            told = f"the CameraInfo of {folder} is not calibrated"
-            raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
-        cameras.append(found)
-    frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
+        if not infos:
+            remedy = "Record camera_info of each camera."
+            raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
+        cameras = []
+        for folder, info in infos.items():
+            beside = [topic for topic in images if topic.startswith(f"{folder}/")]
+            rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
+            found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
+            if found is None:
+                told = f"the CameraInfo of {folder} is not calibrated"
+                raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
+            cameras.append(found)
+        frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
     if len(frames) == 1 and frames[0] not in tree:
         return Rig(tuple(cameras))
     roots = [_root(frame, tree) for frame in frames]
@@ -69,9 +67,15 @@ def _placed(one: Camera, T_world_camera: NDArray) -> Camera:
     return Camera(one.name, one.size, one.matrix, lens, T_camera_world=se3.inverse(T_world_camera))  # type: ignore[arg-type]
 
 
-def _names(folders: list[str]) -> dict[str, str]:
-    """The shortest end of each folder that no other has."""
-    out = {}
+def _infos(topics: Topics) -> dict[str, Any]:
+    """{folder: the first CameraInfo in it}."""
+    infos = {topic.rpartition("/")[0]: topics.first(topic) for topic in topics.of(INFO)}
+    return {folder: info for folder, info in infos.items() if info is not None}
+
+
+def camera_names(topics: Topics) -> dict[str, str]:
+    """{folder of a CameraInfo: its camera's name}, the shortest end of each folder that no other has."""
+    out, folders = {}, list(_infos(topics))
     for folder in folders:
         parts, end = folder.strip("/").split("/"), folder
         for count in range(1, len(parts) + 1):

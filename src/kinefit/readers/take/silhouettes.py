@@ -112,7 +112,11 @@ def _silhouettes(
         scene = _BeforeBackground(Video(camera.video, rate=take.rate), entry.file, size, frame)
         times = offset + np.arange(len(scene.video)) / scene.video.rate
         return SilhouetteVideo(entry.camera, scene.video.rate, times, size, scene.mask, str(camera.video))
-    found = read_detections(entry.file or detections_file(take.path, entry.camera))
+    file = entry.file or detections_file(take.path, entry.camera)
+    found = read_detections(file)
+    if found.seen.any() and not len(found.mask_runs):
+        remedy = "Run `kinefit detect` on this take, which keeps outlines."
+        raise TakeError("the detector's file has no outlines", file=file, remedy=remedy)
     times = offset + np.arange(len(found)) / found.rate
     return SilhouetteVideo(
         entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source

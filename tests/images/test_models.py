@@ -1,0 +1,21 @@
+"""Networks that are none."""
+
+import pytest
+
+from kinefit.errors import FileError
+from kinefit.images.models import DETECTOR, LANDMARKS, Models
+
+pytest.importorskip("ai_edge_litert", reason="needs the extra detect")
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage" * 9, b"\0\0\0\0TFL3" + bytes(100), b"\x1c\0\0\0TFL3" + bytes(20)])
+def test_a_file_that_is_no_network_is_told(tmp_path, content):
+    for name in (LANDMARKS, DETECTOR):
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileError, match="not a network that LiteRT runs"):
+        Models(tmp_path)
+
+
+def test_a_missing_network_is_told(tmp_path):
+    with pytest.raises(FileError, match="no such network"):
+        Models(tmp_path)
