@@ -26,6 +26,7 @@ from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import Linearised, OtherSensors, SceneOf
 from kinefit.smoothing.pixels import exchanged, without_bias
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
+from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.closed import Constraint, on_null_space, onto
@@ -50,6 +51,7 @@ class SmoothedTake:
     matched : F lists, the matches of all other sensors; None where there are none
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     provenance : what was estimated, as `Motion.provenance` has it
+    shared : what keypoints of one segment err by together, as it was taken
     """
 
     results: Sequence[FrameResult]
@@ -57,6 +59,7 @@ class SmoothedTake:
     matched: Sequence[tuple[Matched, ...]] | None
     weight: NDArray
     provenance: dict[str, Any]
+    shared: SharedErrors
 
 
 def smooth_results(
@@ -124,7 +127,8 @@ def smooth_results(
         smoothed.append(replace(frame, matched=pixels, measurements=()))
     if surfaces:
         smoothed = _without_adrift(body, smoothed, round(_ADRIFT * rate))
-    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
+    shared = SharedErrors.of(channels, strength.shared, strength.sigma)
+    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds), shared)
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:

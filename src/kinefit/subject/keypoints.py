@@ -135,6 +135,8 @@ def _fitted(
         prior[of_body:, of_body:] /= excess_of
         if k == 0 and by_view:
             bias, steps = _without_bias(body, channels, found, steps)
+        if k == 0 and len(channels.sets) > 1:
+            steps = _by_detector(channels, found, steps)
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
@@ -159,6 +161,27 @@ def _without_bias(
     bias = learn_view_bias([frames])
     layout = Layout(bias.known_to(channels), body)
     return bias, [[KeypointMeasurement(m.of, layout, m.uv, m.confidence, m.time) for m in several] for several in steps]
+
+
+def _by_detector(
+    channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
+) -> list[Sequence[KeypointMeasurement]]:
+    """Frames in which keypoints of each set count as sure as they prove beside the surest one's, by what is left over.
+
+    Detectors are stated alike, and the worse of two would else have as much to say of lengths.
+    """
+    sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
+    matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
+    squares = np.stack([m.squares(Scene(sized, state, channels.rig)) for m, state in zip(matched, found.states)])
+    used = np.stack([m.weight > 0 for m in matched])
+    spans = [(channels.column >= s.start) & (channels.column < s.stop) for s in channels.sets.values()]
+    middle = np.array([np.median(squares[:, mine][used[:, mine]]) if used[:, mine].any() else np.inf for mine in spans])
+    sure = np.zeros(len(channels.column))
+    for mine, own in zip(spans, middle, strict=True):
+        sure[mine] = middle.min() / own if own > 0 else 1.0
+    return [
+        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * sure, m.time) for m in several] for several in steps
+    ]
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:
