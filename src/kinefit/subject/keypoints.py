@@ -30,6 +30,7 @@ from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
 _BELIEF = 5.0  # axes of points that this counts for
+_POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.6  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
 _ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
@@ -129,7 +130,7 @@ def _fitted(
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
+            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps), posture=_POSTURE
         )
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
