@@ -175,7 +175,8 @@ def estimate(
     """
     body, channels, n = takes[0].body, takes[0].channels, takes[0].body.tree.n_dofs
     start = np.where(np.arange(n) < 3, *settings_start)
-    strength, groups, limb, count = Strength(start, np.array(channels.sigma), np.zeros(len(channels.sigma))), alike(body), limbs(body), 0
+    strength = Strength(start, np.array(channels.sigma), np.zeros(len(channels.sigma)))
+    groups, limb, count = alike(body), limbs(body), 0
     takes = list(takes)
     while count < rounds:
         count += 1

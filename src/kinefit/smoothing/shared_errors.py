@@ -1,4 +1,4 @@
-"""Errors that the points of one segment share: a detector that sees a head 7 px too far left has all of its points there.
+"""Errors that the points of one segment share: a head that is seen 7 px too far left has all of its points there.
 
 Eleven points of a face then tell little more of where the head is than one does, and far less than eleven points of
 joints would. What is shared is found from the take: of two points of one segment in one view the products of what a
@@ -63,8 +63,11 @@ class SharedErrors:
         return cls(np.full(count, -1), np.zeros(count), np.zeros(0))
 
     def whitened(self, columns: NDArray, weight: NDArray, channel: NDArray) -> NDArray:
-        """Rows (R, k), u and v of each channel (R,) in turn and whitened by weights (N,) [1/px²] of own errors alone,
-        whitened by all of the errors: the square root of D - D 1 (1/U + 1ᵀ D 1)⁻¹ 1ᵀ D in place of that of D."""
+        """Rows (R, k), u and v of each channel (R,) in turn, whitened by all of their errors.
+
+        They come whitened by weights (N,) [1/px²] of own errors alone: by the square root of a diagonal D, in place of
+        that of D - D 1 (1/U + 1ᵀ D 1)⁻¹ 1ᵀ D of each group.
+        """
         grouped = self.member[channel] >= 0
         if not grouped.any():
             return columns
@@ -112,7 +115,7 @@ def shared_by(channels: Channels, left: NDArray, variance: NDArray, looks: float
         of_set[points] = of_set.get(points, 0.0) + told
         groups.setdefault(points, []).append(g)
     for of_set in sums.values():
-        whole = _share(sum(of_set.values()), 0.0)
+        whole = _share(np.sum(list(of_set.values()), axis=0), 0.0)
         for points, told in of_set.items():
             out[np.isin(member, groups[points])] = _share(told, whole)
     return out

@@ -323,6 +323,13 @@ def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
         "velocity_memory": take.memory[1],
         "speed_std": speeds,
         "pixel_sigma": sigma,
+        "shared_errors": {
+            label: {
+                take.body.tree.segments[take.points.segments[i]]: round(float(strength.shared[i]), 2)
+                for i in np.flatnonzero((take.channels.source == q) & (strength.shared > 0))
+            }
+            for q, label in enumerate(take.channels.sources)
+        },
         "sigma_factor": scale,
         "liveliest": round(float(take.live.max()), 2),
         "contacts": 0 if take.contacts is None else int(np.any(take.contacts.weight > 0, axis=1).sum()),

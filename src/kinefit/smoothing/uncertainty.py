@@ -28,8 +28,8 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
-from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
+from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product

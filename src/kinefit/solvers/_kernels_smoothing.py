@@ -11,10 +11,10 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit._kernels_losses import weigh
 from kinefit.bodies._kernels import difference, forward, retract
 from kinefit.correspondences._kernels import pixel_rows, place, point_rows
 from kinefit.geometry._kernels_camera import project_jacobian
-from kinefit._kernels_losses import weigh
 from kinefit.solvers._kernels import accumulate, project
 from kinefit.solvers._kernels_shared import take_out, without_shift
 
