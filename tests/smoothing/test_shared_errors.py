@@ -1,8 +1,11 @@
 """Errors that points of one segment share: found from residuals, and weighed as their covariance asks for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from kinefit import Recording, track
 from kinefit.bodies import PointSet, load_body
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.sensors.channels import make_channels
@@ -122,3 +125,20 @@ def test_equations_of_points_that_are_shifted_together(channels, loss):
         found[k, above] = found[above, k] = C[0, k, : tree.depth[k] + 1]
     where = found != 0
     np.testing.assert_allclose(found[where], H[where], rtol=1e-4, atol=1e-5 * np.abs(H).max())
+
+
+@pytest.mark.parametrize("shared_px", [0.0, 6.0])
+def test_a_take_tells_what_its_segments_share(shared_px):
+    random, segments = np.random.default_rng(5), BODY.keypoints("BODY_25B")
+    seen = []
+    for record in simulate_keypoints(MOTION, RIG, noise_px=3.0, outliers=0.0, missing=0.0):
+        shift = shared_px * random.standard_normal((len(MOTION), len(BODY.tree.segments), 2))
+        column = [record.names.index(name) for name in segments.names]
+        points = np.array(record.points)
+        points[:, 0, column] += shift[:, segments.segments]
+        seen.append(replace(record, points=points))
+    motion = track(Recording.of_keypoints(RIG, seen, accuracy=8.0, up=MOTION.up), BODY)
+    told = motion.provenance["smoothing"]["shared_errors"]
+    assert set(told) == set(RIG.names)
+    for of_camera in told.values():
+        assert of_camera.get("head", 0.0) < 0.2 if shared_px == 0.0 else of_camera["head"] > 0.5
