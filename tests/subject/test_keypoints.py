@@ -138,8 +138,8 @@ def test_exact_pixels_of_a_body_of_usual_shape_leave_it_as_it_is():
     np.testing.assert_allclose(fit_subject(BODY, channels).scales, 1.0, atol=0.02)
 
 
-def test_a_worse_detector_beside_a_better_one_hardly_counts():
-    """Lengths of two detectors, of which one errs eight times as much, are those of the better one."""
+def test_a_worse_detector_beside_a_better_one_does_no_harm():
+    """Lengths by two detectors, of which one errs eight times as much, are no worse than by the better one alone."""
 
     def wrong(*detectors):
         errors = []
@@ -154,7 +154,7 @@ def test_a_worse_detector_beside_a_better_one_hardly_counts():
         return np.mean(errors)
 
     good = ("BODY_25B", 2.0)
-    assert wrong(good, ("MEDIAPIPE_33", 16.0)) < 1.25 * wrong(good)
+    assert wrong(good, ("MEDIAPIPE_33", 16.0)) < wrong(good)
 
 
 @pytest.fixture(scope="module")
