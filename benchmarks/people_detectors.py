@@ -47,7 +47,8 @@ def run() -> None:
         worse = sum(one[2] > min(one[:2]) for one in made)
         print(
             f"# second detector {ratio} x: {first:.1f}, {second:.1f} mm alone, {both:.1f} mm both; worse than the "
-            f"better one in {worse} of {len(made)}; inside {100 * joints:.0f} % of joints, {100 * angles:.0f} % of angles"
+            f"better one in {worse} of {len(made)}; inside {100 * joints:.0f} % of joints, "
+            f"{100 * angles:.0f} % of angles"
         )  # fmt: skip
         figure(name, both / min(first, second), goal, "<= 1")
 
