@@ -69,7 +69,7 @@ def whole(tracker, results, noise):
     take = replace(take, angles=unwrap(BODY.tree, take.angles))
     for _ in range(3):
         take = take.renewed()
-        fit, post = take.fit(Strength(noise.acceleration, np.array(channels.sigma)))
+        fit, post = take.fit(Strength(noise.acceleration, np.array(channels.sigma), np.zeros(len(channels.sigma))))
         take = replace(take, roots=fit.roots, angles=fit.angles)
     return [BodyState(T, q) for T, q in zip(fit.roots, fit.angles, strict=True)], post
 

@@ -12,6 +12,7 @@ from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.subject.keypoints import fit_subject
@@ -51,7 +52,7 @@ def covariance(scene, noise, Sigma=None, cameras=None):
     known, layout = Known.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
-    return lasting(known, layout, state, weight, noise, none, none)
+    return lasting(known, layout, state, weight, noise, SharedErrors.none(len(weight)), none, none)
 
 
 def noise_of(channels, drift=0.0, shift=None):

@@ -138,6 +138,25 @@ def test_exact_pixels_of_a_body_of_usual_shape_leave_it_as_it_is():
     np.testing.assert_allclose(fit_subject(BODY, channels).scales, 1.0, atol=0.02)
 
 
+def test_a_worse_detector_beside_a_better_one_does_no_harm():
+    """Lengths by two detectors, of which one errs eight times as much, are no worse than by the better one alone."""
+
+    def wrong(*detectors):
+        errors = []
+        for seed in range(3):
+            seen = [
+                k for s, noise in detectors
+                for k in simulate_keypoints(MOTION, RIG, s, noise_px=noise, outliers=0.0, missing=0.0, seed=seed)
+            ]  # fmt: skip
+            people = [np.zeros(len(MOTION), int)] * len(seen)
+            subject = fit_subject(BODY, make_channels(BODY, RIG, seen, people, [8.0] * len(seen)))
+            errors.append(np.abs(subject.scales / SCALES - 1.0).mean())
+        return np.mean(errors)
+
+    good = ("BODY_25B", 2.0)
+    assert wrong(good, ("MEDIAPIPE_33", 16.0)) < wrong(good)
+
+
 @pytest.fixture(scope="module")
 def two_takes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("takes")

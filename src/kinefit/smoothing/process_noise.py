@@ -16,6 +16,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
+from kinefit.smoothing.shared_errors import SharedErrors, shared_by
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import boxes
 from kinefit.solvers.motion_prior import MotionPrior
@@ -41,15 +42,18 @@ class Strength:
     ----------
     acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation.
     sigma : (N,) [px] noise of every channel at full confidence.
+    shared : (N,) share of its variance that all points of a segment have in common in a view.
     """
 
     acceleration: NDArray
     sigma: NDArray
+    shared: NDArray
 
     def change(self, other: Strength) -> float:
         """Largest relative difference of anything in it."""
         pairs = zip(*((s.acceleration, s.sigma) for s in (self, other)), strict=True)
-        return max(float(np.abs(np.log(a / b)).max(initial=0.0)) for a, b in pairs)
+        shared = float(np.abs(self.shared - other.shared).max(initial=0.0))
+        return max(shared, *(float(np.abs(np.log(a / b)).max(initial=0.0)) for a, b in pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +99,14 @@ class SmoothTake:
             others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),
         )  # fmt: skip
 
-    def seen(self, sigma: NDArray) -> SeenPoints:
-        """Its pixels and contacts as the solver takes them; sigma (N,) [px]."""
+    def seen(self, sigma: NDArray, shared: NDArray | None = None) -> SeenPoints:
+        """Its pixels and contacts as the solver takes them; sigma (N,) [px], shared (N,) as of `Strength`."""
+        known = SharedErrors.of(self.channels, np.zeros(len(sigma)) if shared is None else shared, sigma)
         out = SeenPoints(
-            self.channels.rig, self.points, self.channels.camera, self.uv, self.confidence / np.square(sigma), self.loss
-        )
+            self.channels.rig, self.points, self.channels.camera, self.uv,
+            self.confidence / (np.square(sigma) * (1.0 - known.share)), self.loss, member=known.member,
+            shared=known.variance,
+        )  # fmt: skip
         if self.contacts is None:
             return out
         held = self.contacts
@@ -147,7 +154,7 @@ class SmoothTake:
         prior = MotionPrior(
             strength.acceleration, self.memory, self.dt, usual, tree.spread, self.live, tree.couplings
         )  # fmt: skip
-        make = self.seen(strength.sigma).equations(self.body)
+        make = self.seen(strength.sigma, strength.shared).equations(self.body)
         dense = self.linear is not None
         if self.linear is not None:
             make = with_quadratic(self.body, make, self.linear)
@@ -174,7 +181,8 @@ def estimate(
     """
     body, channels, n = takes[0].body, takes[0].channels, takes[0].body.tree.n_dofs
     start = np.where(np.arange(n) < 3, *settings_start)
-    strength, groups, limb, count = Strength(start, np.array(channels.sigma)), alike(body), limbs(body), 0
+    strength = Strength(start, np.array(channels.sigma), np.zeros(len(channels.sigma)))
+    groups, limb, count = alike(body), limbs(body), 0
     takes = list(takes)
     while count < rounds:
         count += 1
@@ -192,11 +200,11 @@ def estimate(
         takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
         looks = min(takes[0].dt / _LOOK, 1.0)
-        r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
-        sigma = _noise(channels, r2, variance, looks)
+        left, r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
+        sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, left, variance, looks)
         if takes[0].one_view:  # a pose follows what its only view is off by: residuals show the jitter alone
-            sigma = np.maximum(sigma, channels.sigma)
-        found = Strength(acceleration, sigma)
+            sigma, shared = np.maximum(sigma, channels.sigma), np.zeros(len(sigma))
+        found = Strength(acceleration, sigma, shared)
         change = found.change(strength)
         strength = found
         if takes[0].others is not None:
@@ -305,13 +313,14 @@ def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: 
     return np.asarray(np.exp(share * own + (1.0 - share) * np.log(start)))
 
 
-def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray]:
+def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray, NDArray]:
     """(T, N) squared residuals [px²] at full confidence, NaN for outliers, and the variance of the fit there [px²]."""
     fitted = take.fitted(take.roots, take.angles)
     inside = take.factors(strength.sigma, fitted) > INLIER
     r2 = take.confidence * np.square(take.uv - fitted).sum(axis=2)
     variance = take.seen(strength.sigma).variance(take.body, take.roots, take.angles, post.frames).sum(axis=2)
-    return np.where(inside, r2, np.nan), np.where(inside, take.confidence * variance, np.nan)
+    left = np.where(inside[..., None], take.uv - fitted, np.nan)
+    return left, np.where(inside, r2, np.nan), np.where(inside, take.confidence * variance, np.nan)
 
 
 def _noise(channels: Channels, r2: NDArray, variance: NDArray, looks: float) -> NDArray:

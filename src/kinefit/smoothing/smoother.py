@@ -27,6 +27,7 @@ from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors, SceneOf
 from kinefit.smoothing.pixels import exchanged, without_bias
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
+from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.closed import Constraint, on_null_space, onto
@@ -51,6 +52,7 @@ class SmoothedTake:
     matched : F lists, the matches of all other sensors; None where there are none
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     provenance : what was estimated, as `Motion.provenance` has it
+    shared : what keypoints of one segment err by together, as it was taken
     """
 
     results: Sequence[FrameResult]
@@ -58,6 +60,7 @@ class SmoothedTake:
     matched: Sequence[tuple[Matched, ...]] | None
     weight: NDArray
     provenance: dict[str, Any]
+    shared: SharedErrors
 
 
 def smooth_results(
@@ -126,7 +129,8 @@ def smooth_results(
         smoothed.append(replace(frame, matched=pixels, measurements=()))
     if surfaces:
         smoothed = _without_adrift(body, smoothed, round(_ADRIFT * rate))
-    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds))
+    shared = SharedErrors.of(channels, strength.shared, strength.sigma)
+    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds), shared)
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
@@ -340,6 +344,13 @@ def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
         "velocity_memory": take.memory[1],
         "speed_std": speeds,
         "pixel_sigma": sigma,
+        "shared_errors": {
+            label: {
+                take.body.tree.segments[take.points.segments[i]]: round(float(strength.shared[i]), 2)
+                for i in np.flatnonzero((take.channels.source == q) & (strength.shared > 0))
+            }
+            for q, label in enumerate(take.channels.sources)
+        },
         "sigma_factor": scale,
         "liveliest": round(float(take.live.max()), 2),
         "contacts": 0 if take.contacts is None else int(np.any(take.contacts.weight > 0, axis=1).sum()),

@@ -29,9 +29,10 @@ from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
+from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.border_frames import gram
-from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, normal_equations, product
+from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
 from kinefit.solvers.whitened import Pose, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
@@ -67,7 +68,7 @@ class Lasting:
 def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
-    cameras: tuple[float, float] | None = None,
+    cameras: tuple[float, float] | None = None, shared: SharedErrors | None = None,
 ) -> tuple[Iterator[FrameResult], DetectorNoise]:  # fmt: skip
     """The same results, one by one, with the deviations that lasting errors and the shape add; the detectors' noise.
 
@@ -80,8 +81,10 @@ def with_lasting_errors(
     others : noise of all other sensors
     answers : what shapes add that were found from several kinds of sensors together
     cameras : (2,) standard deviations [m], [rad] of the cameras' poses, where neither the subject nor the answers know
+    shared : what points of one segment err by together, as the fit took it; None: each for itself
     """
     body, channels = subject.body, take.channels
+    shared = shared or SharedErrors.none(len(channels.column))
     values, factor = _left_over(take)
     seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
     hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
@@ -98,7 +101,7 @@ def with_lasting_errors(
     def lasts(f: int) -> Lasting:
         more = nothing if others is None else others.pooled(f, half)
         near = weight[max(f - half, 0) : f + half + 1]
-        return lasting(known, layout, results[f].state, near.mean(axis=0), noise, *more)
+        return lasting(known, layout, results[f].state, near.mean(axis=0), noise, shared, *more)
 
     shapes = []
     if answers:
@@ -191,7 +194,7 @@ class Known:
 
 def lasting(
     known: Known, layout: Layout, state: BodyState, weight: NDArray,
-    noise: DetectorNoise, other_information: NDArray, other_lasting: NDArray,
+    noise: DetectorNoise, shared: SharedErrors, other_information: NDArray, other_lasting: NDArray,
 ) -> Lasting:  # fmt: skip
     """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
@@ -199,10 +202,12 @@ def lasting(
     ----------
     known : what the keypoints rest on
     weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
+    shared : part of a channel's errors, of jitter and of drift alike, that is the same in all of its group
     other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     n = tree.n_dofs
+    weight = weight / (1.0 - shared.share)  # of what is its own
     rows = targets.fill(
         _kernels.pixel_rows, 2, body, state, layout.points, channels.rig.packed, channels.camera,
         np.zeros((len(weight), 2)), np.ascontiguousarray(weight),
@@ -210,6 +215,7 @@ def lasting(
     frames, _ = tree.forward(state.T_world_root, state.angles)
     by_pose, Sigma = columns(rows, Pose.of(body, state)), known.covariance
     by_shape, stretch = known.columns(layout, rows, tree, frames)
+    by_pose, by_shape = (shared.whitened(one, weight, rows.group) for one in (by_pose, by_shape))
     if body.closures:
         closed = closed_at(body, state)
         w = closed.rows().weight
@@ -219,15 +225,16 @@ def lasting(
     prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
     free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
     alone = np.zeros((n, n))
-    seen = normal_equations(body, state, rows).matrix
+    seen = gram(by_pose, by_pose)
     alone[free, free] = inverse((seen + other_information + prior)[free, free])
-    pushed = np.sqrt(weight[rows.group])[:, None] * by_pose
-    last, source, axis = noise.drift[rows.group], channels.source[rows.group], np.arange(len(rows)) % 2
+    pushed = np.sqrt(weight[rows.group])[:, None] * shared.whitened(by_pose, weight, rows.group)
+    source, axis = channels.source[rows.group], np.arange(len(rows)) % 2
     sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shift))]
     push = np.concatenate([np.empty((0, n)), *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
-    data = np.array(rows.data)
-    data[7] *= np.square(last) * weight[rows.group]
-    drift = normal_equations(body, state, replace(rows, data=data)).matrix
+    last, share = (v[rows.group][:, None] * pushed for v in (noise.drift * np.sqrt(1.0 - shared.share),
+                                                            noise.drift * np.sqrt(shared.share)))
+    together = shared.sums(share, rows.group)
+    drift = gram(last, last) + gram(together, together)
     meat = drift + product(push.T, push) + other_lasting
     pushed_by_shape = gram(by_pose, by_shape)
     if known.closing is not None:

@@ -11,39 +11,49 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit._kernels_losses import weigh
 from kinefit.bodies._kernels import difference, forward, retract
 from kinefit.correspondences._kernels import pixel_rows, place, point_rows
 from kinefit.geometry._kernels_camera import project_jacobian
-from kinefit.solvers._kernels import assemble
+from kinefit.solvers._kernels import accumulate, project
+from kinefit.solvers._kernels_shared import take_out, without_shift
 
 
 @jit
 def pixel_equations(
     roots, angles, owner, rest, cameras, camera, uv, weight, anchor_owner, anchor_rest, anchors, anchor_weight,
-    kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain, depth, C, g, cost,
+    member, shared, kind, scale, parents, dof_start, prismatic, axes, rest_joints, chain, depth, C, g, cost,
 ):  # fmt: skip
     """Normal equations C (F, n, m) packed, g (F, n), cost (F,) of all frames at roots (F, 4, 4), angles (F, D).
 
     uv (F, K, 2) [px], weight (F, K) [1/px²] of points owner (K,), rest (K, 3) seen by camera (K,); and points
     anchor_owner (P,), anchor_rest (P, 3) that should lie at anchors (F, P, 3) [m], anchor_weight (F, P) [1/m²].
+    member (K,) is the group of a point, -1 for none, and shared (G,) [px²] the variance of what a group's points are
+    shifted by together, anew in every frame; see `_kernels_shared`.
     """
     size = 2 * owner.size + 3 * anchor_owner.size
     data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
     factor, blocks = np.empty(size), np.empty((parents.size, 27))
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
+    shift, told = np.empty((shared.size, 2)), np.empty(shared.size)
     for t in range(roots.shape[0]):
         forward(parents, dof_start, prismatic, axes, rest_joints, roots[t], angles[t], frames, screws)
         count = pixel_rows(frames, owner, rest, cameras, camera, uv[t], weight[t], data, segment, group, 0)
         first = count
+        of_shifts = 0.0
+        if shared.size > 0:
+            of_shifts = without_shift(data, group, count, weight[t], member, shared, kind, scale, shift, told)
         count = point_rows(
             frames, anchor_owner, anchor_rest, anchors[t], anchor_weight[t], data, segment, group, count
         )  # fmt: skip
         for i in range(first, count):
             group[i] = -1  # a contact is never an outlier
-        cost[t] = assemble(
-            data, segment, group, count, kind, scale, roots[t, :3, 3], parents, dof_start, chain, depth, screws,
-            factor, blocks, C[t], g[t],
-        )  # fmt: skip
+        cost[t] = of_shifts + weigh(data, group, count, kind, scale, factor)
+        blocks[:] = 0.0
+        accumulate(data, segment, factor, count, roots[t, 0, 3], roots[t, 1, 3], roots[t, 2, 3], blocks)
+        if shared.size > 0:
+            take_out(data, segment, group, first, factor, weight[t], member, shared, roots[t, :3, 3], blocks)
+        project(parents, dof_start, chain, depth, screws, blocks, C[t], g[t])
 
 
 @jit

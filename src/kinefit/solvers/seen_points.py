@@ -29,6 +29,8 @@ class SeenPoints:
     loss : Loss of a pixel, in standard deviations.
     anchored : PointSet of P points that rest now and then.
     anchors, anchor_weight : (T, P, 3) [m] where, and (T, P) [1/m²], 0 where they do not.
+    member, shared : (K,) int, which group of points of one segment is shifted together, -1 for none; and (G,) [px²] the
+        variance of each group's shift, new in every frame.
     """
 
     rig: Rig
@@ -40,6 +42,8 @@ class SeenPoints:
     anchored: PointSet = field(default_factory=lambda: NO_POINTS)
     anchors: NDArray | None = None
     anchor_weight: NDArray | None = None
+    member: NDArray | None = None
+    shared: NDArray | None = None
 
     def equations(self, body: Body) -> MakeEquations:
         """What `smooth` asks for."""
@@ -48,13 +52,15 @@ class SeenPoints:
         uv, weight = np.ascontiguousarray(np.nan_to_num(self.uv)), np.ascontiguousarray(self.weight)
         anchors = np.zeros((T, len(self.anchored), 3)) if self.anchors is None else self.anchors
         held = np.zeros(anchors.shape[:2]) if self.anchor_weight is None else self.anchor_weight
+        member = np.full(len(self.points), -1) if self.member is None else self.member
+        shared = np.zeros(0) if self.shared is None else self.shared
         rest, anchor_rest = body.points_rest(self.points), body.points_rest(self.anchored)
 
         def make(roots: NDArray, angles: NDArray) -> Equations:
             C, g, cost = np.zeros((T, *tree.chain.shape)), np.empty((T, n)), np.empty(T)
             _kernels_smoothing.pixel_equations(
                 roots, angles, self.points.segments, rest, self.rig.packed, self.camera, uv, weight,
-                self.anchored.segments, anchor_rest, anchors, held, self.loss.kind, self.loss.scale,
+                self.anchored.segments, anchor_rest, anchors, held, member, shared, self.loss.kind, self.loss.scale,
                 tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain, tree.depth, C, g, cost,
             )  # fmt: skip
             return C, g, cost

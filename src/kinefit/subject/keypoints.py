@@ -30,6 +30,7 @@ from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
 _BELIEF = 5.0  # axes of points that this counts for
+_POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.6  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
 _ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
@@ -129,12 +130,14 @@ def _fitted(
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps)
+            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps), posture=_POSTURE
         )
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
         if k == 0 and by_view:
             bias, steps = _without_bias(body, channels, found, steps)
+        if k == 0 and len(channels.sets) > 1:
+            steps = _by_detector(channels, found, steps)
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
@@ -159,6 +162,27 @@ def _without_bias(
     bias = learn_view_bias([frames])
     layout = Layout(bias.known_to(channels), body)
     return bias, [[KeypointMeasurement(m.of, layout, m.uv, m.confidence, m.time) for m in several] for several in steps]
+
+
+def _by_detector(
+    channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
+) -> list[Sequence[KeypointMeasurement]]:
+    """Frames in which keypoints of each set count as sure as they prove beside the surest one's, by what is left over.
+
+    Detectors are stated alike, and the worse of two would else have as much to say of lengths.
+    """
+    sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
+    matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
+    squares = np.stack([m.squares(Scene(sized, state, channels.rig)) for m, state in zip(matched, found.states)])
+    used = np.stack([m.weight > 0 for m in matched])
+    spans = [(channels.column >= s.start) & (channels.column < s.stop) for s in channels.sets.values()]
+    middle = np.array([np.median(squares[:, mine][used[:, mine]]) if used[:, mine].any() else np.inf for mine in spans])
+    sure = np.zeros(len(channels.column))
+    for mine, own in zip(spans, middle, strict=True):
+        sure[mine] = middle.min() / own if own > 0 else 1.0
+    return [
+        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * sure, m.time) for m in several] for several in steps
+    ]
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:

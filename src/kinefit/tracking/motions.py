@@ -86,7 +86,7 @@ def motion_of(
     body, rate, channels = subject.body, frames.rate, frames.channels
     results: Sequence[FrameResult] = frames.results
     provenance: dict[str, Any] = dict(told or {})
-    others = None
+    others = shared = None
     names = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0)
     if names or body.closures:
         points = 2 * np.count_nonzero(channels.weight, axis=1)
@@ -99,7 +99,7 @@ def motion_of(
             body, channels, results, rate, settings, frames.scene_of, others=others,
             contacts=contacts or eye is not None, up=up, eye=eye,
         )
-        results, take, weight = done.results, done.take, done.weight
+        results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
         others, matched = take.others, done.matched
     else:
@@ -143,7 +143,7 @@ def motion_of(
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_lasting_errors(
         results, subject, take, weight, rate, noise_of_others, answers,
-        cameras=None if elsewhere else settings.camera_std,
+        cameras=None if elsewhere else settings.camera_std, shared=shared,
     )  # fmt: skip
     if channels.sources:
         provenance["detector noise"] = detectors.as_told(channels.sources)
