@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from dataclasses import replace
 
@@ -20,8 +19,7 @@ from kinefit.sensors.observability import levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles
-from kinefit.smoothing.process_noise import alike, limbs
-from kinefit.smoothing.smoother import parts, smooth_results, swapped_channels
+from kinefit.smoothing.smoother import smooth_results, swapped_channels
 from kinefit.smoothing.unwrap import boxes, unwrap
 from kinefit.subject.subject import Subject
 from kinefit.tracking.run import run
@@ -91,29 +89,6 @@ def test_limits_follow_an_angle_into_its_other_chart():
     inside = [np.minimum(angles - lower, upper - angles)[f, ARM] for f in (0, 1)]
     np.testing.assert_allclose(inside[0], inside[1], atol=1e-12)  # as far from the limits as before
     np.testing.assert_allclose(turns_of(usual)[1], turns_of(usual)[0], atol=1e-12)
-
-
-def test_windows_cover_a_take_once_and_overlap():
-    for frames, window, overlap in ((50, 60, 10), (100, 60, 20), (1234, 600, 60), (61, 60, 20)):
-        found = parts(frames, window, overlap)
-        np.testing.assert_array_equal(np.concatenate([np.arange(frames)[kept] for _, kept in found]), np.arange(frames))
-        for whole, kept in found:
-            assert whole.start <= kept.start < kept.stop <= whole.stop
-            assert kept.start == 0 or kept.start - whole.start >= overlap // 2
-        assert all(b[0].start <= a[0].stop - overlap for a, b in itertools.pairwise(found))
-        solved = sum(whole.stop - whole.start for whole, _ in found)
-        assert solved < frames + (len(found) - 1) * overlap + len(found)  # no frame more than they share
-
-
-def test_degrees_of_freedom_are_grouped_by_name_and_by_limb():
-    same = alike(BODY)
-    assert same[6 + TREE.coordinate("knee_angle_r")] == same[6 + TREE.coordinate("knee_angle_l")]
-    assert len(set(same[:3])) == len(set(same[3:6])) == 1 and same[0] != same[3]
-    limb = limbs(BODY)[6:]
-    whole = ("hip_flexion_r", "mtp_angle_r"), ("clav_prot_l", "wrist_dev_l"), ("lumbar_extension", "thorax_bending")
-    for together in whole:
-        assert len({limb[TREE.coordinate(c)] for c in together}) == 1
-    assert len(set(limb)) == 6  # trunk, head, two arms, two legs
 
 
 def test_a_joint_is_told_of_only_by_points_away_from_its_axis():

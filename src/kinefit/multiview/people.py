@@ -258,13 +258,13 @@ class _Search:
                 if turned[t, p] < as_is[t, p]:
                     sides.add((q, mine[p]))
         places: list[NDArray] = []
-        for k in sorted(range(len(tracks)), key=lambda k: abs(frame - tracks[k].met)):
+        unmet = [abs(frame - t.met) for t in tracks]
+        for k in sorted(range(len(tracks)), key=unmet.__getitem__):
             if not views[k]:
                 continue
-            waited = abs(frame - tracks[k].met)
-            reach = _LEAP + SPEED * waited / self.rate
+            reach = _LEAP + SPEED * unmet[k] / self.rate
             kept, found = self._agreeing(frame, views[k], expected[k], sides, reach)
-            if found is not None and waited > 1 and any(_apart(found, x) < _SAME for x in places):
+            if found is not None and unmet[k] > 1 and any(_apart(found, x) < _SAME for x in places):
                 continue  # other detections of somebody who is there
             tracks[k].seen(frame, kept, found, SPEED / self.rate)
             if found is not None:

@@ -15,6 +15,7 @@ from kinefit.losses import Loss
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
+from kinefit.smoothing.limbs import alike, limbs
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
 from kinefit.smoothing.spool import Spool, stretches
@@ -285,26 +286,6 @@ def _liveliness(body: Body, dt: float, squares: NDArray, informed: NDArray) -> N
     return out
 
 
-def limbs(body: Body) -> NDArray:
-    """(n,) int: degrees of freedom between two forks of the tree: trunk, head, each arm, each leg."""
-    tree = body.tree
-    children = np.bincount(np.maximum(tree.parents, 0), minlength=len(tree.segments))
-    children[0] -= 1  # the root is no child of its own
-    out = np.zeros(len(tree.segments), int)
-    for s in range(1, len(out)):
-        parent = tree.parents[s]
-        out[s] = out[parent] if children[parent] == 1 else s
-    return np.concatenate([np.zeros(6, int), out[tree.owners]])
-
-
-def alike(body: Body) -> NDArray:
-    """(n,) int: degrees of freedom that are as lively as each other: the root's shift, its turn, both sides."""
-    known: dict[str, int] = {}
-    names = ["shift"] * 3 + ["turn"] * 3
-    names += [c[:-2] if c.endswith(("_l", "_r")) else c for c in body.tree.coordinates]
-    return np.array([known.setdefault(name, len(known)) for name in names])
-
-
 def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: NDArray) -> NDArray:
     """(n,) by what factor each should change: to start (n,), where the take says little."""
     squares, informed = np.bincount(groups, squares)[groups], np.bincount(groups, informed)[groups]
@@ -314,7 +295,7 @@ def _accelerations(squares: NDArray, informed: NDArray, start: NDArray, groups: 
 
 
 def _pixels(take: SmoothTake, strength: Strength, post: Posterior) -> tuple[NDArray, NDArray, NDArray]:
-    """(T, N) squared residuals [px²] at full confidence, NaN for outliers, and the variance of the fit there [px²]."""
+    """Residuals (T, N, 2) [px], NaN for outliers; squared at full confidence (T, N), and the fit's variance [px²]."""
     fitted = take.fitted(take.roots, take.angles)
     inside = take.factors(strength.sigma, fitted) > INLIER
     r2 = take.confidence * np.square(take.uv - fitted).sum(axis=2)

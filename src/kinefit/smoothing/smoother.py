@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release
-from kinefit._threads import side_by_side
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
@@ -30,15 +28,14 @@ from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enlive
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import unwrap
+from kinefit.smoothing.windows import parts, solved, solved_surely
 from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import inverse
-from kinefit.solvers.smoothing import Posterior
 
 _PARTS = 3  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
 _ADRIFT = 0.13  # [s] about a contradicted segment: of 0, 0.13 and 0.27, the first misses the ends of a gap
-_TOLERANCES = 1e-3, 1e-5  # of two passes of matching all other sensors anew and solving, at known process noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +86,16 @@ def smooth_results(
     swapped = swapped_channels(channels, results)
     take = replace(_take(body, channels, results, swapped, rate, settings, others), one_view=eye is not None)
     strength, take, rounds = _estimate(take, settings, window, overlap)
-    take, covariances, others_matched = _solved_surely(take, strength, window, overlap)
+    take, covariances, others_matched = solved_surely(take, strength, window, overlap)
     again = _swaps(take)
     if not np.array_equal(again, swapped):
         uv, confidence = exchanged(channels, again)
         uv = without_bias(body, channels, uv, take.roots, take.angles)
         take, swapped = replace(take, uv=uv, confidence=confidence), again
-        take, covariances, others_matched = _solved_surely(take, strength, window, overlap)
+        take, covariances, others_matched = solved_surely(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
         found = find_contacts(body, take.roots, take.angles, rate, up, eye)
-        take, others_matched = _solved(replace(take, contacts=found), strength, window, overlap)
+        take, others_matched = solved(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
@@ -220,17 +217,6 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
     return out, rows
 
 
-def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
-    """Overlapping windows of equal length: what is solved, and what of the take is kept from it."""
-    if frames <= window:
-        return [(slice(0, frames), slice(0, frames))]
-    count = int(np.ceil((frames - overlap) / (window - overlap)))
-    window = int(np.ceil((frames + (count - 1) * overlap) / count))  # no longer than needed: each frame costs
-    starts = np.round(np.linspace(0, frames - window, count)).astype(int)
-    cuts = [0, *((starts[1:] + starts[:-1] + window) // 2).tolist(), frames]
-    return [(slice(int(a), int(a) + window), slice(cuts[i], cuts[i + 1])) for i, a in enumerate(starts)]
-
-
 def _estimate(
     take: SmoothTake, settings: TrackSettings, window: int, overlap: int
 ) -> tuple[Strength, SmoothTake, int]:
@@ -249,66 +235,6 @@ def _estimate(
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
     return strength, replace(take, roots=roots, angles=angles, live=live), rounds
-
-
-def _solved(
-    take: SmoothTake, strength: Strength, window: int, overlap: int, tolerances: Sequence[float] = _TOLERANCES
-) -> tuple[SmoothTake, Spool[tuple[Matched, ...]] | None]:
-    """The take at its minimum, and other sensors' matches, after a pass to each tolerance; without them to the last."""
-    matched, windows = None, parts(len(take.roots), window, overlap)
-    for tolerance in tolerances[-1:] if take.others is None else tolerances:
-        fit = partial(SmoothTake.solved, strength=strength, tolerance=tolerance)
-        roots, angles = np.array(take.roots), np.array(take.angles)
-        matched = None if take.others is None else Spool[tuple[Matched, ...]]()
-        fits = side_by_side(fit, _linear_parts(take, windows, matched))
-        for (whole, kept), found in zip(windows, fits, strict=True):
-            inside = slice(kept.start - whole.start, kept.stop - whole.start)
-            roots[kept], angles[kept] = found.roots[inside], found.angles[inside]
-            release(take.uv, take.confidence)
-        take = replace(take, roots=roots, angles=angles)
-    return take, matched
-
-
-def _solved_surely(
-    take: SmoothTake, strength: Strength, window: int, overlap: int
-) -> tuple[SmoothTake, Spool[NDArray], Spool[tuple[Matched, ...]] | None]:
-    """The same with covariances of all frames, the upper triangle of each, and how sure speeds are."""
-    if take.others is not None:
-        take, _ = _solved(take, strength, window, overlap, _TOLERANCES[:-1])
-    packed, windows = np.triu_indices(take.body.tree.n_dofs), parts(len(take.roots), window, overlap)
-    roots, angles = np.array(take.roots), np.array(take.angles)
-    covariances, speeds = Spool[NDArray](), []
-    matched = None if take.others is None else Spool[tuple[Matched, ...]]()
-    fits = side_by_side(lambda part: part.fit(strength), _linear_parts(take, windows, matched, judge=True))
-    for (whole, kept), (fit, post) in zip(windows, fits, strict=True):
-        inside = slice(kept.start - whole.start, kept.stop - whole.start)
-        roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
-        release(take.uv, take.confidence)
-        speeds.append(_speed_std(post, take.dt)[max(inside.start - 1, 0) : inside.stop - 1])
-        for covariance in post.frames[inside]:
-            covariances.append(covariance[packed])
-    moving = np.concatenate(speeds)
-    speed_std = np.percentile(moving, 90.0, axis=0) if len(moving) else None
-    return replace(take, roots=roots, angles=angles, speed_std=speed_std), covariances, matched
-
-
-def _linear_parts(
-    take: SmoothTake, windows: Sequence[tuple[slice, slice]], matched: Spool[tuple[Matched, ...]] | None, *,
-    judge: bool = False,
-) -> Iterator[SmoothTake]:  # fmt: skip
-    """Windows of a take, with other sensors matched and linearised about its states; `matched` takes the matches."""
-    spans, linear = [whole for whole, _ in windows], None
-    if take.others is not None:
-        linear = take.others.windows(take.body, take.roots, take.angles, spans, matched, judge=judge)
-    for whole in spans:
-        part = take.part(whole)
-        yield part if linear is None else replace(part, linear=next(linear))
-
-
-def _speed_std(post: Posterior, dt: float) -> NDArray:
-    """(T - 1, n) [m/s, rad/s] standard deviation of each change to the next frame; errors that last are in none."""
-    own = np.einsum("tii->ti", post.frames)
-    return np.sqrt(np.maximum(own[1:] + own[:-1] - 2.0 * np.einsum("tii->ti", post.following), 0.0)) / dt
 
 
 def _swaps(take: SmoothTake) -> NDArray:

@@ -1,0 +1,28 @@
+"""Degrees of freedom that go together: of one limb, and of both sides."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+
+
+def limbs(body: Body) -> NDArray:
+    """(n,) int: degrees of freedom between two forks of the tree: trunk, head, each arm, each leg."""
+    tree = body.tree
+    children = np.bincount(np.maximum(tree.parents, 0), minlength=len(tree.segments))
+    children[0] -= 1  # the root is no child of its own
+    out = np.zeros(len(tree.segments), int)
+    for s in range(1, len(out)):
+        parent = tree.parents[s]
+        out[s] = out[parent] if children[parent] == 1 else s
+    return np.concatenate([np.zeros(6, int), out[tree.owners]])
+
+
+def alike(body: Body) -> NDArray:
+    """(n,) int: degrees of freedom that are as lively as each other: the root's shift, its turn, both sides."""
+    known: dict[str, int] = {}
+    names = ["shift"] * 3 + ["turn"] * 3
+    names += [c[:-2] if c.endswith(("_l", "_r")) else c for c in body.tree.coordinates]
+    return np.array([known.setdefault(name, len(known)) for name in names])
