@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -37,6 +38,9 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
 
+_REACHED = 10.0  # [Hz] for which the settings' reach is meant: a hand in a brisk wave, 2.5 m/s, goes so far in a frame
+_ARM = 0.7  # [m] the farthest that a limb gets from where it was, however long ago
+
 
 class Sensors:
     """All sensors of a take by name: the built-in kinds as their first frame asks for them, and those of one's own.
@@ -69,6 +73,8 @@ class Sensors:
         on_body: Sequence[str] = (),
     ) -> None:  # fmt: skip
         self.rig, self.rate, self.sigma, self.settings = rig, rate, dict(sigma), settings
+        reach = max(settings.reach, min(settings.reach * _REACHED / rate, _ARM))
+        self._surfaces = replace(settings, reach=reach)
         bad = [f"{name}: {value}" for name, value in self.sigma.items() if not 0.0 < value < np.inf]
         if bad:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
@@ -193,12 +199,12 @@ class Sensors:
         return MarkerSensor(name, self.sigma.get(name, s.marker), s.loss, s.near)
 
     def _depth(self, name: str) -> DepthImageSensor:
-        camera, s = self.rig[name], self.settings
+        camera, s = self.rig[name], self._surfaces
         return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
 
     def _cloud(self, name: str) -> PointCloudSensor:
         camera = self.rig[name] if name in self.rig else None
-        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings, camera)
+        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self._surfaces, camera)
 
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
