@@ -57,14 +57,6 @@ def test_a_search_sees_nobody_else(pair):
     assert without_others(frame, (), cam) is frame
 
 
-def test_what_touches_is_parted_where_one_knows_oneself(pair):
-    cam, both, own, theirs, (mine, yours) = pair
-    frame = DepthFrame("depth", 0.0, both)
-    parted, unknown = (without_others(frame, (yours,), cam, known).depth for known in ((mine,), ()))
-    assert np.mean(parted[own] > 0) > 0.97 and np.mean(parted[theirs] == 0) > 0.97
-    assert np.mean(unknown[own] > 0) < 0.95, "else what is near to the other is theirs"
-
-
 def test_a_mask_of_everybody_gives_no_contour_between_people(pair):
     cam, both, own, theirs, (mine, yours) = pair
     sensor = SilhouetteSensor(cam, 2.0, SETTINGS)

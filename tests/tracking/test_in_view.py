@@ -46,16 +46,11 @@ def test_two_people_before_a_depth_camera():
     for k in range(2):
         alone = view.recording(recording, BODY, k + 1, TrackSettings())
         assert alone.followed.number == k + 1 and len(alone.others) == 1
-        assert max(alone.depth) > COUNT // 2, "the size is found from images of the whole take"
         motion = track(alone, BODY, size=False, smooth=False)
         roots = np.array([[s.T_world_root[:3, 3] for s in truth(step)] for step in range(COUNT)])
         gaps = np.linalg.norm(motion.Ts_world_root[:, None, :3, 3] - roots, axis=-1)
         own = int(np.argmin(gaps[0]))
         assert (gaps[:, own] < 0.15).all() and np.median(gaps[:, own]) < 0.05
-        for step, frame in alone.depth.items():
-            front = [render_body(BODY, s, camera()).depth for s in (truth(step)[own], truth(step)[1 - own])]
-            mine, theirs = (np.isfinite(a) & (a < b) for a, b in (front, front[::-1]))
-            assert np.mean(frame.depth[mine] > 0) > 0.9 and np.mean(frame.depth[theirs] == 0) > 0.9
         owners.append(own)
         assert motion.provenance["people"]["followed"] == k + 1
     assert sorted(owners) == [0, 1]

@@ -41,15 +41,12 @@ def of_others(depth: NDArray, own: NDArray, others: NDArray | None, camera: Came
     return (depth > 0.0) & (away < _REACH) & (away < _distance(depth, own, camera))
 
 
-def without_others(
-    frame: DepthFrame, others: Sequence[Scene], camera: Camera, own: Sequence[Scene] = ()
-) -> DepthFrame:
-    """A depth image with nothing where other bodies are; `own`: the body that it is kept for, where that is known."""
+def without_others(frame: DepthFrame, others: Sequence[Scene], camera: Camera) -> DepthFrame:
+    """A depth image with nothing where other bodies are."""
     drawn = drawn_together(others, camera)
     if drawn is None:
         return frame
-    mine = drawn_together(own, camera)
-    theirs = of_others(frame.depth, np.full_like(drawn, np.inf) if mine is None else mine, drawn, camera)
+    theirs = of_others(frame.depth, np.full_like(drawn, np.inf), drawn, camera)
     return replace(frame, depth=np.where(theirs, np.float32(0.0), frame.depth))
 
 

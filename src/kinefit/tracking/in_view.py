@@ -21,10 +21,8 @@ from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.pictures import TakePictures
-from kinefit.sensors.parting import without_others
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.others import OtherPeople
-from kinefit.tracking.recording import Recording, spread
+from kinefit.tracking.recording import Recording
 from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import track
 
@@ -34,8 +32,6 @@ _STILL = 0.8  # overlap of the pixels of a thing that stands still: 0.95 and mor
 _MOST = 4  # things in a depth image that are looked at
 _SAME = 0.3  # [m] two roots that are nearer are of one person
 _WALK = 3.0  # [m/s]
-_SIZES = 8  # images of the whole take from which the size of one of several people is found
-_SEEN = 0.5  # quality of a frame in which somebody is followed
 _STRIDE = 0.5  # [m] by which the middle of what is seen of a person moves without a step
 
 
@@ -79,10 +75,7 @@ class InView:
             m if own is None or k < number else _elsewhere(m, own)
             for k, m in enumerate(motions) if k != number and m is not None
         )  # fmt: skip
-        followed = replace(self._of(number, recording), others=tuple(m for m in others if len(m)))
-        if not self.depth or own is None or not followed.others:
-            return followed
-        return replace(followed, depth=_parted(followed, own) or followed.depth)
+        return replace(self._of(number, recording), others=tuple(m for m in others if len(m)))
 
     def _of(self, number: int, recording: Recording) -> Recording:
         if not self.depth:
@@ -104,20 +97,6 @@ class InView:
             except KinefitError:
                 return None
         return self._motions[k]
-
-
-def _parted(recording: Recording, own: Motion) -> dict[int, DepthFrame]:
-    """Depth images by step, spread over the whole take: where one is followed, with nothing where others are."""
-    sensor, near = next(iter(recording.depth.values())).sensor, 0.5 / recording.rate + 1e-6
-    followed, others = (OtherPeople(m, recording.rig, near) for m in ((own,), recording.others))
-    out = {}
-    for step in spread(len(recording), _SIZES).tolist():
-        time = float(recording.times[step])
-        here = followed.at(time) if own.quality[np.abs(own.times - time).argmin()] > _SEEN else []
-        for frame in recording.steps(step) if here else ():
-            if isinstance(frame, DepthFrame) and frame.sensor == sensor:
-                out[step] = without_others(frame, others.at(time), recording.rig[sensor], here)
-    return out
 
 
 def _elsewhere(motion: Motion, own: Motion) -> Motion:

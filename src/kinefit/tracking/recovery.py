@@ -76,7 +76,7 @@ class Recovery:
             seek = lost
             if rare:
                 search = self._search(tracker, time, measurements, result)
-            if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
+            if search is not None:  # a limb may lie on another, a hand stand on its edge
                 seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
