@@ -6,7 +6,8 @@ from tests.tracking.depth_oracle import BODY, camera, depth_of, facing
 
 from kinefit.frame.routing import Sensors
 from kinefit.geometry.camera import Rig
-from kinefit.observations import DepthFrame, PointCloud
+from kinefit.observations import DepthFrame
+from kinefit.rendering import render_body
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
@@ -24,17 +25,22 @@ def test_what_a_limb_may_have_moved_between_two_frames_is_gathered(rate, gathere
     assert (np.linalg.norm(cloud - wrist, axis=1).min() < 0.08) == gathered
 
 
+def test_a_room_is_no_limb():
+    wall = np.where(np.isfinite(shown := render_body(BODY, AHEAD, RIG["depth"]).depth), shown, 3.8)
+    scene = Scene(BODY, DOWN, RIG)
+    (measured,) = Sensors(RIG, 1.0, {}, TrackSettings()).measurements([DepthFrame("depth", 1.0, wall)], scene)
+    (usual,) = Sensors(RIG, 30.0, {}, TrackSettings()).measurements([DepthFrame("depth", 1.0, wall)], scene)
+    assert np.array_equal(measured.box, usual.box)
+
+
 @pytest.mark.parametrize("rate, reach", [(120.0, 0.25), (10.0, 0.25), (5.0, 0.5), (1.0, 0.7), (0.01, 0.7)])
 def test_the_reach_goes_with_the_time_between_frames(rate, reach):
     sensors, scene = Sensors(RIG, rate, {}, TrackSettings()), Scene(BODY, DOWN, RIG)
     sensors.measurements([DepthFrame("depth", 0.0, depth_of(BODY, DOWN, RIG["depth"]))], scene)
-    sensors.measurements([PointCloud("cloud", 0.0, np.ones((4, 3)))], scene)
-    assert sensors.of("depth").settings.reach == pytest.approx(reach)
-    assert sensors.of("cloud").settings.reach == pytest.approx(reach)
-    assert sensors.settings.reach == 0.25, "of all others it stays"
+    assert sensors.of("depth").reach == pytest.approx(reach)
 
 
 def test_a_longer_reach_that_is_asked_for_stays():
     sensors, scene = Sensors(RIG, 1.0, {}, TrackSettings(reach=1.0)), Scene(BODY, DOWN, RIG)
     sensors.measurements([DepthFrame("depth", 0.0, depth_of(BODY, DOWN, RIG["depth"]))], scene)
-    assert sensors.of("depth").settings.reach == 1.0
+    assert sensors.of("depth").reach == 1.0

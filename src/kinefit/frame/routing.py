@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -73,8 +72,6 @@ class Sensors:
         on_body: Sequence[str] = (),
     ) -> None:  # fmt: skip
         self.rig, self.rate, self.sigma, self.settings = rig, rate, dict(sigma), settings
-        reach = max(settings.reach, min(settings.reach * _REACHED / rate, _ARM))
-        self._surfaces = replace(settings, reach=reach)
         bad = [f"{name}: {value}" for name, value in self.sigma.items() if not 0.0 < value < np.inf]
         if bad:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
@@ -199,12 +196,13 @@ class Sensors:
         return MarkerSensor(name, self.sigma.get(name, s.marker), s.loss, s.near)
 
     def _depth(self, name: str) -> DepthImageSensor:
-        camera, s = self.rig[name], self._surfaces
-        return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
+        camera, s = self.rig[name], self.settings
+        reach = min(s.reach * _REACHED / self.rate, _ARM)
+        return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera), reach)
 
     def _cloud(self, name: str) -> PointCloudSensor:
         camera = self.rig[name] if name in self.rig else None
-        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self._surfaces, camera)
+        return PointCloudSensor(name, self.sigma.get(name, self.settings.depth), self.settings, camera)
 
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
