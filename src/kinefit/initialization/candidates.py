@@ -101,13 +101,11 @@ def known_points(
     return (joined(sets) if sets else empty), np.concatenate(places)
 
 
-def find_limbs(
-    search: Search, state: BodyState, seek: NDArray, tries: int = 200, *, leap: float = LEAP
-) -> list[tuple[BodyState, float]]:
+def find_limbs(search: Search, state: BodyState, seek: NDArray, tries: int = 200) -> list[tuple[BodyState, float]]:
     """States that a view speaks for more than for the given one, with the gain in score that each must show.
 
     Near ones come first: all else held, then the whole body moved. A limb that is found somewhere else altogether
-    must explain `leap` more.
+    must explain `LEAP` more.
 
     Parameters
     ----------
@@ -123,7 +121,7 @@ def find_limbs(
     found = [(state, now)]
     for limb in chosen:
         found = search.limb(found[0][0], limb, None, ends, tries)
-    out += [(s, v - now, leap) for s, v in found[:2]]
+    out += [(s, v - now, LEAP) for s, v in found[:2]]
     return [(s, least) for s, gain, least in sorted(out, key=lambda o: o[2] - o[1]) if gain > least]
 
 

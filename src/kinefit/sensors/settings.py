@@ -19,8 +19,8 @@ class TrackSettings:
     samples : int
         Points of the body's surface that look for their measurement.
     reach : float [m]
-        How far outside of the predicted body's box a measured point may lie: what a hand moves between two frames. Of
-        depth below 10 Hz it is longer by the time between them, up to an arm.
+        How far outside of the predicted body's box a measured point may lie: what a hand moves between two frames. In
+        depth images below 10 Hz it is longer, up to an arm, unless what lies there is more than limbs can be.
     far, near : float [m]
         Bound of a correspondence in the first iteration and in the last: from what a prediction may be off to three
         deviations of a sensor of a centimetre.

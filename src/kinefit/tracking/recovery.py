@@ -13,14 +13,7 @@ from kinefit.bodies.limbs import limbs
 from kinefit.frame.prediction import forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
-from kinefit.initialization.candidates import (
-    GAIN,
-    LEAP,
-    dofs_of_limbs,
-    find_limbs,
-    starts_from_points,
-    starts_from_views,
-)
+from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import Search
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.settings import TrackSettings
@@ -51,11 +44,6 @@ class Recovery:
         self._of_limbs = np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b])
         self.forget()
 
-    @property
-    def _rare(self) -> bool:
-        """Whether a pose becomes any other between two images: a limb is then as likely anywhere as where it was."""
-        return self.rate < 1.0 / _ANEW
-
     def forget(self) -> None:
         """Of the time before a pause."""
         self._sought = self._lost_since = -np.inf
@@ -78,7 +66,7 @@ class Recovery:
     ) -> FrameResult | None:  # fmt: skip
         """The result of one time, or a better one that was found."""
         s, search = self.settings, None
-        rare = s.search and self._rare
+        rare = s.search and self.rate < 1.0 / _ANEW
         if np.isnan(self._good[0]):
             self._good[0] = time
         if result is None or result.support < s.support:
@@ -88,7 +76,7 @@ class Recovery:
             seek = lost
             if rare:
                 search = self._search(tracker, time, measurements, result)
-            if search is not None:  # a limb may lie on another, a hand stand on its edge
+            if search is not None and search.score.missing(result.state) > LEAP:  # a limb may lie on another
                 seek = lost | self._of_limbs
             self._good[~seek] = time
             if not seek[0]:
@@ -159,7 +147,7 @@ class Recovery:
         std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
         held = result.state, forgetting(inverse(np.diag(std**2)), free)
         now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
-        for state, least in find_limbs(search, result.state, seek, leap=GAIN if self._rare else LEAP):
+        for state, least in find_limbs(search, result.state, seek):
             found = tracker.fitted(time, frames, state, held).result
             value = search.score.of(found.state) - LEAP * _against(tracker, found)
             if not self._shown(tracker, found, lost):
