@@ -38,7 +38,6 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
 
 _REACHED = 10.0  # [Hz] for which the settings' reach is meant: a hand in a brisk wave, 2.5 m/s, goes so far in a frame
-_ARM = 0.7  # [m] the farthest that a limb gets from where it was, however long ago
 
 
 class Sensors:
@@ -197,7 +196,7 @@ class Sensors:
 
     def _depth(self, name: str) -> DepthImageSensor:
         camera, s = self.rig[name], self.settings
-        reach = min(s.reach * _REACHED / self.rate, _ARM)
+        reach = min(s.reach * _REACHED / self.rate, s.longest_reach)
         return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera), reach)
 
     def _cloud(self, name: str) -> PointCloudSensor:
