@@ -37,8 +37,6 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
 
-_REACHED = 10.0  # [Hz] for which the settings' reach is meant: a hand in a brisk wave, 2.5 m/s, goes so far in a frame
-
 
 class Sensors:
     """All sensors of a take by name: the built-in kinds as their first frame asks for them, and those of one's own.
@@ -196,8 +194,7 @@ class Sensors:
 
     def _depth(self, name: str) -> DepthImageSensor:
         camera, s = self.rig[name], self.settings
-        reach = min(s.reach * _REACHED / self.rate, s.longest_reach)
-        return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera), reach)
+        return DepthImageSensor(name, camera, self.sigma.get(name, s.depth), s, self.background(camera))
 
     def _cloud(self, name: str) -> PointCloudSensor:
         camera = self.rig[name] if name in self.rig else None

@@ -32,7 +32,6 @@ from kinefit.sensors.visibility import judge_segments
 AGREES = 3.0  # standard deviations of a measurement that agrees
 _SHAPE = 0.03  # [m] by which a surface of simple shapes is off
 _LIMB = 0.04  # [m] radius of a forearm
-_LIMBS = 0.5  # of a person's surface: both arms and a leg; more of what lies beside a person is a floor, a wall
 _MOST_PIXELS, _MOST_POINTS = 25_000, 5_000  # of what is kept: 100 kB and 80 kB
 
 
@@ -46,17 +45,12 @@ class DepthImageSensor(Sensor):
     sigma : float [m] standard deviation of a depth.
     settings : TrackSettings
     background : Background of this camera, None where it moves, or shows nothing but the body.
-    reach : float [m]
-        How far outside of the predicted body's box measured points are gathered where these are no more than limbs
-        can be; default: the settings', and that where they are more.
     """
 
     def __init__(
-        self, name: str, camera: Camera, sigma: float, settings: TrackSettings, background: Background | None,
-        reach: float = 0.0,
-    ) -> None:  # fmt: skip
+        self, name: str, camera: Camera, sigma: float, settings: TrackSettings, background: Background | None
+    ) -> None:
         self.name, self.camera, self.sigma, self.settings, self.background = name, camera, sigma, settings, background
-        self.reach = max(reach, settings.reach)
         self._coarse: dict[int, Camera] = {1: camera}
 
     def prepare(self, frame: DepthFrame, scene: Scene) -> DepthImageMeasurement:
@@ -115,23 +109,19 @@ class DepthImageMeasurement(Measurement):
         self.sensor, self.time, self.of, self.camera, self.sigma = of.name, frame.time, of, camera, of.sigma
         vertices, corners = surface.posed(scene.state), np.empty((2, 3))
         kernels.box(vertices, corners)
+        self.box = corners[0] - s.reach, corners[1] + s.reach
+        first, last, self._farthest = window_of(camera, *self.box)
+        self._window, self._at = (first, last), (0, 0)
         depth = without_speckles(frame.depth, camera, self.sigma)
+        self._kept = depth if of.background is None else of.background.marked(depth, first, last)
         self._shown: NDArray | None = surface.depth(vertices, camera).copy()
-        drawn = drawn_together(scene.others, camera)
-        for reach in dict.fromkeys((of.reach, s.reach)):
-            self.box = corners[0] - reach, corners[1] + reach
-            first, last, self._farthest = window_of(camera, *self.box)
-            self._window, self._at = (first, last), (0, 0)
-            self._kept = depth if of.background is None else of.background.marked(depth, first, last)
-            if drawn is not None:
-                theirs = of_others(self._kept, self._shown, drawn, camera)
-                self._kept = np.where(theirs, -self._kept, self._kept)
-            self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
-            if reach == s.reach or self._is_limbs(corners):
-                break
+        if scene.others:
+            theirs = of_others(self._kept, self._shown, drawn_together(scene.others, camera), camera)
+            self._kept = np.where(theirs, -self._kept, self._kept)
         self._space = self._free(self._shown)
         self._matches, self.is_compact = 0, False
         self._judged: tuple[BodyState, NDArray] | None = None
+        self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
         patches = surface.areas.sum() / (s.patch**2 * max(len(surface.samples), 1))
         self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is measured by both
 
@@ -144,12 +134,6 @@ class DepthImageMeasurement(Measurement):
         out, (row, column) = np.zeros((height, width), np.float32), self._at
         out[row : row + self._kept.shape[0], column : column + self._kept.shape[1]] = self._kept
         return out
-
-    def _is_limbs(self, corners: NDArray) -> bool:
-        """Whether no more is gathered beyond the settings' reach of the body's box (2, 3) [m] than limbs can be."""
-        half = np.ptp(corners, axis=0) / 2.0 + self.of.settings.reach
-        beyond = (np.abs(self._points.T - corners.mean(axis=0)) > half).any(axis=1)
-        return bool(self._share[beyond].sum() <= _LIMBS * self._share[~beyond].sum())
 
     def _free(self, shown: NDArray) -> FreeSpace | None:
         """Where the body can be, and where some of it is missing, with the body as it is drawn."""

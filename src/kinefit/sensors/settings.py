@@ -20,8 +20,6 @@ class TrackSettings:
         Points of the body's surface that look for their measurement.
     reach : float [m]
         How far outside of the predicted body's box a measured point may lie: what a hand moves between two frames.
-    longest_reach : float [m]
-        What it grows to in depth images below 10 Hz, an arm, unless what lies there is more than limbs can be.
     far, near : float [m]
         Bound of a correspondence in the first iteration and in the last: from what a prediction may be off to three
         deviations of a sensor of a centimetre.
@@ -102,7 +100,6 @@ class TrackSettings:
     points: int = 1000
     samples: int = 600
     reach: float = 0.25
-    longest_reach: float = 0.7
     far: float = 0.15
     near: float = 0.03
     shrink: float = 0.5

@@ -87,9 +87,8 @@ class InView:
         """Of one person, roughly: from keypoints alone, or from depth as if nobody else were there; None if lost."""
         if k not in self._motions:
             try:
-                if self.depth:  # nobody is parted off yet: a longer reach would find the others where one has left
-                    near = replace(settings, longest_reach=0.0)
-                    self._motions[k] = track(self._of(k, recording), body, settings=near, smooth=False)
+                if self.depth:
+                    self._motions[k] = track(self._of(k, recording), body, settings=settings, smooth=False)
                 else:
                     own = Recording.of_keypoints(
                         recording.rig, self.seen.keypoints, person=k + 1, people=self.people, up=recording.up
