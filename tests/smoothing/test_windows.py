@@ -2,6 +2,8 @@
 
 import itertools
 
+import numpy as np
+
 from kinefit.smoothing.windows import parts
 
 
