@@ -140,7 +140,8 @@ def invert_factor(C, chain, depth):
             x[t] = v
             for s in range(t):
                 x[s] -= row[s] * v
-        C[k, : d + 1] = x[: d + 1]
+        for t in range(d + 1):  # a slice set to an array compiles its error's text, for seconds
+            C[k, t] = x[t]
     return True
 
 

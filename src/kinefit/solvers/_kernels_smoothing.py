@@ -105,7 +105,10 @@ def add_motion(steps, past, weight, first, width, band, g):
     c = np.zeros(4)
     for s in range(count):
         for i in range(2, 0, -1):
-            turns[i] = turns[i - 1]
+            for side in range(2):
+                for a in range(3):
+                    for b in range(3):
+                        turns[i, side, a, b] = turns[i - 1, side, a, b]
         _inverse_left_jacobian(steps[s, 3:6], 1.0, turns[0, 0])
         _inverse_left_jacobian(steps[s, 3:6], -1.0, turns[0, 1])
         c[0], c[1], c[2] = 1.0, -past[s, 0], -past[s, 1]
