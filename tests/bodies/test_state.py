@@ -5,6 +5,7 @@ import pytest
 from tests.oracle import STATES, random_body, state_of
 
 from kinefit.bodies import BodyState
+from kinefit.errors import BodyError
 from kinefit.geometry import se3
 
 BODY = random_body(0)
@@ -75,3 +76,9 @@ def test_arrays_of_any_layout_are_taken():
     state = BodyState(np.asfortranarray(T), np.zeros(6)[::2])
     assert state.T_world_root.flags.c_contiguous and state.angles.flags.c_contiguous
     np.testing.assert_array_equal(state.T_world_root, T)
+
+
+@pytest.mark.parametrize("length", [0, 6, 8, 10])
+def test_a_step_of_another_length_is_refused(length):
+    with pytest.raises(BodyError, match="Give 9 numbers"):
+        BodyState(np.eye(4), np.zeros(3)).retract(np.zeros(length))

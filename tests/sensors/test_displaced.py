@@ -82,7 +82,8 @@ def test_a_fit_finds_the_frame_where_another_sensor_holds_the_world():
         world = seen(state, np.eye(4))
         world.sensor = "world"
         steps.append([world, Displaced(seen(state, true), CENTRE)])
-    found = fit_subject(BODY, Rig(()), steps, states, [SensorFrames(("markers",))], velocities=[np.zeros(43)] * 4)
+    still = [np.zeros(BODY.tree.n_dofs)] * 4
+    found = fit_subject(BODY, Rig(()), steps, states, [SensorFrames(("markers",))], velocities=still)
     np.testing.assert_allclose(displacement(found.values["markers"], CENTRE), true, atol=1e-4)
     assert found.value("markers clock")[1] == pytest.approx(0.02, rel=1e-3)  # nobody moves: the prior
 

@@ -40,13 +40,16 @@ class BodyState:
     def retract(self, delta: NDArray, bounds: tuple[NDArray, NDArray] | None = None) -> BodyState:
         """State moved by δ (6 + D,): the root's twist (v, ω) in the world about its own origin, then the angles.
 
-        `bounds` are the lower and upper ends (D,) that the angles are kept within.
+        `bounds` are the lower and upper ends (D,) that the angles are kept within; a δ of another length is a BodyError
         """
         root, angles = np.empty((4, 4)), np.empty(len(self.angles))
         if bounds is None:
             free = np.full(len(self.angles), np.inf)
             bounds = -free, free
         delta = np.ascontiguousarray(delta, dtype=float)
+        if delta.shape != (6 + len(angles),):
+            problem = f"a step of shape {delta.shape} of a state with {len(angles)} angles"
+            raise BodyError(problem, remedy=f"Give {6 + len(angles)} numbers.")
         _kernels.retract(self.T_world_root, self.angles, delta, bounds[0], bounds[1], root, angles)
         return BodyState(root, angles)
 
