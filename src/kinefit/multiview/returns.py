@@ -147,21 +147,21 @@ def _parted(spans: Sequence[Span], needed: int, rate: float) -> list[Span]:
     come, too. Enough cameras never see both then.
     """
     out = list(spans)
-    for i, j in ((i, j) for i in range(len(out)) for j in range(len(out)) if i != j):
-        a, b = out[i], out[j]
-        if not (a.ends[0] < b.ends[1] and b.ends[0] <= a.ends[1]):
+    ends = [s.ends for s in out]
+    well = [np.sort([f for f, nodes in s.nodes.items() if len(nodes) >= needed]) for s in out]
+    long = [k for k in range(len(out)) if len(well[k]) >= _SHORTEST * rate]
+    for i, j in ((i, j) for i in long for j in long if i != j):
+        if not (ends[i][0] < ends[j][1] and ends[j][0] <= ends[i][1]):
             continue
-        well = [np.sort([f for f, nodes in s.nodes.items() if len(nodes) >= needed]) for s in (a, b)]
-        if min(map(len, well)) < _SHORTEST * rate:
-            continue
-        cuts = np.concatenate([well[0] + 1, well[1]])
-        dropped = np.stack([len(well[0]) - np.searchsorted(well[0], cuts), np.searchsorted(well[1], cuts)])
+        cuts = np.concatenate([well[i] + 1, well[j]])
+        dropped = np.stack([len(well[i]) - np.searchsorted(well[i], cuts), np.searchsorted(well[j], cuts)])
         best = int(dropped.sum(axis=0).argmin())
-        if np.all(dropped[:, best] <= _BESIDE * np.array([len(w) for w in well])):
+        if np.all(dropped[:, best] <= _BESIDE * np.array([len(well[i]), len(well[j])])):
             cut = int(cuts[best])
-            before, after = _within(a, -1, cut), _within(b, cut, np.inf)
+            before, after = _within(out[i], -1, cut), _within(out[j], cut, np.inf)
             if _in_reach(before, after, rate):
-                out[i], out[j] = before, after
+                out[i], out[j], ends[i], ends[j] = before, after, before.ends, after.ends
+                well[i], well[j] = well[i][well[i] < cut], well[j][well[j] >= cut]
     return out
 
 
