@@ -134,7 +134,7 @@ def synthetic() -> None:
     for name, truth in library(amount([*MOTIONS, SHORT], ["jumping jacks 13_30"])).items():
         motion = cut(truth, 0, min(len(truth), _LONGEST))
         rig, centre = studio_rig(motion), motion.Ts_world_root[:, :3, 3].mean(axis=0)
-        options = {"up": motion.up, "accuracy": NOISE["noise_px"]}
+        options = {"up": motion.up, "sigma": NOISE["noise_px"]}
         seen = simulate_keypoints(motion, rig, seed=1, **NOISE)
         turn, place = camera_errors(calibrate_people(tuple(rig), seen, body, **options).rig, rig, centre)
         scale = [np.array([[f, 1, 1], [1, f, 1], [1, 1, 1]]) for f in FOCAL]

@@ -15,8 +15,8 @@ from benchmarks.motions import library
 from benchmarks.tracking import DETECTORS, NOISE, TRIAL, take_text
 from kinefit import Keypoints, Motion, Rig
 from kinefit.calibration.check.check import Check, check_keypoints, check_take
-from kinefit.calibration.check.timing import time_offsets
-from kinefit.calibration.check.views import make_views, with_sides_right
+from kinefit.diagnostics.timing import time_offsets
+from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 FINE = 4  # frames of a recorded motion are one of the take: quarters of a frame are exact then

@@ -179,7 +179,7 @@ def from_drive(
     if leg:
         hidden[frames // 4 : 3 * frames // 4] = True
         seen = [_without(k, hidden) for k in seen]
-    recording = Recording.of_keypoints(calibrated(rig, seed), seen, accuracy=noise, up="y")
+    recording = Recording.of_keypoints(calibrated(rig, seed), seen, sigma=noise, up="y")
     return Take(motion, generic, recording, hidden)
 
 

@@ -44,7 +44,7 @@ def tracker(body: Any, rig: Any, rate: float) -> Any:
     """What is measured: the tracker as it comes."""
     from kinefit.tracking.tracker import Tracker
 
-    return Tracker(body, rig, rate=rate)
+    return Tracker(body, rig, rate=rate, up="y")
 
 
 def run() -> None:

@@ -133,7 +133,7 @@ class Stage:
         settings = TrackSettings(points=points, search=False)
         tracker = Tracker(
             self.motion.body, self.rig, rate=self.motion.rate, settings=settings,
-            accuracy={self.camera.name: self.accuracy},
+            sigma={self.camera.name: self.accuracy},
         )  # fmt: skip
         tracker.start_at(self.motion.state(0))
         ms, results = [], []

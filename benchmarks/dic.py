@@ -147,7 +147,7 @@ def _strain(sample: Sample) -> None:
         error, alone, inside = _strain_error(sample, "L3", window, gauge)
         print(f"# strain over {gauge + 1} px, window {window} (of {list(tried)}, by L1 and L5), step {STRAIN_STEP}: "
               f"linear fit of the truth alone {1e6 * alone:.0f}e-6")  # fmt: skip
-        figure(f"dic_strain_L3_gauge_{gauge + 1}", 1e6 * error, "1e-6 RMS", goal.replace("e-6", ""))
+        figure(f"dic_strain_L3_gauge_{gauge + 1}", 1e6 * error, "microstrain RMS", goal.replace("e-6", ""))
         print(f"#   95 % intervals about the mean over the gauge hold {100 * inside:.1f} %")
     found = {name: strained(sample, name, 35, 250)[1].rms()["yy"] for name in ("L1", "L3")}
     print(f"# noise floor, the unstrained direction of L1 and L3, window 35, 251 px: {1e6 * found['L1']:.0f}e-6, "

@@ -59,7 +59,7 @@ def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str,
         if name == "camera_lost":
             middle = len(truth) // 2
             seen = without(seen, number % len(rig), middle - 15, middle + 15)
-        recording = Recording.of_keypoints(rig, seen, accuracy=ACCURACY, up=truth.up)
+        recording = Recording.of_keypoints(rig, seen, sigma=ACCURACY, up=truth.up)
         motion = track(recording, load_body("humanoid"))
         for group, share in coverage_of_groups(truth, motion).items():
             told.setdefault(group, []).append((share.joints, share.angles))

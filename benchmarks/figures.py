@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import os
+import shlex
 import sys
 import time
 import traceback
@@ -19,21 +20,51 @@ Amount = TypeVar("Amount")
 _RELATIONS = {"<=": operator.le, ">=": operator.ge, ">": operator.gt, "==": operator.eq}
 
 
-def figure(name: str, value: float | None, unit: str, goal: str, reason: str = "") -> bool:
-    """Print `figure NAME = VALUE UNIT (goal GOAL): met|missed|not measured (reason)`.
+def figure(
+    name: str, value: float | None, unit: str, goal: str, reason: str = "", *, whole: bool = True
+) -> bool:
+    """Print `figure NAME = VALUE UNIT (goal GOAL): met|missed|not measured (reason)`; log it in a whole run.
 
     Parameters
     ----------
     goal : str such as "<= 9", ">= 2.5", "> 0" or "== 500".
     reason : str, why there is no value.
+    whole : bool, False where less was measured than the figure's name says: it is then not logged.
     """
+    known = value is not None and math.isfinite(value)
+    text = _printed(value, goal) if known else ""
+    verdict = ("met" if holds(value, goal) else "missed") if known else "not measured"
+    reason = "" if known else reason or "no value"
+    print(f"figure {name} = {text or '-'} {unit} (goal {goal}): {verdict}{f' ({reason})' * (not known)}", flush=True)
+    if whole and (command := _command()):
+        from benchmarks.ledger import record
+
+        record(name, text, unit, goal, verdict, reason, command=command)
+    return verdict == "met"
+
+
+def holds(value: float, goal: str) -> bool:
+    """Whether a value meets a goal such as "<= 9"."""
     relation, bound = goal.split()
-    if value is None or not math.isfinite(value):
-        print(f"figure {name} = - {unit} (goal {goal}): not measured ({reason or 'no value'})", flush=True)
-        return False
-    met = _RELATIONS[relation](value, float(bound))
-    print(f"figure {name} = {value:.4g} {unit} (goal {goal}): {'met' if met else 'missed'}", flush=True)
-    return met
+    return bool(_RELATIONS[relation](value, float(bound)))
+
+
+def _printed(value: float, goal: str) -> str:
+    """Four digits, or as many as the verdict needs: 99.996 is not printed as 100 where the goal is 100."""
+    texts = [f"{value:.{digits}g}" for digits in range(4, 18)]
+    return next(text for text in texts if holds(float(text), goal) == holds(value, goal))
+
+
+_PART: list[str] = []
+"""Words of the command that runs one part of an area alone; empty before `run_parts` has begun with it."""
+
+
+def _command() -> str:
+    """The command whose figures are logged; empty in the quick form, with `--no-log`, and in other programs."""
+    program = Path(sys.argv[0]).resolve()
+    if quick() or {"--quick", "--no-log"} & {*sys.argv} or program.parent != Path(__file__).resolve().parent:
+        return ""
+    return shlex.join(["python", "-m", f"benchmarks.{program.stem}", *(_PART or sys.argv[1:])])
 
 
 def data(name: str) -> Path | None:
@@ -58,6 +89,8 @@ def amount(whole: Amount, few: Amount) -> Amount:
     return few if quick() else whole
 
 
+OPTIONS = "--quick", "--no-peers", "--no-log"
+
 FAILED: list[str] = []
 """Processes of kinefit's own that a part started and that broke off: their figures are not measured, and `run_parts`
 ends with an error."""
@@ -74,15 +107,19 @@ def run_parts(parts: Mapping[str, str]) -> None:
     """
     options = {word for word in sys.argv[1:] if word.startswith("--")}
     chosen = [word for word in sys.argv[1:] if word not in options]
-    unknown = [name for name in chosen if name not in parts] + sorted(options - {"--quick", "--no-peers"})
+    unknown = [name for name in chosen if name not in parts] + sorted(options - {*OPTIONS})
     if unknown:
-        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}, and --quick, --no-peers")
+        sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}, and {', '.join(OPTIONS)}")
     if "--quick" in options:
         os.environ[QUICK] = "1"
+    if _command():
+        from benchmarks.ledger import commit
+
+        commit()  # that of the code which is imported now, whatever is edited while the parts run
     broken = []
     for name in chosen or parts:
         print(f"\n# {name}: {parts[name]}", flush=True)
-        began = time.monotonic()
+        began, _PART[:] = time.monotonic(), [name]
         try:
             import_module(f"benchmarks.{name}").run()
         except Exception:

@@ -19,14 +19,16 @@ from benchmarks.fuzz_readers import READERS
 
 SLOW, MEMORY = 5.0, 500
 """[s] of the processor and [MB] that a file may take."""
+WHOLE = 10_000
+"""Damaged files of every reader in a whole run, whose figures are logged."""
 _PATIENCE = 60.0  # [s] after which a process is stopped: of the clock, other programs may run
-_START = 120.0  # [s] for imports and the seed
+_START = 600.0  # [s] for imports, kernels and the seed, which are no damaged file
 _TOLD = 8  # faults of a reader that are printed
 
 
 def run() -> None:
     """Print the counts over all readers."""
-    count = int(os.environ.get("KINEFIT_FUZZ") or amount(10_000, 40))
+    count = int(os.environ.get("KINEFIT_FUZZ") or amount(WHOLE, 40))
     chosen = os.environ.get("KINEFIT_FUZZ_READERS")
     totals: Counter[str] = Counter()
     names = [name.strip() for name in chosen.split(",")] if chosen else list(READERS)
@@ -37,9 +39,10 @@ def run() -> None:
         totals += found
         told = ", ".join(f"{kind} {found[kind]}" for kind in ("read", "typed", *FAULTS) if found[kind])
         print(f"# {name}: {told}", flush=True)
-    figure("damaged files", totals.total(), "files", ">= 1")
+    whole = not chosen and count >= WHOLE
+    figure("damaged files", totals.total(), "files", ">= 1", whole=whole)
     for kind, text in FAULTS.items():
-        figure(text, totals[kind], "files", "== 0")
+        figure(text, totals[kind], "files", "== 0", whole=whole)
 
 
 FAULTS = {
@@ -82,8 +85,10 @@ def _some(name: str, first: int, count: int, found: Counter[str]) -> int:
             try:
                 line = lines.get(timeout=patience)
             except queue.Empty:
+                if at < 0:
+                    raise RuntimeError(f"{name}: no file was begun within {patience:.0f} s") from None
                 _count(found, "slow", name, at, f"stopped after {patience:.0f} s")
-                return max(at, first) + 1
+                return at + 1
             if line is None:
                 break
             words = line.rstrip("\n").split(" ", 4)

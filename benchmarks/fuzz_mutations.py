@@ -46,6 +46,11 @@ def _inside(data: bytes, rng: np.random.Generator) -> bytes:
             return _once(data, rng)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return _chunk(data, rng)
+    if data[:4] == b"glTF" and rng.random() < 0.6:
+        try:
+            return _glb(data, rng)
+        except Exception:
+            return _once(data, rng)
     if data[:1] in (b"{", b"[") and rng.random() < 0.6:
         try:
             return _leaf(data, rng)
@@ -114,6 +119,15 @@ def _leaf(data: bytes, rng: np.random.Generator) -> bytes:
     return json.dumps(tree).encode()
 
 
+def _glb(data: bytes, rng: np.random.Generator) -> bytes:
+    """A GLB file with something in its JSON replaced, and its lengths made right again."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    text = _leaf(data[20 : 20 + length], rng)
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I", len(text)) + b"JSON" + text + data[20 + length :]
+    return data[:8] + struct.pack("<I", 12 + len(body)) + body
+
+
 def _member(data: bytes, rng: np.random.Generator) -> bytes:
     """An archive with one member damaged, left out, of another name, or much larger than its packed bytes."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -157,12 +171,15 @@ def _chunk(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:8] + b"".join(chunks)
 
 
+_WAYS = "cut", "flip", "copy", "leave", "bytes", "number", "word", "lines", "deep", "many"
+
+
 def _once(data: bytes, rng: np.random.Generator) -> bytes:
     """One kind of damage."""
     if not data:
         return bytes(rng.integers(0, 256, 8, dtype=np.uint8))
     a, b, c = sorted(int(v) for v in rng.integers(0, len(data) + 1, 3))
-    way = rng.choice(["cut", "flip", "copy", "leave", "bytes", "number", "number", "number", "word", "lines", "deep"])
+    way = rng.choice([*_WAYS, "number", "number"])
     if way == "cut":
         return data[:a]
     if way == "flip":
@@ -181,6 +198,10 @@ def _once(data: bytes, rng: np.random.Generator) -> bytes:
     if way == "deep":
         sign = rng.choice([b"[", b"{", b"(", b"<a>", b'{"a":', b"a.", b"- "])
         return data[:a] + bytes(sign) * int(rng.choice([3, 5000, 50_000])) + data[a:]
+    if way == "many":  # for which a reader whose time grows by the square of the length takes long
+        line = data[data.rfind(b"\n", 0, a) + 1 : a + 2000].split(b"\n")[0]
+        unit = (b"\n", b" ", line + b"\n", line[-12:] + b" ")[int(rng.integers(4))]
+        return data[:a] + unit * min(50_000, 400_000 // len(unit)) + data[a:]
     if way == "lines":
         lines = data.split(b"\n")
         i, j = (int(v) for v in rng.integers(0, len(lines), 2))

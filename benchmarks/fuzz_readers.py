@@ -6,9 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.fuzz_seeds import FIRST, Seed
+from benchmarks.fuzz_seeds_folders import FOLDERS
 from benchmarks.fuzz_seeds_takes import LATER
 
-READERS: dict[str, Callable[[Path], Seed]] = FIRST | LATER
+READERS: dict[str, Callable[[Path], Seed]] = FIRST | LATER | FOLDERS
 """{reader: maker of its seed}."""
 
 

@@ -54,17 +54,20 @@ def main(name: str, first: int, count: int, memory: int) -> None:
 
 def _read(seed: Seed, place: Path) -> tuple[str, str, str, str]:
     """Kind, time of the processor [s], memory [MB] and what was said."""
-    kind, *told = _once(seed, place)
+    kind, *told = answer(seed, place)
     if kind == "claim":
         limits = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (limits[1], limits[1]))
-        kind, *told = _once(seed, place)
+        kind, *told = answer(seed, place)
         resource.setrlimit(resource.RLIMIT_AS, limits)
     return ("typed" if kind == "claim" else kind), *told  # type: ignore[return-value]
 
 
-def _once(seed: Seed, place: Path) -> tuple[str, str, str, str]:
-    """As `_read`; kind "claim" where FFmpeg says that memory is lacking, as it does of counts that cannot be."""
+def answer(seed: Seed, place: Path) -> tuple[str, str, str, str]:
+    """Kind, time of the processor [s], memory [MB] beyond what the process has, and what was said.
+
+    The kind is "claim" where FFmpeg says that memory is lacking, as it does of counts that cannot be.
+    """
     from kinefit.errors import KinefitError
 
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew

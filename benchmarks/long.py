@@ -75,7 +75,7 @@ def run() -> None:
                 continue
             take = write_long_take(folder / str(frames), frames)
             out = folder / f"{frames}-out"
-            seconds, memory = _tracked(take, out)
+            seconds, memory = tracked(take, out)
             figure(f"long_memory_{frames}", memory, "MB", "<= 700")
             print(f"  {seconds:.0f} s, {sum(p.stat().st_size for p in out.rglob('*')) / 1e6:.0f} MB of results")
         figure("long_resume_equal", _resumed(folder, amount(3_000, 450)), "of 1", "== 1")
@@ -87,13 +87,14 @@ def run() -> None:
         print(f"  of {len(hour)} frames, in {time.process_time() - began:.1f} s")
 
 
-def _command(take: Path, out: Path) -> list[str]:
-    return [sys.executable, "-m", "kinefit", "track", str(take), "--out", str(out)]
+def command(take: Path, out: Path, *options: str) -> list[str]:
+    """The words of `kinefit track`, for a process of its own."""
+    return [sys.executable, "-m", "kinefit", "track", str(take), "--out", str(out), *options]
 
 
-def _tracked(take: Path, out: Path) -> tuple[float, float]:
-    """[s] of the processor and [MB] at most."""
-    process = subprocess.Popen(_command(take, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def tracked(take: Path, out: Path, *options: str) -> tuple[float, float]:
+    """Track a take in a process of its own: [s] of the processor and [MB] at most."""
+    process = subprocess.Popen(command(take, out, *options), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
@@ -104,8 +105,8 @@ def _tracked(take: Path, out: Path) -> tuple[float, float]:
 def _resumed(folder: Path, frames: int) -> float:
     """1 where a run that was killed halfway, and went on, gives the files of one that was not, all bits alike."""
     take, whole, killed = write_long_take(folder / "resume", frames), folder / "whole", folder / "killed"
-    _tracked(take, whole)
-    process = subprocess.Popen(_command(take, killed), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    tracked(take, whole)
+    process = subprocess.Popen(command(take, killed), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     rows = killed / "unfinished" / "so-far.csv"
     while process.poll() is None and not (rows.exists() and rows.read_bytes().count(b"\n") > frames / 2):
         time.sleep(0.02)
@@ -113,13 +114,17 @@ def _resumed(folder: Path, frames: int) -> float:
     process.wait()
     left = rows.read_bytes().count(b"\n") - 1 if rows.exists() else 0
     print(f"  killed after {left} of {frames} frames; left: {sorted(p.name for p in rows.parent.iterdir())}")
-    _tracked(take, killed)
-    one, other = (read_motion(out / "motion.npz") for out in (whole, killed))
+    tracked(take, killed)
+    return float(same_results(whole, killed) and 0 < left < frames and not rows.parent.exists())
+
+
+def same_results(one: Path, other: Path) -> bool:
+    """Whether two folders of results hold the same motion and the same tables, bit for bit."""
+    motions = [read_motion(out / "motion.npz") for out in (one, other)]
     names = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
-    same = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
-    tables = [sorted((out / "tables").iterdir()) for out in (whole, killed)]
-    same &= all(a.read_bytes() == b.read_bytes() for a, b in zip(*tables, strict=True))
-    return float(same and 0 < left < frames and not rows.parent.exists())
+    same = all(np.array_equal(*(getattr(motion, name) for motion in motions)) for name in names)
+    tables = [sorted((out / "tables").iterdir()) for out in (one, other)]
+    return same and all(a.read_bytes() == b.read_bytes() for a, b in zip(*tables, strict=True))
 
 
 def _repeated(motion: Motion, frames: int) -> Motion:

@@ -127,7 +127,7 @@ def load(part: tuple[str, float, float]) -> Markers | None:
     if path is None or not path.exists():
         return None
     markers = read_markers(path)
-    markers = replace(markers, positions=_put_right(markers, part[0]))
+    markers = replace(markers, positions=put_right(markers, part[0]))
     known = find_marker_set(markers.names)
     keep: list[int] = []
     for i, n in enumerate(markers.names):
@@ -142,7 +142,8 @@ def load(part: tuple[str, float, float]) -> Markers | None:
     )
 
 
-def _put_right(markers: Markers, file: str) -> NDArray:
+def put_right(markers: Markers, file: str) -> NDArray:
+    """(F, K, 3) [m] positions of a file below `markers`, with the labels of `MISNAMED` put right."""
     positions = np.array(markers.positions)
     for called, label, first, last, _ in MISNAMED.get(file, ()):
         a, b, rows = markers.names.index(called), markers.names.index(label), slice(first, last + 1)

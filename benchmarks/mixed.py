@@ -1,6 +1,6 @@
 """Sensors together, through take files.
 
-`python -m benchmarks.mixed [--quick] [--draws N] [--each K] [--mixes A,B] [--only GROUP]`.
+`python -m benchmarks.mixed [--quick] [--draws N] [--each K] [--mixes A,B] [--only GROUP] [--no-log]`.
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
 interval), "smoothing" (it helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
@@ -38,6 +38,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, help="so many takes of each draw, in turn, in place of all: of intervals")
     parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")
     parser.add_argument("--only", choices=GROUPS, help="one group of figures")
+    parser.add_argument("--no-log", action="store_true", help="do not write the figures to the log")
     told = parser.parse_args()
     groups = (told.only,) if told.only else GROUPS
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)

@@ -197,7 +197,7 @@ def _tile(name: str, make: Callable[[], Case]) -> NDArray:
     said = f"{len(people)} in view"
     for k in range(count) if wanted is None else [int(wanted) - 1]:
         try:
-            recording = Recording.of_keypoints(rig, records, accuracy=4.0, person=k + 1, people=people, up="y")
+            recording = Recording.of_keypoints(rig, records, sigma=4.0, person=k + 1, people=people, up="y")
             motion = track(recording, load_body("humanoid"))
         except KinefitError as error:
             said = str(error.problem)

@@ -85,8 +85,8 @@ def _both(two: Path, one: Path, folder: Path) -> None:
     for k in seen.keypoints:  # as if her pictures were his, but for a constant shift
         pixels = seen.images[k.camera].from_calibration(k.points) - shift[k.camera]
         moved.append(replace(k, points=alone.images[k.camera].to_calibration(pixels)))
-    with_her = track(Recording.of_keypoints(seen.rig, moved, accuracy=ACCURACY, person=man + 1), load_body("humanoid"))
-    without = track(Recording.of_keypoints(alone.rig, alone.keypoints, accuracy=ACCURACY), load_body("humanoid"))
+    with_her = track(Recording.of_keypoints(seen.rig, moved, sigma=ACCURACY, person=man + 1), load_body("humanoid"))
+    without = track(Recording.of_keypoints(alone.rig, alone.keypoints, sigma=ACCURACY), load_body("humanoid"))
     for name, motion in (("as they are", motions[man]), ("moved back", with_her)):
         a, b = motion.segment_poses()[max(lag, 0) :, :, :3, 3], without.segment_poses()[max(-lag, 0) :, :, :3, 3]
         count = min(len(a), len(b))

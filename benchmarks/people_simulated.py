@@ -64,7 +64,7 @@ def owners_of(seen: Crowd, chosen: tuple) -> np.ndarray:
 
 def errors_of(seen: Crowd, k: int, owner: int) -> tuple[float, float]:
     """[mm] mean distance of joints and share of limbs found while the person is there; smoothed, as by the command."""
-    recording = Recording.of_keypoints(seen.rig, seen.keypoints, accuracy=4.0, person=k + 1, up="y")
+    recording = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=4.0, person=k + 1, up="y")
     motion = track(recording, load_body("humanoid"))
     truth, there = seen.motions[owner], seen.there[:, owner]
     a, b = (m.segment_poses()[there][..., :3, 3] for m in (motion, truth))
@@ -101,4 +101,4 @@ def _speed() -> None:
 def _alone(seen: Crowd, one: Followed, k: int) -> Recording:
     """One person's recording, with nobody sought anew."""
     records = [r.of_one(chosen) for r, chosen in zip(seen.keypoints, one.people[k].chosen)]
-    return Recording.of_keypoints(seen.rig, records, accuracy=4.0, up="y")
+    return Recording.of_keypoints(seen.rig, records, sigma=4.0, up="y")

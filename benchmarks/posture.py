@@ -61,7 +61,7 @@ def told(truth: Motion, number: int, body: Body) -> Told:
     seen = simulate_keypoints(
         truth, rig, SET, noise_px=3.0, drift_px=2.0, drift_time=0.5, outliers=0.1, missing=0.1, seed=number
     )
-    motion = track(Recording.of_keypoints(rig, seen, accuracy=ACCURACY, up=truth.up), body)
+    motion = track(Recording.of_keypoints(rig, seen, sigma=ACCURACY, up=truth.up), body)
     errors, std = angle_errors(truth, motion), np.degrees(motion.dof_std[:, 6:])
     at = {what: [body.tree.coordinate(c) for c in names] for what, names in ANGLES.items()}
     R = truth.Ts_world_root[:, :3, :3]

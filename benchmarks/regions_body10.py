@@ -45,7 +45,7 @@ _GOALS = (
 
 def tracker(body: Any, rig: Any, rate: float) -> Any:
     """What is measured."""
-    return Tracker(body, rig, rate=rate, settings=SETTINGS, accuracy=SIGMA)
+    return Tracker(body, rig, rate=rate, settings=SETTINGS, sigma=SIGMA, up="y")
 
 
 def run() -> None:

@@ -21,7 +21,7 @@ def follow(
     seq: Sequence, every: int, *, resets: bool = True
 ) -> tuple[list[bool], list[tuple[float, float]], list[bool]]:
     """Of every so many images: whether it is right, how far it is off [mm], [deg], whether it is said to be lost."""
-    tracker = Tracker(seq.body, seq.rig, rate=RATE / every)
+    tracker = Tracker(seq.body, seq.rig, rate=RATE / every, up="y")
     tracker.start_at(state_of(seq.truth[0]))
     right, off, lost = [], [], []
     for k in range(0, len(seq.images), every):

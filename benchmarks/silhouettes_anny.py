@@ -87,7 +87,7 @@ def follow(
     body: Body, rig: Rig, masks: tuple[SilhouetteVideo, ...], first: BodyState, count: int
 ) -> list[BodyState]:
     """The movement of a body, from silhouettes alone."""
-    tracker, out = Tracker(body, rig, rate=masks[0].rate), []
+    tracker, out = Tracker(body, rig, rate=masks[0].rate, up="y"), []
     tracker.start_at(first)
     for i in range(count):
         frames = [replace(video.frame(i), time=i / masks[0].rate) for video in masks]

@@ -127,7 +127,7 @@ def first_pose(body: Body, rig: Rig, seen: list[SilhouetteFrame]) -> tuple[BodyS
         T[:3, 3] = wrist
         accuracy = {f"silhouette {c.name}": SIGMA for c in rig}
         start = body.usual_state(T)
-        found.append(coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=levels, settings=SETTINGS))
+        found.append(coarse_to_fine(body, rig, seen, start, sigma=accuracy, levels=levels, settings=SETTINGS))
     best = max(found, key=lambda f: f.overlap)
     return best.result.state, best.overlap
 
@@ -137,7 +137,7 @@ def tracked(body: Body, rig: Rig, pictures: Pictures, start: BodyState) -> dict[
     out = {}
     for steps in (range(START, LAST), range(START - 1, FIRST - 1, -1)):
         accuracy = {f"silhouette {c.name}": SIGMA for c in rig}
-        follow = Tracker(body, rig, rate=RATE, accuracy=accuracy, settings=SETTINGS)
+        follow = Tracker(body, rig, rate=RATE, sigma=accuracy, settings=SETTINGS, up="y")
         follow.start_at(start)
         for k, i in enumerate(steps):
             result = follow.update([replace(frame, time=k / RATE) for frame in pictures(i)])  # also backwards

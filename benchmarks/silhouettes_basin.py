@@ -40,7 +40,7 @@ def run() -> None:
             seen = [SilhouetteFrame(c.name, 0.0, render_body(body, truth, c).seen) for c in rig]
             start = standing(body, truth.angles + np.radians(off) * rng.choice([-1, 1], len(usual)))
             for kind, levels in kinds.items():
-                found = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=levels).result.state
+                found = coarse_to_fine(body, rig, seen, start, sigma=accuracy, levels=levels).result.state
                 away = body.positions(found, body.landmarks) - body.positions(truth, body.landmarks)
                 share[kind][k] += (np.linalg.norm(away, axis=1).mean() < WITHIN) / TRIALS
         print(f"# {off:2d} degrees off: " + ", ".join(f"{kind} {100 * s[k]:.0f} %" for kind, s in share.items()))

@@ -154,7 +154,7 @@ def _basin(whole: FourierSurface, rig: Rig, accuracy: dict[str, float]) -> None:
             start = placed(turn + np.radians(off) * rng.choice([-1, 1]))
             for kind, (steps, shapes) in kinds.items():
                 found = coarse_to_fine(
-                    shapes[-1], rig, seen, start, accuracy=accuracy, levels=steps, smooth=shapes, settings=SETTINGS
+                    shapes[-1], rig, seen, start, sigma=accuracy, levels=steps, smooth=shapes, settings=SETTINGS
                 ).result.state
                 R = found.T_world_root[:3, :3].T @ placed(turn).T_world_root[:3, :3]
                 share[kind][k] += (np.trace(R) > 1 + 2 * np.cos(np.radians(2.0))) / TRIALS

@@ -66,7 +66,7 @@ def spent(
     """[ms] of a frame; degrees off a joint, on average."""
     rounds, off = [], []
     for _ in range(ROUNDS):
-        tracker, times = Tracker(body, rig, rate=RATE), []
+        tracker, times = Tracker(body, rig, rate=RATE, up="y"), []
         for camera, image in zip(rig, empty):
             tracker.know_background(camera.name, image)
         tracker.start_at(truth[0])

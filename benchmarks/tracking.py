@@ -186,7 +186,7 @@ def synthetic(keypoint_set: str) -> None:
     for name, truth in library().items():
         rig = studio_rig(truth)
         keypoints = simulate_keypoints(truth, rig, keypoint_set, seed=len(joints), **NOISE)
-        recording = Recording.of_keypoints(rig, keypoints, accuracy=NOISE["noise_px"], up="y")
+        recording = Recording.of_keypoints(rig, keypoints, sigma=NOISE["noise_px"], up="y")
         motion = track(recording, load_body("humanoid"), smooth=False)
         observed = np.isfinite(motion.dof_std[:, 6:])
         turns = np.where(observed, np.abs(angle_errors(truth, motion)), np.nan)

@@ -21,7 +21,7 @@ def main(bvh=None, frames=60, noise_px=3.0):
     print(f"{truth.name}: {len(truth)} frames, {len(rig)} cameras, {noise_px:g} px noise, 10 % outliers, 10 % missing")
 
     # The generic body goes in: the person's lengths are found from the keypoints alone.
-    recording = kinefit.Recording.of_keypoints(rig, seen, accuracy=noise_px, up=truth.up)
+    recording = kinefit.Recording.of_keypoints(rig, seen, sigma=noise_px, up=truth.up)
     result = kinefit.track(recording, kinefit.load_body("humanoid"))
 
     joints, angles = 1000 * joint_errors(truth, result), np.abs(angle_errors(truth, result))  # [mm], [deg]

@@ -24,7 +24,7 @@ def main(frames=30, seed=0):
     points = person.body.landmarks.select(JOINTS)
     rng = np.random.default_rng(seed)
 
-    tracker = Tracker(person.body, Rig((camera,)), rate=15.0, accuracy={"kinect": 0.008})
+    tracker = Tracker(person.body, Rig((camera,)), rate=15.0, sigma={"kinect": 0.008}, up="y")
     tracker.start_at(truth.state(0))  # left out, the tracker finds its start in the first image
     errors = []
     for i in range(min(frames, len(truth))):

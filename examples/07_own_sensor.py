@@ -68,7 +68,7 @@ def main(frames=60, noise_px=1.0, seed=0):
     print("the rope is {:.4f} ± {:.4f} m long;".format(*subject.value("rope length")), LENGTH, "m is the truth")
     errors, hand = {}, lambda s: Scene(arm, s, rig).position("r_dactylion")
     for name, used in (("one camera", slice(0, 1)), ("one camera and the rope", slice(0, 3, 2))):
-        tracker = Tracker(arm, rig, settings=SLOW, accuracy=sensors.sigma, sensors=[Rope()], values=subject.values)
+        tracker = Tracker(arm, rig, settings=SLOW, sigma=sensors.sigma, sensors=[Rope()], values=subject.values, up="y")
         tracker.start_at(states[0])
         gaps = [hand(tracker.update(f[used]).state) - hand(s) for f, s in zip(observed, states)]
         errors[name] = np.linalg.norm(gaps, axis=1)

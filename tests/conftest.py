@@ -1,17 +1,30 @@
 """What all tests share: real recordings, and settings of hypothesis."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from kinefit._jit import kernel_folder
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # The first example of a test may compile a kernel, so no deadline; a failure is repeated by anyone who runs the test.
 settings.register_profile("kinefit", deadline=None, max_examples=50, derandomize=True)
 settings.load_profile("kinefit")
+
+
+def pytest_configure(config):
+    """Compile the common kernels once where the cache is empty, before each worker compiles its own."""
+    starts_workers = getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput")
+    folder = kernel_folder() if starts_workers else None
+    if folder is not None and not any(folder.rglob("*.nbc")):
+        print("compiling the kernels, once for all workers ...", flush=True)
+        subprocess.run([sys.executable, "-m", "kinefit", "warmup"], check=True, capture_output=True)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike
 
 import kinefit
 from kinefit._arguments import checked
+from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.motion import UP_AXES
+from kinefit.observations import KEYPOINT_SIGMA
+from kinefit.readers.take.entries import KeypointsEntry
+from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.tracker import Tracker
 
 WRONG = {
     "None": None, "text": "text", "bytes": b"bytes", "whole": 3, "number": 2.5, "nan": float("nan"), "list": [],
@@ -81,3 +89,22 @@ def test_what_is_wrong_is_told(args, more, said):
 def test_what_is_missing_is_python_s_own_error():
     with pytest.raises(TypeError):
         some("a")
+
+
+def test_an_old_name_is_read_for_one_version_and_named():
+    body, rig = load_body("humanoid"), Rig(())
+    with pytest.warns(FutureWarning, match="accuracy is called sigma now"):
+        assert Tracker(body, rig, accuracy={"mocap": 0.002}).sigma == {"mocap": 0.002}
+    with pytest.raises(ObservationError, match="accuracy and sigma are the same"):
+        Tracker(body, rig, accuracy={}, sigma={})
+
+
+def test_one_vertical_axis_and_one_deviation_of_keypoints_is_meant_everywhere():
+    body, rig = load_body("humanoid"), Rig(())
+    assert np.array_equal(Tracker(body, rig).up, UP_AXES[inspect.signature(Recording).parameters["up"].default])
+    assert np.array_equal(Tracker(body, rig, up="-y").up, (0.0, -1.0, 0.0))
+    with pytest.raises(ObservationError, match="vertical axis"):
+        Tracker(body, rig, up="upwards")
+    default = lambda function: inspect.signature(function).parameters["sigma"].default
+    stated = [default(f) for f in (Recording.of_keypoints, kinefit.refine, kinefit.calibrate_people)]
+    assert {TrackSettings().pixel, KeypointsEntry(file="x", camera="cam01").sigma, *stated} == {KEYPOINT_SIGMA}

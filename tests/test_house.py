@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
 LEVELS = [
     {"errors", "_jit"},
-    {"_arguments", "_files", "_mapped", "_threads"},
+    {"_arguments", "_files", "_image_headers", "_mapped", "_records", "_threads", "findings", "serving"},
     {"geometry", "_pictures", "_kernels_rendering", "_kernels_losses"},
     {"bodies", "observations", "motion", "motion_columns"},
     {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},
@@ -25,7 +26,7 @@ LEVELS = [
     {"multiview", "frame"},
     {"initialization", "subject"},
     {"smoothing"},
-    {"markers", "preparing"},
+    {"diagnostics", "markers", "preparing"},
     {"tracking"},
     {"calibration"},
     {"simulation", "recipes"},
@@ -46,6 +47,12 @@ SEEN_ONLY_BY = {
     "assets": {"cli", "preparing"},
 }
 LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """The syntax tree of a file: every rule looks at the same one."""
+    return ast.parse(path.read_text("utf-8"))
 
 
 def part_of(path: Path) -> str:
@@ -123,7 +130,7 @@ def test_imports_run_downwards():
     wrong = [
         f"{path.relative_to(ROOT)}:{line} imports kinefit.{imported}"
         for path in SOURCES
-        for imported, line in sorted(imported_parts(ast.parse(path.read_text("utf-8")), path))
+        for imported, line in sorted(imported_parts(parsed(path), path))
         if not may_import(part_of(path), imported)
     ]
     assert not wrong, "\n".join(wrong)
@@ -157,7 +164,7 @@ def public_without_docstring(body: list[ast.stmt], prefix: str = "") -> list[str
 def test_everything_public_says_what_it_is():
     wrong = []
     for path in SOURCES:
-        tree = ast.parse(path.read_text("utf-8"))
+        tree = parsed(path)
         missing = public_without_docstring(tree.body)
         if tree.body and not ast.get_docstring(tree):
             missing.insert(0, "1 the module itself")
@@ -170,7 +177,7 @@ def test_only_kernels_know_the_compiler():
     for path in SOURCES:
         if path.name == "_jit.py" or path.name.startswith("_kernels"):
             continue
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(parsed(path)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if any(name.split(".")[0] == "numba" for name in names):
@@ -188,7 +195,7 @@ def test_no_file_names_a_folder_of_one_machine():
     wrong = []
     for path in files:
         skip = {"__pycache__", "_build", "generated"} & set(path.relative_to(ROOT).parts)
-        if skip or path.suffix not in kept or path.name.startswith(".coverage"):
+        if skip or path.suffix not in kept or path.name.startswith((".coverage", ".git")):
             continue
         for number, line in enumerate(path.read_text("utf-8").splitlines(), 1):
             if own.search(line):
@@ -219,7 +226,7 @@ def test_only_packages_that_are_declared_are_imported():
     declared, own = {re.match(r"[\w-]+", one)[0] for one in told}, {"kinefit", "", *sys.stdlib_module_names}
     wrong = []
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(parsed(path)):
             modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             modules += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             for top in {module.split(".")[0] for module in modules} - own:

@@ -6,6 +6,7 @@ import inspect
 import os
 import types
 import typing
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial, wraps
 from numbers import Integral, Real
@@ -45,6 +46,32 @@ def checked(function: F) -> F:
         return function(*args, **more)
 
     return typing.cast(F, call)
+
+
+def renamed(**new_names: str) -> Callable[[F], F]:
+    """Accept keyword arguments under their old names for one version, with a warning that names the new one.
+
+    Parameters
+    ----------
+    new_names : old="new"
+    """
+
+    def decorate(function: F) -> F:
+        @wraps(function)
+        def call(*args: Any, **more: Any) -> Any:
+            for old in new_names.keys() & more.keys():
+                new = new_names[old]
+                if new in more:
+                    problem = f"{function.__name__}: {old} and {new} are the same argument"
+                    raise ObservationError(problem, remedy=f"Give {new} alone.")
+                text = f"{function.__name__}: the argument {old} is called {new} now"
+                warnings.warn(text, FutureWarning, stacklevel=2)
+                more[new] = more.pop(old)
+            return function(*args, **more)
+
+        return typing.cast(F, call)
+
+    return decorate
 
 
 @cache

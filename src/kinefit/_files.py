@@ -6,6 +6,7 @@ import os
 import re
 import tomllib
 import zipfile
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
@@ -28,12 +29,20 @@ def no_column(missing: Iterable[str], names: Iterable[str] | None) -> str:
     return told if other is None else f"{told}: its columns are separated by {other!r}, not by commas"
 
 
+def repeated(names: Iterable[str]) -> list[str]:
+    """Names that occur more than once, in order of appearance."""
+    return [name for name, count in Counter(names).items() if count > 1]
+
+
 def read_bytes(path: Path) -> bytes:
-    """All of a file; FileError where it cannot be read."""
+    """All of a file; FileError where it cannot be read, or has no end (a device)."""
     try:
+        if path.exists() and not path.is_file():
+            raise FileError("is no file", file=path, remedy="Check the path.")
         return path.read_bytes()
-    except OSError as problem:
-        raise FileError(f"cannot be read ({problem.strerror})", file=path, remedy="Check the path.") from problem
+    except (OSError, ValueError) as problem:
+        told = getattr(problem, "strerror", None) or str(problem)
+        raise FileError(f"cannot be read ({told})", file=path, remedy="Check the path.") from problem
 
 
 def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:

@@ -2,11 +2,14 @@
 
 import csv
 
+import msgspec
 import pytest
+from msgspec.structs import replace
 
 from kinefit.batch.summary import write_summary
 from kinefit.batch.work import FAILED, Range, Row
 from kinefit.errors import ExportError
+from kinefit.findings import Finding
 
 
 def knee(left, right):
@@ -34,8 +37,8 @@ def test_the_tables_hold_a_row_for_each_take_and_person(tmp_path):
     assert table[2]["error"] == "it is, alas, broken" and table[2]["quality"] == table[2]["frames"] == ""
     assert table[1] == {
         "take": "b/take.toml", "person": "", "subject": "s<1>", "visit": "pre", "date": "", "movement": "",
-        "frames": "30", "seconds": "1", "quality": "0.5", "lost share": "0.2", "status": "done", "error": "",
-        "folder": "b/take-kinefit",
+        "frames": "30", "seconds": "1", "quality": "0.5", "lost share": "0.2", "faults": "", "status": "done",
+        "error": "", "folder": "b/take-kinefit",
     }  # fmt: skip
     ranges = list(csv.DictReader((tmp_path / "ranges.csv").read_text().splitlines()))
     assert len(ranges) == 7 and ranges[5]["range [deg]"] == "" and ranges[5]["person"] == "2"
@@ -53,6 +56,19 @@ def test_the_page_links_reports_and_tells_means_over_takes(tmp_path):
     assert "<td>2</td><td>62 ± 3</td><td>45 ± 7</td><td>17 ± 10</td>" in text  # of both takes of a session
     assert "not observed" in text and "camera 1 is off" in text and "3 of 4 takes are done; 2 subjects" in text
     assert "Knee flexion" in text and "Lumbar extension" in text
+
+
+def test_faults_of_the_inputs_are_the_first_thing_on_the_page(tmp_path):
+    fault = Finding("fault", "time", "cam02 runs 5 frames late.", ("cam02",), "Sure.", "Write time_offset = 0.1.")
+    write_summary([replace(ROWS[3], findings=(fault,)), ROWS[0]], tmp_path)
+    text = (tmp_path / "summary.html").read_text("utf-8")
+    place = [text.index(part) for part in ("d/take.toml, person 2: Fault. ", "cam02 runs 5 frames late.", "takes are")]
+    assert place == sorted(place)
+    assert "What to do: </strong>Write time_offset = 0.1." in text
+    table = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
+    assert [row["faults"] for row in table] == ["cam02 runs 5 frames late.", ""]
+    told = msgspec.json.decode(msgspec.json.encode(replace(ROWS[3], findings=(fault,))), type=Row)
+    assert told.findings == (fault,)  # as a worker sends it, and an unfinished study keeps it
 
 
 def test_a_study_of_failures_alone_has_a_page(tmp_path):

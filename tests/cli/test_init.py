@@ -1,6 +1,7 @@
 """`kinefit init`: from a folder to a take that tracks."""
 
 import json
+import re
 import shutil
 import threading
 import urllib.request
@@ -11,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from websockets.sync.client import connect
 
 import kinefit.cli
 from kinefit.bodies import load_body
@@ -198,21 +200,28 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
         place[1] += 80.0
 
     def browser(url):
-        def ask(path, told=None):
-            with urllib.request.urlopen(url + path, data=told and json.dumps(told).encode(), timeout=20) as answer:
-                return answer.read()
+        def ask(path):
+            with urllib.request.urlopen(url + path, timeout=20) as answer:
+                return answer.read(), answer.headers["Content-Security-Policy"]
 
-        seen["page"], seen["asked"] = ask("").decode(), json.loads(ask("asked.json"))
-        seen["picture"] = cv2.imdecode(np.frombuffer(ask("picture/cam02"), np.uint8), 1).shape
-        seen["answers"] = [json.loads(ask("clicks", told)) for told in (wrong, right)]
+        seen["page"], seen["policy"] = ask("")
+        seen["files"] = [ask(name)[0] for name in re.findall(r'(?:href|src)="([^"]*)"', seen["page"].decode())]
+        seen["picture"] = cv2.imdecode(np.frombuffer(ask("picture/cam02")[0], np.uint8), 1).shape
+        with connect(url.replace("http", "ws", 1)) as page:
+            seen["asked"], seen["answers"] = json.loads(page.recv(20.0)), []
+            for told in ("[" * 30_000, json.dumps(wrong), json.dumps(right)):
+                page.send(told)
+                seen["answers"].append(json.loads(page.recv(20.0)))
 
     monkeypatch.setattr("webbrowser.open", lambda url: threading.Thread(target=browser, args=(url,)).start())
     answer = run("init", folder, "--click", "--force")
     assert answer.exit_code == 0, answer.output
     assert seen["asked"]["cameras"] == ["cam01", "cam02", "cam03", "cam04"] and "r_knee" in seen["asked"]["joints"]
-    assert "asked.json" in seen["page"] and seen["picture"] == (960, 544, 3)
-    assert [a["taken"] for a in seen["answers"]] == [False, True]
-    assert "Camera cam03 is off in" in seen["answers"][0]["told"]
+    assert seen["picture"] == (960, 544, 3) and "unsafe" not in seen["policy"]
+    assert len(seen["files"]) == 2 and b"<style" not in seen["page"] and b"<script>" not in seen["page"]
+    assert [a["taken"] for a in seen["answers"]] == [False, False, True]
+    assert "These are no clicks" in seen["answers"][0]["told"]
+    assert "Camera cam03 is off in" in seen["answers"][1]["told"]
     assert read_take(folder / "take.toml").pose is not None
     assert json.loads((folder / "clicks.json").read_text())["points"]["cam01"]
 

@@ -31,6 +31,16 @@ def test_a_take_is_replayed_and_left_as_a_motion(run, take, tmp_path):
     assert "0 of" in result.output and "page and poses at http://localhost:" in result.output
 
 
+def test_the_address_has_the_token_and_a_server_for_all_networks_warns(run, take, tmp_path):
+    """The session is over after one frame: nobody is to connect."""
+    token = "a-token-of-24-characters"
+    words = (take, "--seconds", "0.01", "--port", "0", "--no-record", "--token", token)
+    local, wide = run(*words), run(*words, "--host", "0.0.0.0")
+    assert local.exit_code == wide.exit_code == 0, wide.output
+    assert all(f"/{token}/\n" in result.stdout for result in (local, wide))
+    assert "warning" not in local.output and "warning: The server at 0.0.0.0 is open to the network" in wide.stderr
+
+
 def test_lines_on_the_standard_output_stand_alone(run, take, tmp_path):
     result = run(take, "--speed", "0", "--no-page", "--no-record", "--json", "-")
     assert result.exit_code == 0
@@ -48,7 +58,7 @@ def test_seconds_end_a_session(run, take, tmp_path):
     [
         (("--vmc", "localhost"), "HOST:PORT"), (("--vmc", "localhost:99999"), "HOST:PORT"),
         (("--host", "256.0.0.1"), "nothing can be served"), (("--speed", "-1"), "speed"),
-        (("--json", "/"), "cannot be written"),
+        (("--json", "/"), "cannot be written"), (("--token", "short"), "16 to 128 letters"),
     ],
 )
 def test_what_cannot_be_is_refused(run, take, words, told):

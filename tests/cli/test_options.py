@@ -308,7 +308,7 @@ def test_an_argument_of_a_recording_is_refused_where_it_means_nothing(given):
 
 
 @pytest.mark.parametrize("given", [
-    {"rate": 0.0}, {"accuracy": {"mocap": 0.0}}, {"on_body": ("nobody",)}, {"values": {"rope": {"length": 1.0}}},
+    {"rate": 0.0}, {"sigma": {"mocap": 0.0}}, {"on_body": ("nobody",)}, {"values": {"rope": {"length": 1.0}}},
 ])  # fmt: skip
 def test_an_argument_of_a_tracker_is_refused_where_it_means_nothing(given):
     from tests.tracking.movements import BODY, a_rig

@@ -26,7 +26,11 @@ def test_its_key_tells_files_and_options(take):
 def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "_EVERY", 4)
     words = ["track", str(take), "--no-overlays", "--no-report", "--formats", "motion", "--out"]
-    assert CliRunner().invoke(main, [*words, str(tmp_path / "whole")]).exit_code == 0
+    left = tmp_path / "whole" / "unfinished"
+    left.mkdir(mode=0o700, parents=True)
+    (left / "frames.kinefit").write_bytes(b"damaged")
+    told = CliRunner().invoke(main, [*words, str(tmp_path / "whole")])
+    assert told.exit_code == 0 and "every frame is computed again" in " ".join(told.output.split()), told.output
     update, count = Tracker.update, []
 
     def until(self, frames, time=None, **more):

@@ -53,6 +53,28 @@ def test_a_take_becomes_a_folder_of_results(take):
     assert all(str(out / NAMES[name]) in told.stdout for name in USUAL)
 
 
+def test_faults_of_the_inputs_stand_on_top_of_summary_and_report(take, tmp_path, change):
+    change(take, "[take]\n", "[take]\nframes = [0, 12]\n")
+    calibration = take.parent / "calibration.toml"
+    text = re.sub(
+        r"translation = \[(.*?)\]",
+        lambda m: f"translation = [{', '.join(str(1.8 * float(v)) for v in m[1].split(','))}]", calibration.read_text(),
+    )  # fmt: skip
+    calibration.write_text(text)
+    out = tmp_path / "out"
+    told = run("track", take, "--no-overlays", "--pictures", "none", "--formats", "motion", "--realtime", "--out", out)
+    assert told.exit_code == 0, told.output
+    first, how, remedy = told.stdout.strip().splitlines()[:3]
+    assert re.match(r"fault: The person would be 3\.\d+ m tall: the calibration's unit or scale is wrong\.", first)
+    assert how.startswith("   how sure: ")
+    assert "size of the board's squares" in remedy
+    assert told.stdout.index("fault: ") < told.stdout.index("median residual")
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert page.index("Faults of the inputs") < page.index("the calibration&#x27;s unit or scale is wrong")
+    assert page.index("the calibration&#x27;s unit or scale is wrong") < page.index("How far every joint moved")
+    assert kinefit.read_motion(out / "motion.npz").provenance["findings"][0]["kind"] == "scale"
+
+
 def test_only_what_is_asked_for_is_written(take, tmp_path):
     told = run("track", take, "--no-overlays", "--no-report", "--formats", "bvh, trc", "--out", tmp_path / "there")
     assert told.exit_code == 0

@@ -106,10 +106,10 @@ def test_two_takes_are_too_many(folder):
 def test_it_serves_until_it_is_stopped(folder):
     command = STOPPABLE + "import sys; from kinefit.cli.view import view; view(sys.argv[1:])"
     args = [sys.executable, "-c", command, str(folder / "take-kinefit"), "--no-browser", "--port", "0"]
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1", "KINEFIT_TOKEN": "of-this-environment"}
     with subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
         try:
-            address = re.search(r"http://localhost:\d+", process.stdout.readline())[0]
+            address = re.search(r"http://localhost:\d+/of-this-environment/", process.stdout.readline())[0]
             with urllib.request.urlopen(address, timeout=20) as answer:
                 assert answer.status == 200
         finally:

@@ -192,6 +192,9 @@ def simulate(folder):
 
 
 def smoothing(folder):
+    drawn.write_take(folder)
+    yield {}
+    assert not (folder / "unfinished").exists()
     w = world()
     yield {"tracker": kinefit.Tracker(w.body, w.rig, rate=w.motion.rate, up=w.up), "stream": w.steps}
 

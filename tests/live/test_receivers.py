@@ -1,12 +1,15 @@
 """Poses as other programs read them: WebSocket clients, python-osc, pylsl, JSON lines, a motion file."""
 
 import json
+import queue
+import re
 import socket
 import time
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from kinefit.errors import ExportError
@@ -27,6 +30,11 @@ def played(scene, collected):
     return collected
 
 
+def at(server):
+    """Of poses and wishes, with the token."""
+    return server.url.replace("http", "ws", 1)
+
+
 @pytest.fixture
 def served(scene, played):
     server = WebSockets(0, title="trial <1>")
@@ -36,14 +44,14 @@ def served(scene, played):
 
 
 def test_a_client_gets_the_body_and_then_poses(served, played):
-    with connect(f"ws://127.0.0.1:{served.port}") as client:
+    with connect(at(served)) as client:
         assert client.recv(5.0) == played.hellos[0].decode()
         served.pose(played.poses[0], played.packets[0])
         assert client.recv(5.0) == played.packets[0].decode()
 
 
 def test_a_slow_client_misses_poses_and_the_others_miss_none(served, played):
-    url = f"ws://127.0.0.1:{served.port}"
+    url = at(served)
     with connect(url, max_queue=1) as slow, connect(url) as quick:
         quick.recv(5.0)
         many = b'{"type":"pose","fill":"' + b"x" * 200_000 + b'","number":%d}'
@@ -61,29 +69,96 @@ def test_a_slow_client_misses_poses_and_the_others_miss_none(served, played):
 
 
 def test_wishes_are_passed_on_and_answered(scene, played):
-    asked = []
-    server = WebSockets(0, ask=asked.append)
+    asked = queue.Queue()
+    server = WebSockets(0, ask=lambda *wish: asked.put(wish))
+    try:
+        server.hello(scene.motion.body, played.hellos[0])
+        with connect(at(server)) as client:
+            client.recv(5.0)
+            client.send('{"stop": true}')
+            wish, answer = asked.get(timeout=5.0)
+            assert wish == b'{"stop": true}'
+            answer({"type": "done"})
+            assert json.loads(client.recv(5.0)) == {"type": "done"}
+    finally:
+        server.close()
+    answer({"type": "done"})  # nobody is there any more
+
+
+def test_without_the_token_poses_are_read_and_no_wish_is_heard(scene, played):
+    server = WebSockets(0, ask=lambda *wish: pytest.fail(f"{wish} was heard"))
     try:
         server.hello(scene.motion.body, played.hellos[0])
         with connect(f"ws://127.0.0.1:{server.port}") as client:
-            client.recv(5.0)
+            assert client.recv(5.0) == played.hellos[0].decode()
             client.send('{"stop": true}')
-            while not asked:
-                time.sleep(0.01)
-            asked[0]["answer"]({"type": "done"})
-            assert json.loads(client.recv(5.0)) == {"type": "done"}
-            for nonsense in ("no json", "[1]", '{"answer": 1}'):
-                client.send(nonsense)
-                assert json.loads(client.recv(5.0))["type"] == "refused"
+            answer = json.loads(client.recv(5.0))
+            assert answer["type"] == "refused" and "needs the token" in answer["why"]
+        for address in (f"ws://127.0.0.1:{server.port}/{'x' * 24}", at(server)):
+            with pytest.raises(InvalidStatus, match="403"):
+                connect(address, origin="https://evil.example")
+    finally:
+        server.close()
+
+
+def test_who_floods_a_session_is_cut_off_and_others_get_every_pose(scene, collected):
+    """Each pose waits for the quiet client's last, so that it counts what it gets and no clock decides."""
+    session = LiveSession(scene.tracker(), [scene.replay()], [collected])
+    server = WebSockets(0, ask=session.ask)
+    got = []
+
+    class Quiet:
+        def hello(self, body, packet):
+            self.client = connect(at(server))
+            self.client.recv(10.0)
+
+        def pose(self, posed, packet):
+            got.append(self.client.recv(10.0) == packet.decode())
+
+        def close(self):
+            self.client.close()
+
+    class Flood(Quiet):
+        def hello(self, body, packet):
+            super().hello(body, packet)
+            with pytest.raises(ConnectionClosed):
+                for _ in range(5000):
+                    self.client.send('{"sensor": "cam01", "sigma": 1e-300}')
+                while True:
+                    self.client.recv(10.0)
+
+        def pose(self, posed, packet):
+            pass
+
+    session.receivers = (server, collected, Quiet(), Flood())
+    session.run()
+    server.close()
+    assert session.found == len(scene.recording) and got == [True] * len(scene.recording)
+
+
+def test_answers_that_nobody_reads_end_the_connection(scene, played):
+    """A client that takes nothing in: what waits for it does not grow for ever."""
+    server = WebSockets(0, ask=lambda wish, answer: [answer({"fill": "x" * 100_000}) for _ in range(300)])
+    try:
+        server.hello(scene.motion.body, played.hellos[0])
+        with connect(at(server), max_queue=1) as client:
+            client.recv(5.0)
+            assert server.receivers == 1
+            client.send('{"stop": true}')
+            for _ in range(1000):
+                if server.receivers:
+                    time.sleep(0.01)
+            assert not server.receivers
     finally:
         server.close()
 
 
 def test_the_page_has_the_body_and_escapes_the_name(served):
-    html = urlopen(f"http://127.0.0.1:{served.port}/").read().decode()
+    html = urlopen(served.url).read().decode()
     assert "<h1>trial &lt;1&gt;</h1>" in html and 'id="capsules"' in html and "WebSocket" in html
+    assert " style=" not in html and not re.search(r"<[^>]* on\w+=", html)
     with pytest.raises(OSError, match="404"):
-        urlopen(f"http://127.0.0.1:{served.port}/etc/passwd")
+        urlopen(f"{served.url}etc/passwd")
 
 
 def test_a_port_in_use_is_told(served):

@@ -1,14 +1,23 @@
 """A session gives what the tracker gives, tells receivers, and does what clients ask for."""
 
 import json
+import threading
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.live.refused import REFUSED
 
-from kinefit.errors import ObservationError
+from kinefit.errors import BodyError, ObservationError
+from kinefit.frame.routing import MAX_SIGMA, MIN_SIGMA
 from kinefit.live.cameras import CameraSource, Clock
+from kinefit.live.inbox import Arrived
 from kinefit.live.people import LivePerson
 from kinefit.live.session import LiveSession
+from kinefit.motion import UP_AXES
+from kinefit.observations import MarkerFrame
+from kinefit.tracking.tracker import Tracker
 
 
 def test_a_replay_is_followed_as_the_tracker_follows_it(scene, collected):
@@ -50,31 +59,26 @@ def test_packets_say_what_the_protocol_says(scene, collected):
     assert None in pose["angle_std"]  # fingers that no keypoint shows
 
 
-@pytest.mark.parametrize(
-    ("wish", "told"),
-    [
-        ({"sensor": "cam1"}, "nothing to change"), ({"sensor": "nowhere", "use": False}, "no sensor 'nowhere'"),
-        ({"sensor": "cam1", "sigma": -1}, "positive"), ({"sensor": "cam1", "sigma": "wide"}, "positive"),
-        ({"body": "/etc/passwd"}, "no body of the catalogue"), ({"fly": True}, "nothing that can be asked"),
-    ],
-)
-def test_what_cannot_be_done_is_refused_and_the_session_goes_on(scene, collected, wish, told):
-    session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
-    wish = {k: (scene.rig.names[0] if v == "cam1" else v) for k, v in wish.items()}
-    session.ask({**wish, "answer": answers.append})
+def test_what_cannot_be_done_is_refused_and_the_session_goes_on(scene, collected):
+    session = LiveSession(scene.tracker(), [scene.replay()], [collected])
+    wishes = [*REFUSED, ({"sensor": "cam01", "sigma": float("nan")}, "a standard deviation of nan")]
+    answers = [[] for _ in wishes]
+    for (wish, _), told in zip(wishes, answers):
+        session.ask(wish, told.append)
     session.run()
-    assert answers[0]["type"] == "refused" and told in answers[0]["why"]
-    assert session.processed == len(scene.recording)
+    for (wish, why), told in zip(wishes, answers):
+        assert [a["type"] for a in told] == ["refused"] and why in told[0]["why"], wish
+    assert session.found == session.processed == len(scene.recording)
 
 
 def test_sensors_and_weights_change_while_it_runs(scene, collected):
     session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
     name = scene.rig.names[0]
-    session.ask({"sensor": name, "use": False, "answer": answers.append})
-    session.ask({"sensor": scene.rig.names[1], "sigma": 30.0, "answer": answers.append})
+    session.ask({"sensor": name, "use": False}, answers.append)
+    session.ask({"sensor": scene.rig.names[1], "sigma": 30.0}, answers.append)
     session.run()
-    assert [a["type"] for a in answers] == ["done", "done"]
-    assert session.tracker.accuracy[scene.rig.names[1]] == 30.0
+    assert [a["type"] for a in answers] == ["done", "done"] and answers[0]["asked"] == {"sensor": name, "use": False}
+    assert session.tracker.sigma[scene.rig.names[1]] == 30.0
     used = {m.sensor for m in collected.poses[-1].result.measurements}
     assert used and all(len(m.layout.channels.sources) == 3 for m in collected.poses[-1].result.measurements)
     wide = collected.poses[-1].result.joint_std[0].max()
@@ -88,6 +92,66 @@ def test_a_client_can_end_the_session(scene, collected):
     session.ask({"stop": True})
     session.run()
     assert session.processed < len(scene.recording) and collected.closed
+
+
+@pytest.mark.parametrize("sigma", [MIN_SIGMA, MAX_SIGMA])
+def test_no_standard_deviation_that_is_taken_ends_the_session(scene, collected, sigma):
+    session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
+    session.ask({"sensor": scene.rig.names[0], "sigma": sigma}, answers.append)
+    session.run()
+    assert answers[0]["type"] == "done" and session.found == session.processed == len(scene.recording)
+
+
+def test_one_wish_is_done_a_step_and_those_too_many_are_refused(scene, collected):
+    session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
+    for _ in range(100):
+        session.ask({"sensor": scene.rig.names[0], "use": True}, answers.append)
+    assert len(answers) == 36 and all("64 wishes wait already" in a["why"] for a in answers)
+    session.run()
+    assert [a["type"] for a in answers[36:]] == ["done"] * len(scene.recording)
+
+
+def test_a_body_that_a_receiver_cannot_show_is_refused(scene, collected):
+    class People(type(collected)):
+        def hello(self, body, packet):
+            super().hello(body, packet)
+            if "pelvis" not in body.tree.segments:
+                raise BodyError("no pelvis")
+
+    session, answers = LiveSession(scene.tracker(), [scene.replay()], [people := People()]), []
+    session.ask({"body": "arm"}, answers.append)
+    session.run()
+    assert answers[0]["type"] == "refused" and session.tracker.body.name == scene.motion.body.name
+    assert session.found == len(scene.recording)
+    assert [json.loads(packet)["body"] for packet in people.hellos] == ["humanoid", "arm", "humanoid"]
+
+
+def test_a_body_that_what_is_seen_does_not_suit_is_taken_back(scene, collected):
+    """Markers of segments that the new body lacks: the session goes on with the body before."""
+    body = replace(scene.motion.body, marker_sets={"suit": scene.motion.body.landmarks})
+    x = scene.motion.body.trajectories(scene.motion.Ts_world_root, scene.motion.angles, body.landmarks)
+
+    class Suit:
+        sensors, patient = ("suit",), True
+
+        def start(self, inbox):
+            threading.Thread(target=self.run, args=(inbox,), daemon=True).start()
+
+        def run(self, inbox):
+            for t, positions in zip(scene.motion.times, x):
+                frame = MarkerFrame("suit", float(t), body.landmarks.names, positions, "suit")
+                inbox.put(Arrived("suit", float(t), time.monotonic(), [frame]), wait=True)
+            inbox.end("suit")
+
+        def stop(self):
+            pass
+
+    tracker = Tracker(body, scene.rig, rate=scene.motion.rate, up=UP_AXES[scene.motion.up])
+    session, answers = LiveSession(tracker, [Suit()], [collected]), []
+    session.ask({"body": "arm"}, answers.append)
+    session.run()
+    assert [a["type"] for a in answers] == ["done", "refused"] and "suit" in answers[1]["why"]
+    assert session.tracker.body is body and session.found == session.processed == len(x)
 
 
 def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):

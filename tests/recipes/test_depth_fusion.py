@@ -19,7 +19,7 @@ def wave():
 
 def test_from_a_known_start(wave):
     motion = depth_fusion(
-        wave.seen("fusion"), wave.truth.body, wave.rig, rate=10.0, accuracy=wave.accuracy, up=wave.truth.up,
+        wave.seen("fusion"), wave.truth.body, wave.rig, rate=10.0, sigma=wave.sigma, up=wave.truth.up,
         start=wave.truth.state(0),
     )  # fmt: skip
     assert len(motion) == len(wave.truth)
@@ -33,7 +33,7 @@ def test_a_step_without_frames_is_bridged(wave):
     steps = [list(seen) for seen in wave.seen("3d")[:6]]
     steps[3] = []
     motion = depth_fusion(
-        steps, wave.truth.body, wave.rig, rate=10.0, accuracy=wave.accuracy, start=wave.truth.state(0)
+        steps, wave.truth.body, wave.rig, rate=10.0, sigma=wave.sigma, start=wave.truth.state(0)
     )
     assert len(motion) == 6 and motion.quality[3] == 0.0 and motion.quality[4] > 0.5
     np.testing.assert_allclose(np.diff(motion.times), 0.1, atol=1e-9)
@@ -42,7 +42,7 @@ def test_a_step_without_frames_is_bridged(wave):
 @pytest.mark.slow
 def test_with_nothing_given(wave):
     motion = depth_fusion(
-        wave.seen("fusion")[:12], load_body("humanoid10"), wave.rig, rate=10.0, accuracy=wave.accuracy,
+        wave.seen("fusion")[:12], load_body("humanoid10"), wave.rig, rate=10.0, sigma=wave.sigma,
         up=wave.truth.up,
     )  # fmt: skip
     errors = np.linalg.norm(

@@ -41,7 +41,7 @@ def test_a_state_from_points_without_names(person):
 def test_the_tracker_starts_and_starts_again_far_away(person):
     motion, labelled, subject, model = person
     up = np.eye(3)["xyz".index(motion.up)]
-    tracker = Tracker(subject.body, a_rig(), rate=30.0, accuracy={"markers": 0.01}, up=up)
+    tracker = Tracker(subject.body, a_rig(), rate=30.0, sigma={"markers": 0.01}, up=up)
     for step, frame in enumerate((0, 1, 2)):
         found = tracker.update([name_frame(model, shuffled(labelled, frame), step / 30, marker_set=subject.marker_set)])
         assert found is not None

@@ -165,7 +165,8 @@ class Unnamed(Sensor):
         label, own = linear_sum_assignment(np.minimum(near, 0.3) ** 2)
         x = np.full((len(points), 3), np.nan)
         x[label] = np.where(near[label, own, None] < 0.3, m.value[own], np.nan)
-        return RowsOf(lambda s: point_rows(s.body, s.state, points, x, sigma=0.005), labels=x)
+        rows = lambda s: point_rows(s.body, s.state, points, x, sigma=0.005)
+        return RowsOf(rows, labels=x, channels=self.names)
 
 
 class Pixel(Sensor):

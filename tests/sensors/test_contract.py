@@ -48,7 +48,7 @@ WRIST = {"strut": "l_wrist", "pixel": "l_wrist"}
 
 def a_tracker(*sensors, values=None, start=None):
     values = {s.name: KNOWN[s.name] for s in sensors if s.name in KNOWN} if values is None else values
-    tracker = Tracker(BODY, a_rig(), rate=RATE, settings=STILL, accuracy=SIGMA, sensors=sensors, values=values)
+    tracker = Tracker(BODY, a_rig(), rate=RATE, settings=STILL, sigma=SIGMA, sensors=sensors, values=values, up="y")
     tracker.start_at(a_motion().state(0) if start is None else start)
     return tracker
 
@@ -356,6 +356,57 @@ def test_what_is_no_measurement_is_told(value):
     tracker = a_tracker(bad(None, lambda frame: value))
     with pytest.raises(ObservationError, match="mine|prepare"):
         tracker.update([marker_frame(0, HELD), Seen("mine", 0.0)])
+
+
+def several(count, channels):
+    """A match of so many points that agree with the body, its channels named."""
+    points = BODY.landmarks.select(HELD[:count])
+    return RowsOf(lambda s: s.along(points, (0.0, 1.0, 0.0), np.zeros(count), 0.01), channels=channels)
+
+
+CHANNELS = {
+    "numbers that change": (lambda i: several(1 + i % 2, None), "their number changes"),
+    "other numbers": (
+        lambda i: RowsOf(lambda s: s.along(one("neck"), (0.0, 1.0, 0.0), [0.0], 0.01, group=np.array([i]))),
+        "their number changes",
+    ),
+    "a name too few": (lambda i: several(2, ["a"]), "names 1 channels .* id 1"),
+    "one name twice": (lambda i: several(2, ["a", "a"]), "two channels 'a'"),
+    "numbers as names": (lambda i: several(2, [1, 2]), "are no names"),
+    "a text as names": (lambda i: several(2, "ab"), "are no names"),
+    "names at some times": (lambda i: several(2, ["a", "b"] if i % 2 else None), "at some times only"),
+    "new names at every time": (lambda i: several(2, [f"a{i}", f"b{i}"]), "anew at every time: a9, b9"),
+}
+
+
+@pytest.mark.parametrize("what", CHANNELS)
+def test_a_sensor_that_does_not_keep_to_its_channels_is_told(what):
+    match, problem = CHANNELS[what]
+    tracker = a_tracker(bad(lambda m, scene, reach: match(round(m.time * RATE))))
+    with pytest.raises(ObservationError, match=f"'mine'.*{problem}|{problem}.*'mine'"):
+        for i in range(11):
+            tracker.update([marker_frame(i, HELD), Seen("mine", i / RATE)])
+    assert tracker.update([marker_frame(11, HELD)]) is not None
+
+
+def test_channels_that_come_and_go_need_names():
+    tracker = a_tracker(bad(lambda m, s, r: several(2 - round(m.time * RATE) % 3 % 2, ["neck", "hip"])))
+    nothing = a_tracker(bad(lambda m, s, r: several(1, None) if m.time > 0.1 else RowsOf(lambda scene: [])))
+    for i in range(12):
+        for each in (tracker, nothing):
+            assert each.update([marker_frame(i, HELD), Seen("mine", i / RATE)]) is not None
+
+
+def test_two_measurements_of_one_name_and_time_are_told():
+    frames = [marker_frame(0, HELD), *(Told("mine", 0.0, None, lambda m, s, r: several(1, None)) for _ in range(2))]
+    with pytest.raises(ObservationError, match="two measurements of sensor 'mine' at 0 s"):
+        a_tracker().update(frames)
+    named = Told("mocap", 0.0, None, lambda m, s, r: several(1, ["neck"]))
+    with pytest.raises(ObservationError, match="'mocap' at 0 s have a channel 'neck'.*its own"):
+        a_tracker().update([marker_frame(0, HELD), named])
+    numbered = Told("mocap", 0.0, None, lambda m, s, r: several(1, None))
+    with pytest.raises(ObservationError, match="'mocap' name their channels at some times only"):
+        a_tracker().update([marker_frame(0, HELD), numbered])
 
 
 def test_two_sensors_of_one_name_are_told():

@@ -141,7 +141,7 @@ def test_what_the_fit_leaves_over_is_the_way_to_the_line():
 
 
 def test_the_tracker_follows_a_crate_by_its_edges():
-    tracker = Tracker(CRATE, rig(), rate=30.0, accuracy={"lines cam": 1.0})
+    tracker = Tracker(CRATE, rig(), rate=30.0, sigma={"lines cam": 1.0}, up="y")
     tracker.start_at(TRUTH)
     state = TRUTH
     for k in range(15):

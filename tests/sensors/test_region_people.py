@@ -27,7 +27,7 @@ def measured(state, camera=FRONT, others=(), **options):
 
 
 def tracker(state, rig=RIG, **settings):
-    t = Tracker(BODY, rig, rate=30.0, settings=TrackSettings(**settings))
+    t = Tracker(BODY, rig, rate=30.0, settings=TrackSettings(**settings), up="y")
     t.start_at(state)
     return t
 

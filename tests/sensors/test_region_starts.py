@@ -136,7 +136,7 @@ def test_an_arm_that_waves_is_followed_and_a_wrong_start_is_found():
     def truth(k):
         return state(0.3 + 0.02 * k, 0.4 - 0.02 * k, -0.9 + 0.03 * k)
 
-    tracker = Tracker(arm(), RIG, rate=30.0, accuracy={"region cam": 0.3})
+    tracker = Tracker(arm(), RIG, rate=30.0, sigma={"region cam": 0.3}, up="y")
     tracker.start_at(truth(0))
     for k in range(8):
         found = tracker.update([frame(truth(k), k / 30, seed=k)])
@@ -151,7 +151,7 @@ def test_beside_depth_colours_are_learnt_where_depth_found_the_body():
     """A start that is off by half a radian gives no part the wall's colours, as depth says where it is first."""
     drawn = render_body(arm(), TRUTH, CAMERA).depth.astype(np.float32)
     depth = np.where(np.isfinite(drawn), drawn, np.float32(2.0))
-    tracker = Tracker(arm(), RIG, rate=30.0, accuracy={"region cam": 0.3, "cam": 0.003})
+    tracker = Tracker(arm(), RIG, rate=30.0, sigma={"region cam": 0.3, "cam": 0.003}, up="y")
     tracker.start_at(state(-0.1, 0.1, -0.5))
     silent = tracker.update([DepthFrame("cam", 0.0, depth), frame(TRUTH)])
     assert not any((m.weight > 0).any() for m in silent.matched if m.sensor == "region cam")

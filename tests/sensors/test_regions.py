@@ -33,7 +33,7 @@ def measured(at=ASIDE, **regions):
 
 
 def tracker(**settings):
-    out = Tracker(BODY, RIG, rate=30.0, settings=TrackSettings(**settings))
+    out = Tracker(BODY, RIG, rate=30.0, settings=TrackSettings(**settings), up="y")
     out.start_at(TRUTH)
     out.update([frame(TRUTH)])
     return out
@@ -82,7 +82,8 @@ def test_light_may_change():
 
 
 def test_the_papers_rule_comes_to_the_same_place():
-    t = Tracker(BODY, RIG, rate=30.0, settings=TrackSettings(regions=RegionSettings(rule="shift"), iterations=20))
+    settings = TrackSettings(regions=RegionSettings(rule="shift"), iterations=20)
+    t = Tracker(BODY, RIG, rate=30.0, settings=settings, up="y")
     t.start_at(TRUTH)
     t.update([frame(TRUTH)])
     there = state((0.004, 0.003, 0.0), (0.02, 0.02, 0.0))
@@ -100,14 +101,14 @@ def test_what_is_nowhere_near_is_said_to_be_lost():
 
 def test_equal_colours_tell_nothing():
     wall = ((190, 60, 50),) * 2
-    t = Tracker(BODY, RIG, rate=30.0)
+    t = Tracker(BODY, RIG, rate=30.0, up="y")
     t.start_at(TRUTH)
     found = [t.update([frame(TRUTH, k / 30, wall=wall, seed=k)]) for k in range(3)][-1]
     assert found.hidden[0] and found.quality < 0.5
 
 
 def test_out_of_view_it_is_hidden():
-    t = Tracker(BODY, RIG, rate=30.0)
+    t = Tracker(BODY, RIG, rate=30.0, up="y")
     t.start_at(state((2.0, 0.0, 0.0)))
     assert t.update([frame(TRUTH)]).hidden[0]
 

@@ -178,8 +178,8 @@ def test_coarse_to_fine_finds_what_the_finest_level_does_not():
     far = np.clip(truth.angles + np.radians(40.0) * swing, body.tree.lower, body.tree.upper)
     start = BodyState(truth.T_world_root, far)
     accuracy = {f"silhouette {name}": 1.0 for name in rig.names}
-    alone = coarse_to_fine(body, rig, seen, start, accuracy=accuracy, levels=LEVELS[-1:])
-    found = coarse_to_fine(body, rig, seen, start, accuracy=accuracy)
+    alone = coarse_to_fine(body, rig, seen, start, sigma=accuracy, levels=LEVELS[-1:])
+    found = coarse_to_fine(body, rig, seen, start, sigma=accuracy)
     assert found.overlap > alone.overlap and found.overlap > 0.9
     away = [np.linalg.norm(joints(body, f.result.state) - joints(body, truth), axis=1).mean() for f in (alone, found)]
     assert away[1] < 0.5 * away[0]

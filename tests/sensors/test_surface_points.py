@@ -81,7 +81,7 @@ def test_rows_of_old_and_new_points_have_the_derivative_of_their_residuals():
 def test_a_turn_about_the_limb_is_followed():
     rng, start = np.random.default_rng(0), at(BODY, elbow_flex_r=60, arm_add_r=-30)
     sensor = SurfacePointSensor("skin")
-    tracker = Tracker(BODY, Rig(()), rate=30.0, sensors=[sensor])
+    tracker = Tracker(BODY, Rig(()), rate=30.0, sensors=[sensor], up="y")
     tracker.start_at(start)
     turn = BODY.tree.coordinate("arm_rot_r")
     for k in range(12):
@@ -135,7 +135,7 @@ def test_how_a_limb_was_turned_at_first_lasts():
     arm = load_body("arm")
     points, _, segment = sample(arm, 200)
     sensor, tree = SurfacePointSensor("skin"), arm.tree
-    tracker = Tracker(arm, Rig(()), rate=30.0, sensors=[sensor])
+    tracker = Tracker(arm, Rig(()), rate=30.0, sensors=[sensor], up="y")
     angles = np.array(arm.usual_state().angles)
     angles[tree.coordinate("elbow_flex_r")] = 1.2
     tracker.start_at(BodyState(np.eye(4), angles))

@@ -39,7 +39,7 @@ def seen(i, depth=False, noise=2.0):
 @cache
 def tracked(depth, count):
     """A tracker that has done its work, and its results."""
-    tracker = a_tracker(accuracy=SIGMA)
+    tracker = a_tracker(sigma=SIGMA)
     return tracker, [tracker.update(seen(i, depth, noise=2.0)) for i in range(count)]
 
 
@@ -141,7 +141,7 @@ def test_what_left_a_window_is_not_forgotten():
 
 
 def test_frames_that_are_missing_are_bridged_and_a_long_gap_begins_anew():
-    tracker = a_tracker(accuracy=SIGMA)
+    tracker = a_tracker(sigma=SIGMA)
     lagged, done = FixedLag(tracker, 0.1, noise=CALM), []
     there = [i for i in range(40) if not 10 <= i < 13 and not 22 <= i < 38]
     for i in there:

@@ -137,7 +137,7 @@ def test_a_take_tells_what_its_segments_share(shared_px):
         points = np.array(record.points)
         points[:, 0, column] += shift[:, segments.segments]
         seen.append(replace(record, points=points))
-    motion = track(Recording.of_keypoints(RIG, seen, accuracy=8.0, up=MOTION.up), BODY)
+    motion = track(Recording.of_keypoints(RIG, seen, sigma=8.0, up=MOTION.up), BODY)
     told = motion.provenance["smoothing"]["shared_errors"]
     assert set(told) == set(RIG.names)
     for of_camera in told.values():

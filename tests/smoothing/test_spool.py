@@ -12,7 +12,7 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import SurfaceAnchors
-from kinefit.errors import ObservationError
+from kinefit.errors import ExportError
 from kinefit.sensors.base import Leftover, Measurement, RowsOf
 from kinefit.smoothing.spool import Spool
 
@@ -126,6 +126,6 @@ def test_no_room_is_told_with_what_helps(monkeypatch):
     def full(data):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(spool._store._file, "write", full)
-    with pytest.raises(ObservationError, match=r"No space left on device.*TMPDIR"):
+    monkeypatch.setattr(spool._store._records._file, "write", full)
+    with pytest.raises(ExportError, match=r"No space left on device.*TMPDIR"):
         spool.append(np.zeros(3))

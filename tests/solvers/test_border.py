@@ -94,6 +94,18 @@ def test_limits_hold():
         assert np.all((s.angles >= ARM.tree.lower) & (s.angles <= ARM.tree.upper))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_solving_again_wins_nothing_where_limits_hold(seed):
+    problem, states, prior = task(frames=8, seed=seed)
+    random, tree = np.random.default_rng(seed), ARM.tree
+    beyond = [BodyState(np.eye(4), tree.usual + random.normal(scale=0.8, size=7)) for _ in states]
+    problem = Landmarks([ARM.positions(s, ARM.landmarks) for s in beyond])
+    found = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4))
+    assert any(np.any((s.angles == tree.lower) | (s.angles == tree.upper)) for s in found.states)
+    again = solve(problem, found.theta, found.states, prior, np.full(3, 1e-4))
+    assert found.converged and again.cost > (1.0 - 1e-4) * found.cost
+
+
 def test_a_loss_keeps_an_outlier_from_the_lengths():
     problem, states, prior = task(frames=4, loss=huber(1.5))
     calm = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4))

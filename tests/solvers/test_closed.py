@@ -82,6 +82,8 @@ def test_a_limit_ends_the_way_along_the_chain(leg):
     fit = closed_fit(leg, start, rows, equations, tolerance=1e-14)
     assert np.abs(equations(fit.state)[0]).max() <= CLOSED and fit.state.angles[1] <= 0.0
     assert leg.positions(fit.state, points)[0, 1] == pytest.approx(0.75, abs=1e-5)
+    again = closed_fit(leg, fit.state, rows, equations, tolerance=1e-14)
+    assert again.equations.cost > (1.0 - 1e-6) * fit.equations.cost
 
 
 def test_equations_that_cannot_be_met_end_a_fit(leg):

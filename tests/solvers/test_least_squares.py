@@ -4,6 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from benchmarks.faults_solver import beyond_limits
+from scipy.optimize import minimize
 from tests.oracle import look_at, posture, random_body, random_unit, rig_around
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet, load_body
@@ -23,7 +25,7 @@ from kinefit.geometry import lines, se3
 from kinefit.geometry.camera import Rig
 from kinefit.losses import geman_mcclure, huber, tukey
 from kinefit.solvers.equations import normal_equations
-from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt
+from kinefit.solvers.least_squares import _step, gauss_newton, levenberg_marquardt
 
 HUMANOID = load_body("humanoid")
 POINTS = HUMANOID.landmarks
@@ -129,6 +131,34 @@ def test_limits_hold_exactly():
     assert np.all(g[6:][low] <= 0) and np.all(g[6:][high] >= 0) and low.any() and high.any()
     inner = np.r_[np.ones(6, bool), ~(low | high)]
     np.testing.assert_allclose(g[inner], 0, atol=1e-4 * np.abs(g).max())
+
+
+def test_solving_again_wins_nothing_where_limits_hold():
+    body, points, x = beyond_limits(10)
+    state = body.usual_state()
+    for target in x:
+        make = lambda s: point_rows(body, s, points, target, sigma=0.005)  # noqa: B023
+        fit = levenberg_marquardt(body, state, make)
+        again = levenberg_marquardt(body, fit.state, make)
+        assert fit.converged and again.equations.cost > (1.0 - 1e-6) * fit.equations.cost
+        state = fit.state
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_that_limits_stop_is_solved_anew_for_the_others(seed):
+    """Against a general optimiser with bounds: near its least value, far below that of a step which is only clipped."""
+    body, points, x = beyond_limits(1, seed)
+    state, n = body.rest_state(), body.tree.n_dofs
+    eq = normal_equations(body, state, point_rows(body, state, points, x[0] + 0.1, sigma=0.1))
+    delta, fall = _step(eq, 1.0, (body.tree.lower, body.tree.upper), np.zeros(n, bool))
+    assert fall == pytest.approx(2.0 * eq.gradient @ delta - delta @ eq.matrix @ delta, rel=1e-9)
+    H = eq.matrix + np.eye(n)
+    low = np.r_[np.full(6, -np.inf), body.tree.lower - state.angles]
+    high = np.r_[np.full(6, np.inf), body.tree.upper - state.angles]
+    clipped = np.clip(np.linalg.solve(H, eq.gradient), low, high)
+    cost = lambda d: d @ H @ d - 2.0 * eq.gradient @ d
+    best = minimize(cost, clipped, jac=lambda d: 2.0 * (H @ d - eq.gradient), bounds=list(zip(low, high))).fun
+    assert cost(clipped) - cost(delta) > 0.8 * (cost(clipped) - best) > 0.0
 
 
 def test_a_start_beyond_the_limits_is_brought_back():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from benchmarks.faults_solver import MAX_GAIN, SETTINGS, beyond_limits, second_call
 from tests.oracle import posture, random_unit
 
 from kinefit.bodies import BodyState, load_body
@@ -48,6 +49,17 @@ def test_points_give_what_frame_by_frame_gives(loss, limits):
         np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=SAME_PLACE)
         start = fit.state
     assert np.all(result.iterations[1:] <= 8)
+
+
+@pytest.mark.parametrize("loss", SETTINGS)
+def test_solving_again_wins_nothing(loss):
+    """Limits make steps bad, and hundreds of good steps lower the damping between them: it must be able to rise."""
+    body, points, x = beyond_limits(1200)
+    found = fit_sequence(body, body.usual_state(), points, x, **SETTINGS[loss])
+    at_limit = (found.angles <= body.tree.lower) | (found.angles >= body.tree.upper)
+    assert at_limit.any(axis=1).mean() > 0.9
+    gain = second_call(body, points, x, found.Ts_world_root, found.angles, **SETTINGS[loss])
+    assert gain.max() < MAX_GAIN
 
 
 def test_exact_points_are_met():

@@ -213,7 +213,8 @@ def test_a_take_is_found_again_from_exact_pixels_and_limits_hold():
     acceleration = np.where(np.arange(N) < 3, 100.0, 2000.0)
     loose = MotionPrior(acceleration, (0.1, 1.0), 1 / 30, TREE.usual, TREE.spread)
     fit = smooth(BODY, truth.Ts_world_root, start, seen.equations(BODY), loose, bounds=(TREE.lower, TREE.upper))
-    assert fit.converged
+    again = smooth(BODY, fit.roots, fit.angles, seen.equations(BODY), loose, bounds=(TREE.lower, TREE.upper))
+    assert fit.converged and again.cost > (1.0 - 1e-4) * fit.cost
     knee = [TREE.coordinate(f"knee_angle_{side}") for side in "rl"]
     assert np.abs(fit.angles[:, knee] - truth.angles[:, knee]).max() < 0.01
     assert np.all(fit.angles >= TREE.lower) and np.all(fit.angles <= TREE.upper)

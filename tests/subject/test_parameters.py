@@ -13,7 +13,7 @@ from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.rows import ParameterRows, Rows
-from kinefit.sensors.base import Unknown
+from kinefit.sensors.base import RowsOf, Unknown
 from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.border_frames import differences
 from kinefit.subject.lasting import Seen, excess
@@ -156,39 +156,47 @@ def rows(residual, segment=None, group=None):
     return Rows.of(segment, np.zeros((count, 3)), np.tile([1.0, 0, 0], (count, 1)), residual, np.ones(count), group)
 
 
+def seen(sensor, parts, surface=False, channels=None):
+    matched = RowsOf(None, channels=channels)
+    object.__setattr__(matched, "sensor", sensor)
+    object.__setattr__(matched, "of_points", not surface)
+    return Seen(matched, parts)
+
+
 def test_errors_that_last_are_told_from_fresh_ones():
     random = np.random.default_rng(0)
-    fresh = [[Seen("a", [rows(random.normal(size=200))])] for _ in range(25)]
+    fresh = [[seen("a", [rows(random.normal(size=200))])] for _ in range(25)]
     assert excess(fresh, 0.0)["a"] < 1.3
     bias = random.normal(size=200)
-    half = [[Seen("a", [rows(0.7 * bias + 0.7 * random.normal(size=200))])] for _ in range(25)]
+    half = [[seen("a", [rows(0.7 * bias + 0.7 * random.normal(size=200))])] for _ in range(25)]
     assert excess(half, 0.0)["a"] == pytest.approx(0.5 * 25, rel=0.2)
     assert excess(half, 100.0)["a"] == pytest.approx(2.0 * excess(half, 0.0)["a"], rel=0.01)  # half of them followed
-    assert excess([[Seen("a", [rows(3.0 * random.normal(size=200))])] for _ in range(25)], 0.0)["a"] > 7.0
+    assert excess([[seen("a", [rows(3.0 * random.normal(size=200))])] for _ in range(25)], 0.0)["a"] > 7.0
 
 
 def test_markers_that_come_and_go_are_known_by_their_names():
     random, names = np.random.default_rng(1), np.array([f"m{k}" for k in range(60)])
     bias, frames = random.normal(size=60), []
     for _ in range(20):
-        seen = np.flatnonzero(random.random(60) < 0.5)
-        frames.append([Seen("mocap", [rows(bias[seen])], names=tuple(names[seen]))])
+        on = np.flatnonzero(random.random(60) < 0.5)
+        frames.append([seen("mocap", [rows(bias[on])], channels=names[on].tolist())])
     assert excess(frames, 0.0)["mocap"] > 4.0  # the largest biases count as outliers
-    without = [[Seen("mocap", one[0].rows)] for one in frames]
-    assert excess(without, 0.0)["mocap"] < 2.0
+    with pytest.raises(ObservationError, match="'mocap' have no names.*RowsOf"):
+        excess([[seen("mocap", one[0].rows)] for one in frames], 0.0)
 
 
 def test_errors_of_a_surface_last_over_a_segment():
     random, segment = np.random.default_rng(2), np.repeat(np.arange(10), 30)
     bias = random.normal(size=10)[segment]
-    frames = [[Seen("depth", [rows(0.5 * bias + 0.8 * random.normal(size=300),
-                                   segment, random.permutation(100000)[:300])], of_points=False)]
+    frames = [[seen("depth", [rows(0.5 * bias + 0.8 * random.normal(size=300),
+                                   segment, random.permutation(100000)[:300])], surface=True)]
               for _ in range(10)]  # fmt: skip
     assert excess(frames, 0.0)["depth"] > 30.0
-    points = [[Seen("depth", one[0].rows)] for one in frames]
+    names = [str(g) for g in range(100000)]
+    points = [[seen("depth", one[0].rows, channels=names)] for one in frames]
     assert excess(points, 0.0)["depth"] < 2.0
 
 
 def test_a_few_rows_tell_nothing_of_their_errors():
-    frames = [[Seen("rope", [ParameterRows(np.zeros(1, int), np.full(1, 5.0), np.ones(1))])] for _ in range(5)]
+    frames = [[seen("rope", [ParameterRows(np.zeros(1, int), np.full(1, 5.0), np.ones(1))])] for _ in range(5)]
     assert excess(frames, 0.0) == {}

@@ -81,7 +81,7 @@ def cloud_frame(i, segment=None, name="wave", every=3):
 
 def a_tracker(name="wave", start=0, settings=STILL, **more):
     """A tracker that begins at the truth of a frame, or with nothing known where `start` is None."""
-    tracker = Tracker(BODY, a_rig(name), rate=RATE, settings=settings, **more)
+    tracker = Tracker(BODY, a_rig(name), rate=RATE, settings=settings, **{"up": "y", **more})
     if start is not None:
         tracker.start_at(a_motion(name).state(start))
     return tracker

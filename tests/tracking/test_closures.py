@@ -80,7 +80,7 @@ def frames(hidden=range(0), crank=0.15, names=("joint", "foot", "pedal")):
 
 
 def tracker_of(leg):
-    out = Tracker(leg, Rig(()), rate=RATE, accuracy={"markers": NOISE}, settings=STILL, keep=True)
+    out = Tracker(leg, Rig(()), rate=RATE, sigma={"markers": NOISE}, settings=STILL, keep=True, up="y")
     out.start_at(states()[0])
     return out
 
@@ -205,4 +205,4 @@ def test_coordinates_of_a_closed_chain_are_known():
 
 def test_contradictory_closures_are_told_before_tracking():
     with pytest.raises(BodyError, match="contradict each other.*'foot' by 700.0 mm"):
-        Tracker(parse_body(LEG.replace("at = [0.0, 0.6, 0.0]", "at = [0.0, 1.6, 0.0]")), Rig(()))
+        Tracker(parse_body(LEG.replace("at = [0.0, 0.6, 0.0]", "at = [0.0, 1.6, 0.0]")), Rig(()), up="y")

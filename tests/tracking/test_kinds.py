@@ -26,7 +26,7 @@ ENDS = np.arange(4.0).reshape(1, 2, 2) * 9.0
     [
         {"body": "humanoid"}, {"body": None}, {"rig": None}, {"rig": [1]}, {"rate": "30"}, {"rate": None},
         {"rate": np.nan},
-        {"accuracy": [1]}, {"accuracy": "8"}, {"accuracy": {"cam01": "8"}}, {"accuracy": {"cam01": None}}, {"up": "z"},
+        {"sigma": [1]}, {"sigma": "8"}, {"sigma": {"cam01": "8"}}, {"sigma": {"cam01": None}}, {"up": "w"},
         {"up": None}, {"up": (1, 2)}, {"on_body": 3}, {"on_body": "cam01"}, {"settings": {"a": 1}}, {"sensors": 3},
         {"sensors": "abc"}, {"sensors": [3]}, {"values": 3}, {"values": "abc"}, {"values": {"a": 3}},
     ],

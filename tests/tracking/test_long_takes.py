@@ -76,8 +76,8 @@ def test_no_file_is_left_behind(stop, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(spool, "IN_MEMORY", 0)
     made = []
-    write = spool._Store.write
-    monkeypatch.setattr(spool._Store, "write", lambda *a: made.append(len(open_files(tmp_path))) or write(*a))
+    write = spool.Store.write
+    monkeypatch.setattr(spool.Store, "write", lambda *a: made.append(len(open_files(tmp_path))) or write(*a))
     if stop is None:
         followed(12, True)
     else:

@@ -73,7 +73,7 @@ def test_arms_are_followed_with_their_shoulders(body, rig, sensors):
     """The morphing body finds the arms' angles; the same one held stiff is off."""
     model, ends = Morphing(body), {}
     for name, own in (("morphing", body), ("stiff", replace(body, morphs=()))):
-        follow = Tracker(own, rig, rate=30.0, settings=TrackSettings(search=False))
+        follow = Tracker(own, rig, rate=30.0, settings=TrackSettings(search=False), up="y")
         follow.start_at(posture(body, 0))
         for i in range(8):
             truth, frames = posture(body, i), []

@@ -32,7 +32,7 @@ def test_between_frames_far_apart_limbs_are_sought_for_what_nothing_explains(mon
     monkeypatch.setattr(recovery, "find_limbs", lambda *_: sought.append(1) or [])
     monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
     settings = TrackSettings(doubtful=0.0)
-    tracker = Tracker(a_motion().body, a_rig(), rate=rate, settings=settings, on_body=("depth",))
+    tracker = Tracker(a_motion().body, a_rig(), rate=rate, settings=settings, on_body=("depth",), up="y")
     tracker.start_at(a_motion().state(0))
     result = tracker.update([sees(0)])
     assert not result.lost.any()

@@ -28,7 +28,7 @@ def seen(i, cameras=COLOUR, depth=False):
 
 
 def run(steps, **more):
-    tracker = a_tracker(keep=True, accuracy=SIGMA, up=(0.0, 0.0, 1.0), **more)
+    tracker = a_tracker(keep=True, sigma=SIGMA, up=(0.0, 0.0, 1.0), **more)
     for frames in steps:
         tracker.update(frames)
     return tracker

@@ -105,8 +105,8 @@ def test_the_order_of_sensors_does_not_matter(together):
 def test_a_sensor_that_is_inaccurate_hardly_pulls(alone):
     names = ("r_wrist", "l_wrist", "neck", "r_knee", "l_knee")
     wrong = [depth_frame, lambda i: marker_frame(i, names, shift=0.03)]
-    told, _ = followed(wrong, count=12, accuracy={"mocap": 0.5})
-    trusted, _ = followed(wrong, count=12, accuracy={"mocap": 0.005})
+    told, _ = followed(wrong, count=12, sigma={"mocap": 0.5})
+    trusted, _ = followed(wrong, count=12, sigma={"mocap": 0.005})
     points = BODY.landmarks
 
     def pulled(result):
@@ -400,23 +400,23 @@ def test_wrong_frames_are_told_and_do_no_harm(says, kind, frames):
 @pytest.mark.parametrize("accuracy", [0.0, -0.01, np.nan, np.inf])
 def test_an_accuracy_that_is_none_is_told(accuracy):
     with pytest.raises(ObservationError, match="standard deviations of depth"):
-        Tracker(BODY, a_rig(), accuracy={"depth": accuracy})
+        Tracker(BODY, a_rig(), sigma={"depth": accuracy}, up="y")
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, np.nan, np.inf])
 def test_a_rate_that_is_none_is_told(rate):
     with pytest.raises(ObservationError, match="Hz"):
-        Tracker(BODY, a_rig(), rate=rate)
+        Tracker(BODY, a_rig(), rate=rate, up="y")
 
 
 def test_depth_needs_surfaces_and_markers_do_not():
     bare = replace(BODY, surfaces=())
-    tracker = Tracker(bare, a_rig(), settings=STILL)
+    tracker = Tracker(bare, a_rig(), settings=STILL, up="y")
     tracker.start_at(a_motion().state(0))
     for frame in (depth_frame(0), cloud_frame(0)):
         with pytest.raises(BodyError, match="no surfaces"):
             tracker.update([frame])
-    tracker = Tracker(bare, a_rig(), settings=STILL)
+    tracker = Tracker(bare, a_rig(), settings=STILL, up="y")
     tracker.start_at(a_motion().state(0))
     assert off(tracker.update([marker_frame(0, FEW)]).state, 0).mean() < 0.01
 
@@ -453,7 +453,8 @@ def garbage(draw, time):
 def test_no_garbage_makes_a_result_that_is_not_finite(data):
     tracker = a_tracker()
     for i in range(3):
-        result = tracker.update([data.draw(garbage(i / RATE)) for _ in range(data.draw(st.integers(1, 3)))])
+        drawn = [data.draw(garbage(i / RATE)) for _ in range(data.draw(st.integers(1, 3)))]
+        result = tracker.update(list({f.sensor: f for f in drawn}.values()))  # two of one sensor are refused
         assert is_finite(result)
         assert (result.dof_std > 0).all() and ((result.segment_quality >= 0) & (result.segment_quality <= 1)).all()
     R = result.state.T_world_root[:3, :3]
@@ -465,7 +466,7 @@ def test_no_garbage_makes_a_result_that_is_not_finite(data):
 def test_no_garbage_stops_a_search(data):
     tracker = a_tracker(start=None, settings=TrackSettings())
     try:
-        result = tracker.update([data.draw(garbage(0.0)) for _ in range(2)])
+        result = tracker.update(list({f.sensor: f for f in (data.draw(garbage(0.0)) for _ in range(2))}.values()))
     except KinefitError:
         raise AssertionError("a search that finds nothing is no error") from None
     assert result is None or is_finite(result)

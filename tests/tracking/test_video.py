@@ -79,13 +79,13 @@ def test_a_camera_that_was_turned_is_named_and_spoils_little(truth, smooth):
     turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(3.0), 0.0]))
     moved = Rig(tuple(c.with_pose(turn @ c.T_camera_world) if c.name == "cam03" else c for c in rig))
     motion = track(
-        Recording.of_keypoints(moved, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"), smooth=smooth
+        Recording.of_keypoints(moved, keypoints, sigma=3.0, up=truth.up), load_body("humanoid"), smooth=smooth
     )
     told = motion.provenance["contradictions"]
     assert set(told) == {"cam03"} and told["cam03"]["median_px"] > 50.0 > told["cam03"]["others_px"]
     assert "cam03 contradicts the other cameras" in sentences(told)[0] and "px" in sentences(told)[0]
     assert joint_errors(truth, motion).mean() < 0.02
-    right = Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up)
+    right = Recording.of_keypoints(rig, keypoints, sigma=3.0, up=truth.up)
     as_it_is = track(right, load_body("humanoid"), smooth=smooth)
     assert as_it_is.provenance["contradictions"] == {}
 
@@ -93,14 +93,14 @@ def test_a_camera_that_was_turned_is_named_and_spoils_little(truth, smooth):
 def test_known_motion_is_recovered(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", seed=1)
-    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"))
+    motion = track(Recording.of_keypoints(rig, keypoints, sigma=3.0, up=truth.up), load_body("humanoid"))
     assert joint_errors(truth, motion).mean() < 0.012
 
 
 def test_exact_pixels_give_the_exact_motion(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "MEDIAPIPE_33", noise_px=0.0, outliers=0.0, missing=0.0)
-    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=0.5, up=truth.up), load_body("humanoid"))
+    motion = track(Recording.of_keypoints(rig, keypoints, sigma=0.5, up=truth.up), load_body("humanoid"))
     assert joint_errors(truth, motion).mean() < 0.004
 
 
@@ -111,7 +111,7 @@ def with_a_gap(truth, gone, seed):
         points, confidence = k.points.copy(), k.confidence.copy()
         points[gone], confidence[gone] = np.nan, 0.0
         emptied.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
-    return Recording.of_keypoints(rig, emptied, accuracy=3.0, up=truth.up)
+    return Recording.of_keypoints(rig, emptied, sigma=3.0, up=truth.up)
 
 
 def inside(truth, motion, frames):
@@ -162,7 +162,7 @@ def test_a_hidden_limb_is_told_by_segment(truth):
         arm = [k.names.index(n) for n in ("RElbow", "RWrist")]
         points[20:40, :, arm], confidence[20:40, :, arm] = np.nan, 0.0
         hidden.append(Keypoints(k.camera, k.keypoint_set, k.names, k.rate, points, confidence))
-    motion = track(Recording.of_keypoints(rig, hidden, accuracy=3.0, up=truth.up), load_body("humanoid"))
+    motion = track(Recording.of_keypoints(rig, hidden, sigma=3.0, up=truth.up), load_body("humanoid"))
     segment = motion.body.tree.segment
     assert np.all(motion.segment_quality[22:38, segment("forearm_r")] == 0.0)
     assert motion.segment_quality[22:38, segment("forearm_l")].min() > 0.5
@@ -171,7 +171,7 @@ def test_a_hidden_limb_is_told_by_segment(truth):
 def test_a_detector_that_exchanges_sides_is_put_right(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig, "BODY_25B", swaps=0.2, seed=4)
-    motion = track(Recording.of_keypoints(rig, keypoints, accuracy=3.0, up=truth.up), load_body("humanoid"))
+    motion = track(Recording.of_keypoints(rig, keypoints, sigma=3.0, up=truth.up), load_body("humanoid"))
     assert sum(r.swapped.sum() for r in motion.residuals.values()) > 10
     assert joint_errors(truth, motion).mean() < 0.015
 

@@ -4,12 +4,16 @@ import base64
 import re
 import socket
 import sys
+import types
+import urllib.error
 import urllib.request
 
 import numpy as np
 import pytest
+import websockets
 import websockets.sync.client
 from tests.exporters.synthetic import a_camera, smooth_motion
+from tests.serving.probing import probe
 from tests.viewers.recordings import RATE, write_video
 
 from kinefit.bodies import BodyState, load_body
@@ -17,10 +21,13 @@ from kinefit.errors import BodyError, CalibrationError, ExportError, Observation
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
+from kinefit.serving.access import Access
 from kinefit.viewers import Choice, Pictures, Player, Recording, View, page
 from kinefit.viewers.page import MOST_FRAMES, chosen_frames
 from kinefit.viewers.show import ALL, Show
 from kinefit.viewers.stage import free_port, open_server, quiet
+
+ACCESS = Access()
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +42,7 @@ def rig():
 
 @pytest.fixture
 def server():
-    server = open_server(0)
+    server = open_server(0, ACCESS)
     yield server
     with quiet():
         server.stop()
@@ -47,14 +54,56 @@ def node(server, name):
 
 def test_the_page_is_served(server, motion):
     Player(server, Recording((motion,))).tick(0.0)
-    address = f"localhost:{server.get_port()}"
-    with urllib.request.urlopen(f"http://{address}", timeout=10) as answer:
+    address = ACCESS.url(server.get_port())
+    with urllib.request.urlopen(address, timeout=10) as answer:
         assert answer.status == 200 and b"<html" in answer.read()[:1000].lower()
+        assert "connect-src 'self'" in answer.headers["Content-Security-Policy"]
+    with viser_client(address) as client:
+        assert len(client.recv(timeout=10)) > 1000  # the scene so far, compressed
+
+
+def viser_client(address, **options):
+    """A WebSocket as viser's page opens it: without the slash at the end."""
     import viser
 
-    protocol = f"viser-v{viser.__version__}"
-    with websockets.sync.client.connect(f"ws://{address}", subprotocols=[protocol], max_size=None) as client:
-        assert len(client.recv(timeout=10)) > 1000  # the scene so far, compressed
+    address = address.replace("http", "ws", 1).rstrip("/")
+    protocols = [f"viser-v{viser.__version__}"]
+    return websockets.sync.client.connect(address, subprotocols=protocols, max_size=None, **options)
+
+
+def test_a_foreign_page_gets_no_scene(server):
+    port = server.get_port()
+    own, bare = ACCESS.url(port), f"http://localhost:{port}/"
+    for address in (bare, f"{bare}another-token-of-24-char/"):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(address, timeout=10)
+        with pytest.raises(websockets.InvalidStatus, match="403"):
+            viser_client(address)
+    for headers, status in (({"Origin": "https://evil.example"}, 403), ({"Host": f"evil.example:{port}"}, 421)):
+        with pytest.raises(urllib.error.HTTPError, match=str(status)):
+            urllib.request.urlopen(urllib.request.Request(own, headers=headers), timeout=10)
+    with pytest.raises(websockets.InvalidStatus, match="403"):
+        viser_client(own, origin="https://evil.example")
+    with viser_client(own, origin=f"http://localhost:{port}") as client:
+        assert client.recv(timeout=10)
+
+
+def test_probes_print_nothing(server, capfd, caplog):
+    probe(server.get_port())
+    with viser_client(ACCESS.url(server.get_port())) as client:
+        assert client.recv(timeout=10)
+    assert capfd.readouterr() == ("", "") and not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch):
+    import viser
+
+    stopped = []
+    other = types.SimpleNamespace(stop=lambda: stopped.append(True))
+    monkeypatch.setattr(viser, "ViserServer", lambda **_: other)
+    with pytest.raises(ExportError, match="serves in another way"):
+        open_server(0)
+    assert stopped
 
 
 def test_segments_stand_where_the_motion_says(server, motion):
@@ -225,7 +274,7 @@ def test_a_port_in_use_gives_the_next():
 
 def test_a_host_that_is_none_is_told():
     with pytest.raises(ExportError, match="no.such.host"):
-        open_server(0, host="no.such.host.invalid")
+        open_server(0, Access("no.such.host.invalid"))
 
 
 def test_without_viser_the_remedy_is_told(monkeypatch):
@@ -239,6 +288,7 @@ def test_a_page_is_one_file_with_all_in_it(motion, rig):
     assert frames == len(motion)
     assert len(base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)[1])) > 10_000
     assert not re.search(r'(?:src|href)="https?://', text)
+    assert re.search(r'<head><meta http-equiv="Content-Security-Policy" content="connect-src', text)
 
 
 @pytest.mark.parametrize(
@@ -266,3 +316,8 @@ def test_a_live_view_follows_states(rig):
             view.show(BodyState(np.eye(4), np.zeros(3)))
         with pytest.raises(CalibrationError, match="cam 7"):
             view.show(state, images={"cam 7": image})
+
+
+def test_a_view_that_a_network_reaches_warns():
+    with pytest.warns(UserWarning, match="open to the network"), View(load_body("arm"), port=0, host="0.0.0.0"):
+        pass

@@ -141,8 +141,8 @@ def track_person(
     total = 0
     with ExitStack() as work:
         unfinished = work.enter_context(Checkpoint(out / "unfinished", key_of(take, **how), restart=choices.restart))
-        if unfinished.resumed:
-            tell(f"going on with what an earlier run left in {unfinished.folder}; --restart begins anew")
+        for sentence in unfinished.said():
+            tell(sentence)
         step("reading", 0, 0)
 
         def read(what: str, done: int, count: int) -> None:

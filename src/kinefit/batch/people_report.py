@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.batch.summary import OUTCOME, by_joint, outcome
+from kinefit.batch.summary import OUTCOME, by_joint, fault_boxes, outcome
 from kinefit.batch.work import DONE, Row
 
 if TYPE_CHECKING:
@@ -33,7 +33,8 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
     done = [row for row in rows if row.status == DONE]
     told = f"{len(done)} of {len(rows)} people in view were tracked; each has results and a report of their own."
     parts: list[p.Section | str] = [
-        p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", told), _people(rows, folder)
+        *fault_boxes(rows), p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", told),
+        _people(rows, folder),
     ]  # fmt: skip
     parts += [p.section(f"Person {row.person}", *_person(row, folder, pictures)) for row in rows]
     if done:
@@ -51,13 +52,12 @@ def _people(rows: Sequence[Row], folder: Path) -> Html:
 
 def _person(row: Row, folder: Path, pictures: bool) -> list[str]:
     """The picture of all cameras, and what the command says."""
-    import cv2
-
+    from kinefit._pictures import read_picture
     from kinefit.exporters.report import page as p
 
     montage = folder / row.folder / "montage.png"
-    read = cv2.imread(str(montage)) if pictures and row.folder and montage.is_file() else None
-    parts: list[str] = [] if read is None else [p.picture(cv2.cvtColor(read, cv2.COLOR_BGR2RGB), width=1400)]
+    there = pictures and row.folder and montage.is_file()
+    parts: list[str] = [p.picture(read_picture(montage), width=1400)] if there else []
     if row.error:
         parts.append(p.callout("bad", row.error))
     if row.notes:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from kinefit.exporters.report.page import Html
 
 _WHO = ("take", "person", "subject", "visit", "date", "movement")
-_ROW = (*_WHO, "frames", "seconds", "quality", "lost share", "status", "error", "folder")
+_ROW = (*_WHO, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
 _RANGE = (
     *_WHO, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]", "observed share",
 )  # fmt: skip
@@ -37,7 +37,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     if not rows:
         raise ExportError("no take to summarise", file=folder, remedy="Name takes by a pattern that matches some.")
     table = [(*_who(row), row.frames or "", *map(_number, (row.seconds, row.quality, row.lost)), row.status, row.error,
-              row.folder) for row in rows]  # fmt: skip
+              " ".join(found.text for found in row.findings), row.folder) for row in rows]  # fmt: skip
     ranges = [
         (*_who(row), one.coordinate, one.side, *map(_number, (one.lowest, one.highest, one.span, one.twice, one.share)))
         for row in rows for one in row.ranges
@@ -56,6 +56,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
     named = len({row.subject for row in rows if row.subject})
     told = f"{takes - bad} of {takes} takes are done; {named} subjects are named."
     parts: list[p.Section | str] = [
+        *fault_boxes(rows),
         p.callout("bad" if not done else "warning" if bad else "good", told),
         p.section("Takes", _takes(rows, folder)),
     ]
@@ -65,6 +66,16 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
     if notes:
         parts.append(p.section("Notes", p.table(("take", "person", "note"), notes, first_left=3)))
     return p.page("Summary of takes", parts)
+
+
+def fault_boxes(rows: Iterable[Row]) -> list[Html]:
+    """A box for each fault of the inputs, with the take and the person that it is about."""
+    from kinefit.exporters.report.findings import finding_callout
+
+    return [
+        finding_callout(found, f"{row.take}{f', person {row.person}' if row.person else ''}")
+        for row in rows for found in row.findings
+    ]  # fmt: skip
 
 
 _ABOUT = (

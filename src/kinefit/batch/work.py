@@ -14,6 +14,7 @@ import msgspec
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
 from kinefit.errors import KinefitError
+from kinefit.findings import Finding, of_provenance
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
@@ -57,6 +58,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     status : "done" or "failed"
     error : what went wrong
     notes : what the command says besides
+    findings : faults of the inputs
     ranges : tuple of Range
     """
 
@@ -74,6 +76,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
     status: str = DONE
     error: str = ""
     notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     ranges: tuple[Range, ...] = ()
 
 
@@ -200,7 +203,7 @@ def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
             ranges.append(Range(coordinate, side, *ends, *found.span, found.share))
     return msgspec.structs.replace(
         row, frames=len(motion), seconds=len(motion) / motion.rate, quality=float(motion.quality.mean()),
-        lost=float(motion.lost.mean()), notes=notes, ranges=tuple(ranges),
+        lost=float(motion.lost.mean()), notes=notes, findings=of_provenance(motion.provenance), ranges=tuple(ranges),
     )  # fmt: skip
 
 

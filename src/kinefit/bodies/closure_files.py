@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from kinefit._files import repeated
 from kinefit.bodies.closures import KINDS, Closure, Dimension, with_dimensions
 from kinefit.errors import BodyError, choices
 
@@ -88,8 +89,7 @@ def closed(
         problem = "closures of a body whose joints or surfaces morph"
         raise BodyError(problem, file=source, place="closure", remedy="Leave out the morphs, or the closures.")
     for what, names in (("closure", [c.name for c in closures]), ("dimension", [d.name for d in dimensions])):
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
+        if twice := sorted(repeated(names)):
             raise BodyError(f"{what} named twice: {', '.join(twice)}", file=source, remedy="Rename one of them.")
     body = replace(body, closures=tuple(_closure(body, r, source) for r in closures))
     drawn, wanted = [], {}

@@ -58,7 +58,7 @@ def with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -
             raise BodyError(problem, file=source, place=place, remedy="Use one of these.")
         d = tree.coordinate(name)
         unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
-        if not tree.lower[d] <= value * unit <= tree.upper[d]:
+        if not (np.isfinite(value) and tree.lower[d] <= value * unit <= tree.upper[d]):
             ends = f"{tree.lower[d] / unit:g} to {tree.upper[d] / unit:g}"
             raise BodyError(f"{value:g} is out of its range", file=source, place=place, remedy=f"Give {ends}.")
         out[d] = value * unit

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, repeated
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closure_files import closed, with_closure_images
 from kinefit.bodies.couplings import coupled, with_posture
@@ -26,6 +26,7 @@ from kinefit.errors import BodyError, choices
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
+_MAX_SEGMENTS = 1000  # and couplings ...; detailed skeletons have 200, and tables of all pairs grow by the square
 _CHOOSE = "Use one of these, or add it."
 
 
@@ -132,12 +133,12 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
         record = msgspec.convert(parse_toml(text, source, BodyError), FileRecord)
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
-        raise BodyError(
-            f"not a body file: {problem}",
-            file=source,
-            place=place.strip(".`") or None,
-            remedy="See docs/bodies.md for its keys.",
-        ) from error
+        where, remedy = place.strip(".`") or None, "See docs/bodies.md for its keys."
+        raise BodyError(f"not a body file: {problem}", file=source, place=where, remedy=remedy) from error
+    most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
+    if most > _MAX_SEGMENTS:
+        problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
+        raise BodyError(problem, file=source, remedy="Leave out what does not move by itself.")
     base = record.body.base
     if base is None:
         return record
@@ -200,35 +201,37 @@ def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
 
 def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
     """Depth first from the root, so that parents come before children and limbs stay together."""
-    names = [s.name for s in segments]
-    for what, items in (("segment", names), ("joint", [s.joint.name for s in segments])):
-        twice = {n for n in items if items.count(n) > 1}
-        if twice:
-            problem = f"{what} named twice: {', '.join(sorted(twice))}"
-            raise BodyError(problem, file=source, remedy="Rename one of them.")
+    children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
+    _refuse_repeated("segment", [s.name for s in segments], source)
+    _refuse_repeated("joint", [s.joint.name for s in segments], source)
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
-        raise BodyError(
-            f"a body has exactly one segment without a parent, here: {found}",
-            file=source,
-            remedy="Give the others a parent.",
-        )
+        problem = f"a body has exactly one segment without a parent, here: {found}"
+        raise BodyError(problem, file=source, remedy="Give the others a parent.")
     for s in segments:
-        if s.parent is not None and s.parent not in names:
+        if s.parent is not None and s.parent not in children:
             place = f"parent of segment {s.name}"
-            raise BodyError(choices("segment", s.parent, names), file=source, place=place, remedy=_CHOOSE)
+            raise BodyError(choices("segment", s.parent, children), file=source, place=place, remedy=_CHOOSE)
+        children.setdefault(s.parent, []).append(s)
     out: list[SegmentRecord] = []
     stack = [roots[0]]
     while stack:
         s = stack.pop()
         out.append(s)
-        stack += reversed([c for c in segments if c.parent == s.name])
+        stack += reversed(children[s.name])
     if len(out) != len(segments):
-        lost = ", ".join(n for n in names if n not in {s.name for s in out})
+        placed = {s.name for s in out}
+        lost = ", ".join(s.name for s in segments if s.name not in placed)
         remedy = "Every chain of parents must end at the root."
         raise BodyError(f"the segments {lost} form a cycle", file=source, remedy=remedy)
     return out
+
+
+def _refuse_repeated(what: str, names: list[str], source: str) -> None:
+    if twice := repeated(names):
+        problem = f"{what} named twice: {', '.join(sorted(twice))}"
+        raise BodyError(problem, file=source, remedy="Rename one of them.")
 
 
 def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
@@ -284,10 +287,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
             unit = 1.0 if slides[k] else np.pi / 180.0
             names.append(coordinates[k])
             rows.append((i, axis / norm, slides[k], low * unit, high * unit, usual * unit, spread * unit))
-    twice = {n for n in names if names.count(n) > 1}
-    if twice:
-        problem = f"coordinate named twice: {', '.join(sorted(twice))}"
-        raise BodyError(problem, file=source, remedy="Rename one of them.")
+    _refuse_repeated("coordinate", names, source)
     return KinematicTree(
         segments=tuple(s.name for s in segments),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
@@ -323,8 +323,9 @@ def _points(
 
 
 def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
+    known = set(landmarks.names)
     for name, landmark in entries.items():
-        if landmark not in landmarks.names:
+        if landmark not in known:
             problem = choices("landmark", landmark, landmarks.names)
             raise BodyError(problem, file=source, place=f"{place}.{name}", remedy=_CHOOSE)
     chosen = landmarks.select(tuple(entries.values()))

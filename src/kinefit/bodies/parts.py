@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import repeated
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import without_landmarks
 from kinefit.bodies.operators import Operator
@@ -76,7 +77,7 @@ def with_part(
         ("coordinate", joint.coordinates, tree.coordinates),
         ("landmark", tuple(landmarks or ()), body.landmarks.names),
     ):
-        taken = sorted(set(new) & set(old)) + sorted({n for n in new if list(new).count(n) > 1})
+        taken = sorted(set(new) & set(old)) + sorted(repeated(new))
         if taken:
             raise BodyError(f"{what} '{taken[0]}' is there already", place=f"part {name}", remedy="Choose another.")
     here = len(tree.segments)

@@ -166,7 +166,7 @@ def saved_body(path: str | PathLike[str]) -> Body:
     try:
         return body_from_arrays(arrays)
     except BodyError as error:
-        raise BodyError(error.problem, file=path, remedy=error.remedy or remedy) from error
+        raise BodyError(error.problem, file=path, place=error.place, remedy=error.remedy or remedy) from error
     except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise BodyError(f"cannot read the body ({error})", file=path, remedy=remedy) from error
 
@@ -229,7 +229,11 @@ def _points_from_arrays(arrays: Mapping[str, NDArray], key: str, n_segments: int
     names = _texts(arrays, f"{key}/names")
     segments = _array(arrays, f"{key}/segments", (len(names),))
     _check_indices(segments, n_segments, f"{key}/segments")
-    return PointSet(names, segments, _array(arrays, f"{key}/points", (len(names), 3)))
+    points = _array(arrays, f"{key}/points", (len(names), 3))
+    if not (finite := np.isfinite(points).all(axis=1)).all():
+        place = f"{key}, {names[np.argmin(finite)]}"
+        raise BodyError("a point that is not finite", place=place, remedy="Give three numbers in metres.")
+    return PointSet(names, segments, points)
 
 
 def _sets(arrays: Mapping[str, NDArray], kind: str, n_segments: int) -> dict[str, PointSet]:

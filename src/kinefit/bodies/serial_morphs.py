@@ -86,6 +86,9 @@ def _morph(own: Mapping[str, NDArray], surfaces: FromArrays) -> Operator:
     kind, segment, weight = str(own["kind"]), str(own["segment"]), own["weight"]
     start, end = (float(v) for v in own["span"])
     told = str(weight) if weight.dtype.kind == "U" else weight
+    for name in _OWN.get(kind, ()):
+        if np.isnan(own[name]).any() or (name != "radii" and np.isinf(own[name]).any()):  # radii: inf for everywhere
+            raise ValueError(f"{name} is not finite")
     steering = Steering(str(own["angle"]), start, end, told, bool(own["beyond"]))
     if kind == "joint":
         return JointMotion(segment, own["twist"], steering)

@@ -70,6 +70,7 @@ class KinematicTree:
         object.__setattr__(self, "axes", _frozen(self.axes.reshape(-1, 3)))
         lines = (len(self.couplings), len(self.coordinates))
         object.__setattr__(self, "couplings", _frozen(np.reshape(self.couplings, lines)))
+        self._check_numbers()
         if np.any(np.diff(self.owners) < 0) or np.any(self.parents[1:] >= np.arange(1, len(self.parents))):
             raise BodyError("segments of a tree are not in order", remedy="Put parents before their children.")
         middle = [d.start + 1 for d in self.ball_joints]
@@ -78,6 +79,23 @@ class KinematicTree:
                 why = "the middle axis of a ball joint" if d in middle else "without a spread of its own"
                 problem = f"a coupling of {self.coordinates[d]}, {why}"
                 raise BodyError(problem, remedy="Couple other coordinates, with a finite spread.")
+
+    def _check_numbers(self) -> None:
+        """Raise BodyError where a number of a segment or a coordinate cannot be."""
+        finite = {name: np.isfinite(getattr(self, name)) for name in ("offsets", "axes", "usual", "couplings")}
+        wrong = {
+            "offset": (~finite["offsets"].all(axis=-1), self.segments, "Give three numbers in metres."),
+            "axis": (~finite["axes"].all(axis=1), self.coordinates, "Give a unit vector."),
+            "usual": (~finite["usual"], self.coordinates, "Give an angle or a length within the limits."),
+            "couplings": (~finite["couplings"].all(axis=0), self.coordinates, "Give numbers, 0 for none."),
+            "limits": (~((self.lower <= self.upper) & (self.lower < np.inf) & (self.upper > -np.inf)), self.coordinates,
+                       "Give the lower one first, -inf and inf for none."),
+            "spread": (~(self.spread > 0.0), self.coordinates, "Give a positive number, inf for no prior."),
+        }  # fmt: skip
+        for what, (bad, names, remedy) in wrong.items():
+            if bad.any():
+                place = f"{what} of {names[np.argmax(bad)]}"
+                raise BodyError("a number that is not finite, or beyond what it can be", place=place, remedy=remedy)
 
     @property
     def n_dofs(self) -> int:

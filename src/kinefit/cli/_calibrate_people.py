@@ -55,7 +55,7 @@ def people(
         found = calibrate_people(
             tuple(seen.rig), seen.keypoints, load_body(entry.body), height=height or entry.height, focal=focal,
             time_offsets=time_offsets, up=entry.up, progress=step,
-            accuracy=median(source.sigma for source in entry.keypoints),
+            sigma=median(source.sigma for source in entry.keypoints),
         )  # fmt: skip
     write_calibration(found.rig, out)
     for line in found.told():

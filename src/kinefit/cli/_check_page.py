@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kinefit.calibration.check.check import Check
-from kinefit.calibration.check.findings import Finding
 from kinefit.cli._check_pictures import pair, picture_section
+from kinefit.diagnostics.keypoints import Check
 from kinefit.exporters.report import page as p
+from kinefit.exporters.report.findings import finding_callout
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES
 
 if TYPE_CHECKING:
     from kinefit.cli._check_refine import Refined
 
-_LOOKS = {"fault": "bad", "doubt": "warning", "note": "note", "good": "good"}
-_TITLES = {"fault": "Fault", "doubt": "Doubt", "note": "Note", "good": "In order"}
 _DOTS = 1500  # of the person's points in the plan
 
 
@@ -48,22 +46,12 @@ def verdict(check: Check) -> str:
 
 
 def _findings(check: Check) -> p.Section:
-    shown = [_callout(found) for found in check.findings if found.severity != "good"]
+    shown = [finding_callout(found) for found in check.findings if found.severity != "good"]
     good = [found.text for found in check.findings if found.severity == "good"]
     parts = shown or [p.callout("good", "Nothing is wrong that a check can find.")]
     if good:
         parts.append(p.folded(f"In order: {len(good)} things looked at", p.bullets(good), opened=not shown))
     return p.section("Findings", *parts, anchor="findings")
-
-
-def _callout(found: Finding) -> p.Html:
-    parts = []
-    if found.confidence:
-        parts.append(p.paragraph(found.confidence, small=True))
-    if found.remedy:
-        parts.append(p.paragraph(p.strong("What to do: "), found.remedy))
-    head = p.joined(p.strong(f"{_TITLES[found.severity]}. "), found.text)
-    return p.callout(_LOOKS[found.severity], head, *parts)
 
 
 def camera_rows(check: Check) -> tuple[list[str], list[list[str]]]:
@@ -143,7 +131,7 @@ def _plan(check: Check, up: str) -> p.Section:
         plots.append(p.Html(f"<div>{p.heading(title)}{plot}</div>"))
     note = "Lines: the middle of each picture's left and right side. Orange: cameras with a fault."
     return p.section(
-        "Where the cameras stand", p.gallery(plots, smallest=420), p.paragraph(note, small=True), anchor="plan"
+        "Where the cameras stand", p.gallery(plots, size="large"), p.paragraph(note, small=True), anchor="plan"
     )
 
 

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.check.bias import CameraBias
-from kinefit.calibration.check.check import Check
-from kinefit.calibration.check.views import from_others
+from kinefit.diagnostics.bias import CameraBias
+from kinefit.diagnostics.keypoints import Check
+from kinefit.diagnostics.views import from_others
 from kinefit.errors import KinefitError
 from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera, ImageFrame
@@ -48,7 +48,7 @@ def picture_section(check: Check) -> p.Section:
         "ones: distortion."
     )
     return p.section(
-        "Pictures", first, p.gallery(pictures, smallest=240), p.paragraph(second), p.gallery(maps, smallest=240),
+        "Pictures", first, p.gallery(pictures), p.paragraph(second), p.gallery(maps),
         anchor="pictures",
     )  # fmt: skip
 

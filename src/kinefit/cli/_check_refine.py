@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.calibration.check.check import Check
-from kinefit.calibration.check.sensor_fit import SensorFit, marker_index
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, told
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
+from kinefit.diagnostics.keypoints import Check
+from kinefit.diagnostics.sensor_fit import SensorFit, marker_index
 from kinefit.errors import TakeError, command
 from kinefit.geometry.camera import Rig
 
@@ -82,11 +82,11 @@ def _refine(
             remedy="Mend what is named as a fault first.",
         )
     static = read_static_points(points, found.views.rig.names) if points else None
-    accuracy = min(entry.sigma for entry in take.keypoints)
+    sigma = min(entry.sigma for entry in take.keypoints)
     return refine(
         found.views.rig, [k for k in seen.keypoints if k.camera in found.views.rig], load_body(take.body), focal=focal,
         distortion=distortion, time_offsets=time_offsets, static_points=static, height=take.height, up=take.up,
-        accuracy=accuracy,
+        sigma=sigma,
         progress=step,
     )  # fmt: skip
 

@@ -63,7 +63,6 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
         return answer
 
     page = ClickPage(_pictures(take, seen, step), clickable(body), taken, step=step)
-    page.start()
     try:
         _screen.say(f"Click the joints at {page.url} ; Ctrl-C leaves the take without a start.")
         if browser:
@@ -71,7 +70,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
         while not page.done.wait(0.5):
             pass
     finally:
-        page.stop()
+        page.close()
     _screen.say(f"{out}: start written, from {out.with_name(CLICKS)}")
 
 

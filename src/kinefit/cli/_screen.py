@@ -12,9 +12,12 @@ import click
 from kinefit import __version__
 from kinefit.batch.results import Step
 from kinefit.errors import KinefitError
+from kinefit.serving import TOKEN_VARIABLE
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from kinefit.findings import Finding
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
@@ -23,6 +26,7 @@ REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 """Errors of the system for which nobody is to blame but the disk."""
 
 _VERBOSE = "kinefit.verbose"
+_STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
 
 
 def verbose_option(command: Callable) -> Callable:
@@ -34,6 +38,12 @@ def verbose_option(command: Callable) -> Callable:
 
     text = "Show more: the points of every camera, and where an error arose."
     return click.option("-v", "--verbose", is_flag=True, callback=remember, help=text)(command)
+
+
+def token_option(command: Callable) -> Callable:
+    """Add `--token` to a command that opens a server."""
+    text = "Of the page's address: 16 characters or more.  [default: a new one each time]"
+    return click.option("--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT", help=text)(command)
 
 
 def is_verbose() -> bool:
@@ -83,6 +93,18 @@ def tell_error(error: KinefitError) -> None:
     _complain(error.problem, **{"at": where, "try": error.remedy or ""})
     if is_verbose():
         _traceback(error)
+
+
+def tell_finding(found: Finding) -> None:
+    """Print what a check found, how sure that is, and what to do."""
+    from rich.text import Text
+
+    console().print(
+        Text.assemble("\n", (f"{found.severity}: ", _STYLES[found.severity]), found.text), soft_wrap=True
+    )
+    for what, text in (("how sure", found.confidence), ("try", found.remedy)):
+        if text:
+            say(f"   {what}: {text}")
 
 
 def tell_interrupted(told: str) -> None:

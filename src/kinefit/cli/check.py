@@ -10,8 +10,8 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
-    from kinefit.calibration.check.check import Check
     from kinefit.cli._check_refine import Refined
+    from kinefit.diagnostics.keypoints import Check
 
 _EXAMPLES = """\b
 Examples:
@@ -19,7 +19,6 @@ Examples:
   kinefit check take.toml --refine           a better calibration and a take that uses it, beside the old ones
 """
 _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r exchanged")
-_STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
 
 
 @click.command(short_help="Find out what is wrong with a recording; refine its calibration.", epilog=_EXAMPLES)
@@ -93,7 +92,6 @@ def check(
 def _print(found: Check, verbose: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
-    from rich.text import Text
 
     from kinefit.cli._check_page import camera_rows, verdict
 
@@ -101,13 +99,7 @@ def _print(found: Check, verbose: bool) -> None:
     for one in found.findings:
         if one.severity == "good" and not verbose:
             continue
-        _screen.console().print(
-            Text.assemble("\n", (f"{one.severity}: ", _STYLES[one.severity]), one.text), soft_wrap=True
-        )
-        if one.confidence:
-            _screen.say(f"   how sure: {one.confidence}")
-        if one.remedy:
-            _screen.say(f"   try: {one.remedy}")
+        _screen.tell_finding(one)
     good = [one for one in found.findings if one.severity == "good"]
     if good and not verbose:
         _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v says more)")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit evaluate                                 the fusion tracker on all 100 sequences
-  kinefit evaluate --method voodoo                 the published method, as printed
+  kinefit evaluate --method voodoo                 the published method, with three helps
   kinefit evaluate --sensor kinect --count 10      ten sequences, each movement and each person once
 """
 _NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
@@ -25,7 +25,7 @@ _NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
               help="Ten movements by ten people, seen by a depth camera and as face and hands in 2D.")  # fmt: skip
 @click.option("--count", type=click.IntRange(1, 100), default=100, show_default=True, help="Sequences.")
 @click.option("--method", type=click.Choice(["fusion", "live", "voodoo"]), default="fusion", show_default=True,
-              help="The fusion tracker, smoothed or frame by frame; or VooDoo as published.")  # fmt: skip
+              help="The fusion tracker, smoothed or frame by frame; or VooDoo with three helps.")  # fmt: skip
 @click.option("--sensor", type=click.Choice(["tof", "kinect"]), default="tof", show_default=True)
 @click.option("--start", type=click.Choice(["truth", "found"]), default="truth", show_default=True,
               help="First pose: the true one, or found in the first depth image.")  # fmt: skip

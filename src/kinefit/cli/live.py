@@ -41,6 +41,7 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
 @click.option("--page/--no-page", default=True, show_default=True, help="Serve the page and poses by WebSocket.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Of both; 0 for any.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 for all networks.")
+@_screen.token_option
 @click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC.")
 @click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`).")
 @click.option("--json", "lines", metavar="FILE", help="Write every packet as a line; - for the standard output.")
@@ -54,8 +55,8 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
 )
 @_screen.verbose_option
 def live(
-    take: Path, out: Path | None, page: bool, port: int, host: str, vmc: tuple[str, int] | None, lsl: str | None,
-    lines: str | None, speed: float, seconds: float | None, record: bool, verbose: bool,
+    take: Path, out: Path | None, page: bool, port: int, host: str, token: str | None, vmc: tuple[str, int] | None,
+    lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool, verbose: bool,
 ) -> None:
     """Follow a person live, and stream the poses.
 
@@ -63,9 +64,10 @@ def live(
     that fills up with images, depth images or keypoints), they are followed as they see; else what the take recorded is
     replayed at its own speed. Frames that come faster than they can be followed are dropped and counted, never queued.
 
-    The page at http://localhost:8765 shows the person, and programs get the poses there by WebSocket; docs/live.md has
-    the protocol. The session is left in the folder: as a motion for `kinefit export` and `kinefit view`, and, where the
-    built-in detector looked, as a take for `kinefit track`, which fits and smooths it as a whole.
+    The page whose address is printed shows the person, and programs get the poses there by WebSocket; docs/live.md has
+    the protocol, and says who may connect. The session is left in the folder: as a motion for `kinefit export` and
+    `kinefit view`, and, where the built-in detector looked, as a take for `kinefit track`, which fits and smooths it as
+    a whole.
     """
     from kinefit.live.record import MotionRecord
     from kinefit.live.take import folder_of, live_session
@@ -97,9 +99,11 @@ def live(
         if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
             from kinefit.live.receivers.websocket import WebSockets
 
-            served = WebSockets(port, host=host, title=told.name, ask=session.ask)
+            served = WebSockets(port, host=host, token=token, title=told.name, ask=session.ask)
             receivers.append(served)
-            _screen.say(f"page and poses at {served.address}", stderr=quiet)
+            if served.access.warning:
+                _screen.note(f"warning: {served.access.warning}")
+            _screen.say(f"page and poses at {served.url}", stderr=quiet)
     except BaseException:
         for receiver in receivers:
             receiver.close()

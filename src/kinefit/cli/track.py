@@ -120,6 +120,9 @@ def track(
     the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done; the same command
     then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
 
+    Faults of the inputs (a camera that moved, a wrong unit, vertical, focal length or clock, exchanged names, mirrored
+    images) stand on top of what is printed and of report.html, with what to do: `kinefit check` looks closer.
+
     Where keypoints show several people, each has the same results in OUT/person-1, OUT/person-2 and so on.
     """
     from kinefit.readers.take.find import find_take
@@ -173,6 +176,7 @@ def _track_one(
     from kinefit.cli._agreement import print_agreement
     from kinefit.cli._summary import print_files, print_summary
     from kinefit.errors import TrackingError
+    from kinefit.findings import of_provenance
 
     files: dict[str, Path] = {}
     try:
@@ -186,6 +190,8 @@ def _track_one(
         if files and isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
         raise
+    for found in of_provenance(done.motion.provenance):
+        _screen.tell_finding(found)
     for note in done.notes:
         _screen.say(f"note: {note}")
     print_summary(done.motion, points=verbose)

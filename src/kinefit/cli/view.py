@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
+    from kinefit.serving.access import Access
     from kinefit.viewers.show import Recording
 
 _EXAMPLES = """\b
@@ -32,11 +33,13 @@ Examples:
 @click.option("--take", type=click.Path(path_type=Path), help="Take file whose cameras and markers are shown.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other computers look in, too.")
+@_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
 @click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead.")
 @_screen.verbose_option
 def view(
-    sources: tuple[Path, ...], take: Path | None, port: int, host: str, browser: bool, html: Path | None, verbose: bool
+    sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
+    html: Path | None, verbose: bool,
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 
@@ -44,6 +47,7 @@ def view(
     shown beside the first one. Ctrl-C ends it.
     """
     from kinefit.cli._results import check_file
+    from kinefit.serving.access import Access
 
     if html is not None:
         check_file(html, "--html")
@@ -51,7 +55,7 @@ def view(
     if html is not None:
         _write(recording, html)
     else:
-        _serve(recording, port, host, browser)
+        _serve(recording, port, Access(host, token), browser)
 
 
 def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
@@ -155,22 +159,24 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")
         return None
-    accuracy = [entry.sigma for entry in take.keypoints]
-    channels = make_channels(load_body(take.body), seen.rig, keypoints, people, accuracy)
+    sigma = [entry.sigma for entry in take.keypoints]
+    channels = make_channels(load_body(take.body), seen.rig, keypoints, people, sigma)
     return triangulated(channels, np.arange(len(channels.uv)))
 
 
-def _serve(recording: Recording, port: int, host: str, browser: bool) -> None:
+def _serve(recording: Recording, port: int, access: Access, browser: bool) -> None:
     from kinefit.viewers.player import Player
     from kinefit.viewers.stage import open_server, quiet
 
-    server = open_server(port, host=host, label=f"kinefit: {recording.name}")
+    server = open_server(port, access, label=f"kinefit: {recording.name}")
     try:
         player = Player(server, recording)
         player.tick(0.0)
         if port and server.get_port() != port:
             _screen.note(f"Port {port} is in use: another one is taken.")
-        address = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{server.get_port()}"
+        if access.warning:
+            _screen.note(f"warning: {access.warning}")
+        address = access.url(server.get_port())
         _screen.say(f"{recording.name}: {len(recording.times)} frames at {address}  (Ctrl-C ends)")
         if browser:
             click.launch(address)

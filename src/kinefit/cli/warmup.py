@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -17,27 +19,32 @@ Examples:
   kinefit warmup
   KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
 """
+_PARTS = "surfaces", "keypoints", "depth"  # the longest first
+_PROCESSES = 2  # more would compile the kernels that the parts share once more, instead of loading them
 
 
 @click.command(short_help="Compile the kernels now, so that the first track does not wait.", epilog=_EXAMPLES)
 @_screen.verbose_option
 def warmup(verbose: bool) -> None:
     """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
-    begin = perf_counter()
-    with _screen.bars() as step:
-        step("compiling", 0, 3)
-        from kinefit._jit import kernel_folder
-        from kinefit.simulation.warm import warm_depth, warm_keypoints
+    from kinefit._jit import kernel_folder
 
-        warm_keypoints()
-        step("compiling", 1, 3)
-        warm_depth()
-        step("compiling", 2, 3)
-        _surfaces()
-        step("compiling", 3, 3)
+    begin = perf_counter()
+    with _screen.bars() as step, ProcessPoolExecutor(_PROCESSES, multiprocessing.get_context("spawn")) as pool:
+        step("compiling", 0, len(_PARTS))
+        for done, part in enumerate(as_completed([pool.submit(_compile, name) for name in _PARTS]), 1):
+            part.result()
+            step("compiling", done, len(_PARTS))
     kept = kernel_folder()
     where = f"the kernels lie in {kept.parent}" if kept else "none can be kept: set KINEFIT_CACHE"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
+
+
+def _compile(part: str) -> None:
+    """Use the kernels of one kind of take once."""
+    from kinefit.simulation.warm import warm_depth, warm_keypoints
+
+    {"surfaces": _surfaces, "keypoints": warm_keypoints, "depth": warm_depth}[part]()
 
 
 def _surfaces() -> None:
@@ -73,7 +80,7 @@ def _surfaces() -> None:
     for images in states:
         points = tracker.update(images)
     body = load_body("arm_metaballs")
-    follower = Tracker(body, rig, rate=30.0, sensors=[SurfacePointSensor("surface")])
+    follower = Tracker(body, rig, rate=30.0, sensors=[SurfacePointSensor("surface")], up="y")
     follower.start_at(body.usual_state())
     for k in range(3):
         frame = SurfacePointFrame("surface", k / 30.0, points.ids, points.x_world, points.covariance)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels, targets
 from kinefit.geometry.camera import Rig
+from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.rows import Rows
 
 
@@ -19,7 +20,7 @@ def pixel_rows(
     camera: ArrayLike,
     uv: ArrayLike,
     *,
-    sigma: ArrayLike = 8.0,
+    sigma: ArrayLike = KEYPOINT_SIGMA,
 ) -> Rows:
     """Two rows a pixel: g = ∂(u or v)/∂x with distortion, n = g/|g|, r = Δpx/|g|, w = |g|²/σ².
 

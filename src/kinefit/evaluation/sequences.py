@@ -67,7 +67,7 @@ class Sequence:
         return list(zip(self.depth, self.features))
 
     @property
-    def accuracy(self) -> dict[str, float]:
+    def sigma(self) -> dict[str, float]:
         """Standard deviations of the sensors: [m] of depth at the person's distance, [px] of features."""
         distance = float(np.linalg.norm(self.rig["depth"].centre_world - self.truth.Ts_world_root[0, :3, 3]))
         return {"depth": float(self.sensor.sigma(distance)), "colour": _FEATURE_NOISE}

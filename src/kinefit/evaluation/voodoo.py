@@ -222,9 +222,10 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
 def voodoo_method(
     run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
 ) -> Motion:
-    """P2 as printed: parts that move freely, tied by bands; `model` has the true body's tree, default: that body.
+    """P2's method: parts that move freely, tied by bands; `model` has the true body's tree, default: that body.
 
-    The room's floor is known, unless `settings` say otherwise.
+    Unless `settings` say otherwise it has three helps that P2 does not: the room's floor is known, points in the boxes
+    of several limbs go to the nearest surface, and ICP's stop rule is off.
     """
     parts = free_parts(run.truth.body)
     fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings or Settings(floor=_FLOOR))
@@ -242,7 +243,7 @@ def live_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
 
 
 def _tracked(run: Sequence, inputs: Inputs, start: BodyState) -> Tracker:
-    tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, accuracy=run.accuracy, keep=True)
+    tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, sigma=run.sigma, keep=True, up="y")
     tracker.start_at(start)
     for seen in run.seen(inputs):
         tracker.update(seen)

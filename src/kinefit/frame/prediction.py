@@ -30,6 +30,8 @@ class Prediction:
         How long a velocity lasts that nothing confirms; of gear in a closed chain it lasts.
     """
 
+    state_attributes = ("state", "_velocity", "_xx", "_vx", "_vv")  # see `save_state`
+
     def __init__(
         self, body: Body, dt: float, *, angle_acceleration: float, root_acceleration: float, memory: float
     ) -> None:

@@ -8,6 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._records import restore_state, save_state
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import (
@@ -24,7 +25,8 @@ from kinefit.observations import (
 )
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.background import Background
-from kinefit.sensors.base import Measurement, Sensor, named
+from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
+from kinefit.sensors.channel_names import ChannelNames
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.image_lines import ImageLineSensor
 from kinefit.sensors.keypoints import NAME as KEYPOINTS
@@ -36,6 +38,9 @@ from kinefit.sensors.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
+
+MIN_SIGMA, MAX_SIGMA = 1e-5, 1e4
+"""[m] or [px] of a sensor: finer than any marker system, and wider than any image. A weight is 1 / sigma²."""
 
 
 class Sensors:
@@ -83,6 +88,8 @@ class Sensors:
         self._own = frozenset(self._sensors)
         self._backgrounds: dict[str, Background | None] = {rig[name].name: None for name in on_body}
         self.stated: dict[str, NDArray] = {}
+        self._made_of: dict[str, tuple[str, str]] = {}  # of built-in sensors the kind and the name of their frames
+        self._channels = ChannelNames()
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
@@ -112,6 +119,13 @@ class Sensors:
                     out.append(self.keypoints.prepare(pixels, scene))
         return out
 
+    def check_channels(self, matched: Sequence[Matched], scene: Scene) -> None:
+        """ObservationError where sensors of one's own do not keep to their channels, or two use one name."""
+        self._channels.check_step(matched)
+        for m in matched:
+            if m.of_points and (m.sensor in self._own or m.sensor not in self._sensors):
+                self._channels.channels(m, rows_at(m, scene))
+
     @property
     def own(self) -> tuple[Sensor, ...]:
         """Those of one's own, in the order of their names."""
@@ -123,10 +137,11 @@ class Sensors:
         Raises
         ------
         ObservationError
-            No positive number; a sensor of one's own, which has its own.
+            No number from `MIN_SIGMA` to `MAX_SIGMA`; a sensor of one's own, which has its own.
         """
-        if not is_number(sigma) or not 0.0 < sigma < np.inf or isinstance(sigma, bool):
-            raise ObservationError(f"a standard deviation of {sigma} of '{name}'", remedy="Give a positive number.")
+        if not is_number(sigma) or not MIN_SIGMA <= sigma <= MAX_SIGMA or isinstance(sigma, bool):
+            remedy = f"Give a number from {MIN_SIGMA:g} to {MAX_SIGMA:g}, in metres or pixels."
+            raise ObservationError(f"a standard deviation of {sigma} of '{name}'", remedy=remedy)
         if name in self._own:
             raise ObservationError(f"'{name}' is a sensor of one's own", remedy="Change it where it was made.")
         self.sigma[name] = float(sigma)
@@ -148,6 +163,7 @@ class Sensors:
         """The detectors of all cameras."""
         if KEYPOINTS not in self._sensors:
             self._sensors[KEYPOINTS] = self._keypoints(KEYPOINTS)
+            self._made_of[KEYPOINTS] = KeypointFrame.__name__, KEYPOINTS
         sensor = self._sensors[KEYPOINTS]
         assert isinstance(sensor, KeypointSensor)
         return sensor
@@ -178,10 +194,28 @@ class Sensors:
         out._backgrounds, out.stated = self._backgrounds, self.stated
         return out
 
+    def save_state(self) -> dict[str, Any]:
+        """What all of them have learnt, for `restore_state`."""
+        sensors = {name: (self._made_of.get(name), save_state(one)) for name, one in self._sensors.items()}
+        backgrounds = {name: save_state(one) for name, one in self._backgrounds.items() if one is not None}
+        return {"sensors": sensors, "backgrounds": backgrounds}
+
+    def restore_state(self, state: Mapping[str, Any]) -> None:
+        """Have the built-in sensors that others like these had, and know what those had learnt."""
+        makers = {kind.__name__: make for kind, make in self._makers.items()}
+        for name, learnt in state["backgrounds"].items():
+            restore_state(self.background(self.rig[name]), learnt)
+        for name, (made_of, learnt) in state["sensors"].items():
+            if made_of is not None:
+                self._made_of[name], (kind, sensor) = made_of, made_of
+                self._sensors[name] = makers[kind](sensor)
+            restore_state(self._sensors[name], learnt)
+
     def _of_frame(self, frame: Frame) -> Sensor:
         name = sensor_of(frame)
         if name not in self._sensors:
             self._sensors[name] = self._makers[type(frame)](frame.sensor)
+            self._made_of[name] = type(frame).__name__, frame.sensor
         return self._sensors[name]
 
     def _keypoints(self, name: str) -> KeypointSensor:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry import _kernels_camera as kernels
 from kinefit.geometry.se3 import inverse
@@ -86,8 +87,9 @@ class Camera:
             raise self._error(f"matrix {K.shape}, pose {T.shape}", "Give (3, 3) and (4, 4).")
         if not all(np.isfinite(a).all() for a in (K, T, k)):
             raise self._error("a number is not finite", "Calibrate it again, or repair the file.")
-        if self.size[0] < 1 or self.size[1] < 1:
-            raise self._error(f"image size {self.size}", "Give (width, height) in pixels.")
+        if min(self.size) < 1 or self.size[0] * self.size[1] > MAX_IMAGE_PIXELS:
+            remedy = f"Give (width, height) in pixels; images have up to {MAX_IMAGE_PIXELS // 10**6} million pixels."
+            raise self._error(f"image size {self.size}", remedy)
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise self._error(f"focal lengths {K[0, 0]:g}, {K[1, 1]:g} px", "Both must be positive.")
         if K[1, 0] != 0 or np.any(K[2] != (0, 0, 1)):

@@ -50,7 +50,7 @@ class FarFit(NamedTuple):
 
 def coarse_to_fine(
     body: Body, rig: Rig, frames: Sequence[SilhouetteFrame], state: BodyState, *,
-    accuracy: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
+    sigma: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
     smooth: Sequence[Body] = (), settings: TrackSettings | None = None,
 ) -> FarFit:  # fmt: skip
     """Fit silhouettes of one time from a pose that may be tens of degrees off in every joint.
@@ -60,7 +60,7 @@ def coarse_to_fine(
 
     Parameters
     ----------
-    accuracy : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
+    sigma : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
     levels : the last one alone is what the tracker does from frame to frame.
     smooth : the body for each level, such as low-pass approximations of a surface (P1 2.4); default: as it is.
 
@@ -82,7 +82,7 @@ def coarse_to_fine(
             settings, outline=level.side, far=level.far, near=level.near, angle=level.angle, iterations=steps
         )
         first_scene = Scene(own_body, state, rig, samples=own.samples)
-        fits.append((FrameFit(own_body, own), Sensors(rig, 1.0, dict(accuracy or {}), own), first_scene))
+        fits.append((FrameFit(own_body, own), Sensors(rig, 1.0, dict(sigma or {}), own), first_scene))
     best: FarFit | None = None
     for first in range(len(levels) - 1, -1, -1):
         now = state

@@ -7,10 +7,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 
+from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.live.cameras import Clock, ThreadSource
@@ -111,11 +111,12 @@ class ImageFolderStream(FolderSource):
         ObservationError
             An image of another size.
         """
-        image = cv2.imread(str(path))
-        if image is None:
+        try:
+            image = read_picture(path)
+        except FileError:
             return None
         check_size(image.shape[1::-1], self.size, path, f"camera {self.name}")
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return image
 
 
 class DepthFolderStream(FolderSource):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import queue
 import time
@@ -9,6 +10,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from kinefit.bodies import Body, catalogue, load_body
@@ -22,6 +24,7 @@ from kinefit.live.people import LivePerson
 from kinefit.live.replay import REPLAY
 from kinefit.live.seen import SeenRecord
 from kinefit.live.sizing import LiveSize
+from kinefit.live.wishes import Answer, Wish, read_wish
 from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker
@@ -29,6 +32,7 @@ from kinefit.tracking.tracker import Tracker
 _LATEST = 10_000  # steps whose latency is kept
 _PATIENT = 10.0  # [s] for which the other sensors are waited for, where none may be dropped
 _WAIT = 0.25  # [s] at most between looks at what clients ask for
+_MAX_WAITING_WISHES = 64  # of all clients: two seconds of wishes, as one is done a step
 
 
 class Source(Protocol):
@@ -76,7 +80,7 @@ class LiveSession:
     inbox : Inbox
     processed, found : int, steps, and those in which the person was found
     latencies : [s] of the latest steps, from the arrival of the newest frame until all receivers had the pose
-    asked : queue of what clients ask for, see `ask`
+    wishes : queue of what clients ask for, see `ask`
     """
 
     def __init__(
@@ -92,7 +96,8 @@ class LiveSession:
         self.inbox = Inbox(self.sensors, patience=patience)
         self.processed = self.found = 0
         self.latencies: deque[float] = deque(maxlen=_LATEST)
-        self.asked: queue.SimpleQueue[Mapping[str, Any]] = queue.SimpleQueue()
+        self.wishes: queue.Queue[tuple[Wish, Answer]] = queue.Queue(_MAX_WAITING_WISHES)
+        self._replaced: tuple[Body, Wish, Answer] | None = None  # until a step was fitted with the body asked for
         self._off: set[str] = set()
         self._over = False
 
@@ -145,12 +150,9 @@ class LiveSession:
 
     def step(self, arrived: Sequence[Arrived]) -> FrameResult | None:
         """Fit what arrived, and tell receivers."""
-        frames = self._frames(arrived)
-        result = None
+        frames, result = self._fit(*self._sort(arrived))
         if self.seen is not None:
             self.seen.keep(frames)
-        if frames:
-            result = self.tracker.update(frames, float(np.mean([f.time for f in frames])))
         at = max(one.at for one in arrived)
         now = result.time if result is not None else max(one.time for one in arrived)
         poses = np.zeros((0, 4, 4))
@@ -170,18 +172,59 @@ class LiveSession:
             self.change_body(body)
         return result
 
-    def ask(self, wish: Mapping[str, Any]) -> None:
-        """Have something changed before the next step; from any thread.
+    def ask(self, wish: bytes | Mapping[str, Any], answer: Answer = lambda told: None) -> None:
+        """Have something changed before one of the next steps; from any thread.
 
-        {"sensor": name, "use": bool}: whether a sensor takes part; {"sensor": name, "sigma": value}: its standard
-        deviation [px, m]; {"body": name}: another body of the catalogue; {"stop": true}.
+        Parameters
+        ----------
+        wish : as JSON or as a mapping
+            {"sensor": name, "use": bool}: whether a sensor takes part; {"sensor": name, "sigma": value}: its standard
+            deviation [px, m]; {"body": name}: another body of the catalogue; {"stop": true}.
+        answer : takes {"type": "done"} or {"type": "refused", "why": text}, with the wish as "asked"
         """
-        self.asked.put(wish)
+        try:
+            self.wishes.put_nowait((read_wish(wish), answer))
+        except KinefitError as error:
+            answer({"type": "refused", "why": str(error)})
+        except queue.Full:
+            answer({"type": "refused", "why": f"{_MAX_WAITING_WISHES} wishes wait already. Ask again later."})
 
     def change_body(self, body: Body) -> None:
-        """Go on with another body."""
+        """Go on with another body.
+
+        Raises
+        ------
+        KinefitError
+            Of a receiver that cannot show it: the session goes on with the body before.
+        """
+        before = self.tracker.body
         self.tracker.change_body(body)
-        self._hello()
+        try:
+            self._hello()
+        except KinefitError:
+            self.tracker.change_body(before)
+            self._hello()
+            raise
+
+    def _fit(self, frames: list[Any], records: list[Keypoints]) -> tuple[list[Any], FrameResult | None]:
+        """Fit one person's frames; with the body before, where they do not suit the one that a client asked for."""
+        try:
+            of_person, result = self._follow(frames, records)
+        except KinefitError as error:
+            if self._replaced is None:
+                raise
+            (before, wish, answer), self._replaced = self._replaced, None
+            answer(_refused(wish, error))
+            self.change_body(before)
+            return self._follow(frames, records)
+        if of_person:
+            self._replaced = None
+        return of_person, result
+
+    def _follow(self, frames: list[Any], records: list[Keypoints]) -> tuple[list[Any], FrameResult | None]:
+        """Frames with the keypoints of one person of all records, and what they were fitted to."""
+        frames = frames + self.person.frames(records, self.tracker.body, self.tracker.state)
+        return frames, self.tracker.update(frames, float(np.mean([f.time for f in frames]))) if frames else None
 
     def _hello(self) -> None:
         t = self.tracker
@@ -189,8 +232,8 @@ class LiveSession:
         for receiver in self.receivers:
             receiver.hello(t.body, packet)
 
-    def _frames(self, arrived: Sequence[Arrived]) -> list[Any]:
-        """What the tracker takes of it: one person's."""
+    def _sort(self, arrived: Sequence[Arrived]) -> tuple[list[Any], list[Keypoints]]:
+        """Frames for the tracker, and keypoints of all people."""
         images = [one for one in arrived if isinstance(one.seen, np.ndarray) and one.sensor not in self._off]
         records = self.detector(images) if self.detector is not None and images else []
         frames: list[Any] = []
@@ -200,38 +243,35 @@ class LiveSession:
                     records += [seen] if seen.camera not in self._off else []
                 elif seen.sensor not in self._off:
                     frames.append(seen)
-        return frames + self.person.frames(records, self.tracker.body, self.tracker.state)
+        return frames, records
 
     def _listen(self) -> None:
-        """Do what clients asked for; what cannot be done is told to them alone."""
-        while not self.asked.empty():
-            wish = dict(self.asked.get())
-            answer = wish.pop("answer", None)
+        """Do one thing that a client asked for: more would hold up poses."""
+        with contextlib.suppress(queue.Empty):
+            wish, answer = self.wishes.get_nowait()
             try:
-                self._fulfil(wish)
-                told = {"type": "done", "asked": wish}
+                self._fulfil(wish, answer)
             except KinefitError as error:
-                told = {"type": "refused", "asked": wish, "why": str(error)}
-            if answer is not None:
-                answer(told)
-
-    def _fulfil(self, wish: Mapping[str, Any]) -> None:
-        if wish.get("stop") is True:
-            self.stop()
-        elif isinstance(wish.get("body"), str):
-            if wish["body"] not in catalogue():  # no file of this computer
-                raise BodyError(choices("body of the catalogue", wish["body"], catalogue()))
-            self.change_body(load_body(wish["body"]))
-        elif isinstance(wish.get("sensor"), str):
-            name, known = wish["sensor"], self.names
-            if name not in known:
-                raise ObservationError(choices("sensor", name, known))
-            if isinstance(wish.get("use"), bool):
-                (self._off.discard if wish["use"] else self._off.add)(name)
-            elif "sigma" in wish:
-                self.tracker.set_sigma(name, wish["sigma"])
+                answer(_refused(wish, error))
             else:
-                raise ObservationError(f"nothing to change of {name}", remedy='Give "use" or "sigma".')
+                answer({"type": "done", "asked": msgspec.to_builtins(wish)})
+
+    def _fulfil(self, wish: Wish, answer: Answer) -> None:
+        if wish.stop:
+            self.stop()
+        elif wish.body is not None:
+            if wish.body not in catalogue():  # no file of this computer
+                raise BodyError(choices("body of the catalogue", wish.body, catalogue()))
+            before = self._replaced[0] if self._replaced else self.tracker.body
+            self.change_body(load_body(wish.body))
+            self._replaced = before, wish, answer
+        elif wish.sensor not in self.names:
+            raise ObservationError(choices("sensor", str(wish.sensor), self.names))
+        elif wish.sigma is not None:
+            self.tracker.set_sigma(wish.sensor, wish.sigma)
         else:
-            remedy = 'Ask for {"sensor": ..., "use" or "sigma": ...}, {"body": ...} or {"stop": true}.'
-            raise ObservationError(f"{sorted(wish)} is nothing that can be asked for", remedy=remedy)
+            (self._off.discard if wish.use else self._off.add)(wish.sensor)
+
+
+def _refused(wish: Wish, error: KinefitError) -> dict[str, Any]:
+    return {"type": "refused", "asked": msgspec.to_builtins(wish), "why": str(error)}

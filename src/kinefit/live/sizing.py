@@ -16,7 +16,7 @@ from kinefit.bodies import Body
 from kinefit.errors import KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
-from kinefit.observations import KeypointFrame, Keypoints, LiftedFrame
+from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, LiftedFrame
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.warm import warm_keypoints
 from kinefit.tracking.recording import Recording
@@ -118,7 +118,8 @@ def fitted_body(
 ) -> Body:  # fmt: skip
     """The body with the person's lengths, from keypoints of some steps."""
     records = _records(steps)
-    recording = Recording.of_keypoints(rig, records, accuracy=[sigma.get(k.camera, 8.0) for k in records], up=up)
+    sigmas = [sigma.get(k.camera, KEYPOINT_SIGMA) for k in records]
+    recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
     settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
     person = fitted_to_person(
         recording, body, channels_of(recording, body), settings, subject=None, trial=None, height=height, size=True,

@@ -15,6 +15,7 @@ from kinefit.live.cameras import CameraStream, Clock
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
 from kinefit.live.session import Source
+from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.preparing.detecting import Tell, hush, networks
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.take.depth import stated_camera
@@ -24,7 +25,6 @@ from kinefit.readers.take.one_camera import assumed_camera, is_alone
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.take_recording import posed_start
 
-_SIGMA = 8.0  # [px] of the built-in detector's keypoints, as in takes
 _RATE = 30.0  # [Hz] of streams that nothing states a rate of
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
 
@@ -111,7 +111,7 @@ def with_detector(
     folder = networks(None, tell)
     hush(folder)
     detector = LiveDetector(folder, images, rate=rate, people=people, threads=threads)
-    sigma = dict.fromkeys(images, _SIGMA)
+    sigma = dict.fromkeys(images, KEYPOINT_SIGMA)
     own = Rig(tuple(rig[entry.name] for entry in take.cameras))
     recording = Recording(np.zeros(1), rate, own, sigma=sigma, up=take.up, name=take.name)
     return Opened(recording, body, tuple(sources), detector)

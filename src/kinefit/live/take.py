@@ -69,7 +69,7 @@ def live_session(
     if recording.start is not None:
         tracker.start_at(recording.start[1])
     sized = trial is not None or take.start is not None or take.size is False
-    sigma = {k: v for k, v in tracker.accuracy.items() if k in recording.rig.names}
+    sigma = {k: v for k, v in tracker.sigma.items() if k in recording.rig.names}
     size = None if sized or not (opened.detector or take.keypoints) else LiveSize(
         body, recording.rig, sigma=sigma, settings=settings, height=take.height, up=take.up
     )  # fmt: skip

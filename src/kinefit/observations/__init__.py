@@ -20,11 +20,12 @@ from kinefit.observations.frames import (
     SilhouetteFrame,
     sensor_of,
 )
-from kinefit.observations.recordings import Keypoints, MarkerEvent, Markers, SkeletonMotion
+from kinefit.observations.recordings import KEYPOINT_SIGMA, Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.silhouettes import SilhouetteVideo
 from kinefit.observations.surface_points import SurfacePointFrame, SurfacePointVideo
 
 __all__ = [
+    "KEYPOINT_SIGMA",
     "MEDIAPIPE_33",
     "CloudVideo",
     "ColourFrame",

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations.arrays import frozen
 from kinefit.observations.recordings import Keypoints
 
-_MOST_PIXELS = 200_000_000  # of an image; beyond, a size is damaged
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
 _PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"
 MEDIAPIPE_33 = (
@@ -61,12 +61,13 @@ class Detections:
         points, confidence = frozen(self.points), frozen(self.confidence)
         starts, runs = frozen(self.mask_starts, int), frozen(self.mask_runs, np.uint32)
         cells = points.shape[0] * points.shape[1] if points.ndim == 4 else -1
-        fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3] and len(starts) == cells + 1
+        fits = points.shape[2:] == (33, 2) and confidence.shape == points.shape[:3]
+        fits = fits and starts.shape == (cells + 1,) and runs.ndim == 1
         if not fits or starts[0] != 0 or starts[-1] != len(runs) or np.any(np.diff(starts) < 0):
             raise ObservationError(
                 f"detections of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}, "
-                f"{len(starts)} starts of masks and {len(runs)} runs", file=self.source or None,
-                remedy="Give (frames, people, 33, 2), (frames, people, 33) and frames * people + 1 starts.",
+                f"starts of masks {starts.shape} and runs {runs.shape}", file=self.source or None,
+                remedy="Give (frames, people, 33, 2), (frames, people, 33), (frames * people + 1,) starts, (N,) runs.",
             )
         lifted = None if self.lifted is None else frozen(self.lifted)
         if lifted is not None and lifted.shape != (*points.shape[:3], 3):
@@ -76,7 +77,7 @@ class Detections:
             )  # fmt: skip
         ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
         sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
-        if min(self.size) < 1 or pixels > _MOST_PIXELS or np.any(sizes != pixels):
+        if min(self.size) < 1 or pixels > MAX_IMAGE_PIXELS or np.any(sizes != pixels):
             raise ObservationError(
                 f"masks of {', '.join(map(str, np.unique(sizes)[:3])) or 'no'} pixels in images of {self.size}",
                 file=self.source or None, remedy="Give runs that sum up to the image's pixels.",

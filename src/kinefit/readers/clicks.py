@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_bytes, repeated
 from kinefit.errors import FileError
 
+_MAX_NUMBER = 1e9  # frames and pixels; no recording has as many
 _FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}.'
 
 
@@ -33,8 +35,7 @@ class Clicks:
     @property
     def names(self) -> tuple[str, ...]:
         """Landmarks that were clicked in two images or more, in the order of the first clicks."""
-        every = [name for points in self.points.values() for name in points]
-        return tuple(name for name in dict.fromkeys(every) if every.count(name) > 1)
+        return tuple(repeated(name for points in self.points.values() for name in points))
 
     def places(self, camera: str) -> NDArray:
         """(N, 2) [px] of `names` in a camera's image; NaN where not clicked."""
@@ -56,10 +57,8 @@ def read_clicks(path: str | PathLike[str]) -> Clicks:
         Not readable, not JSON, or of another form.
     """
     try:
-        told = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy=_FORM) from error
-    except ValueError as error:
+        told = json.loads(read_bytes(Path(path)))
+    except (ValueError, RecursionError) as error:
         raise FileError(f"is no JSON ({error})", file=path, remedy=_FORM) from error
     try:
         return clicks_of(told)
@@ -72,7 +71,7 @@ def clicks_of(told: Any) -> Clicks:
     if not isinstance(told, dict) or not isinstance(told.get("points"), dict):
         raise FileError("holds no points", remedy=_FORM)
     step = told.get("step", 0)
-    if not isinstance(step, int) or isinstance(step, bool) or step < 0:
+    if not isinstance(step, int) or isinstance(step, bool) or not 0 <= step < _MAX_NUMBER:
         raise FileError(f"step {step!r} is no number of a frame", remedy=_FORM)
     points: dict[str, dict[str, tuple[float, float]]] = {}
     for camera, of in told["points"].items():
@@ -80,8 +79,8 @@ def clicks_of(told: Any) -> Clicks:
             raise FileError("holds no points", place=f"camera {camera}", remedy=_FORM)
         points[camera] = {}
         for name, place in of.items():
-            numbers = isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)
-            if not numbers or not np.isfinite(place).all():
+            pair = isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)
+            if not pair or not all(abs(v) < _MAX_NUMBER for v in place):
                 raise FileError(f"{place!r} is no pixel", place=f"camera {camera}, {name}", remedy=_FORM)
             points[camera][name] = (float(place[0]), float(place[1]))
     return Clicks(step, points)

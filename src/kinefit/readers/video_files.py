@@ -9,6 +9,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._image_headers import MAX_IMAGE_PIXELS
+from kinefit._pictures import check_image_size
 from kinefit.errors import FileError
 
 _FORWARD = 64  # frames that are decoded and dropped rather than sought over
@@ -94,11 +96,34 @@ class VideoFile:
         return stated if stated and (not measured or abs(measured / stated - 1) < 0.02) else measured
 
 
-def _open(path: Path) -> Any:
+def open_container(path: Path) -> Any:
+    """A container opened by FFmpeg, whose decoders refuse frames of more than `MAX_IMAGE_PIXELS`.
+
+    Raises
+    ------
+    FileError
+        Not readable, or a video in it states frames that are too large.
+    """
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), options={"max_pixels": str(MAX_IMAGE_PIXELS)})
     except (av.FFmpegError, OSError, ValueError) as error:
         raise FileError(f"not a readable video, 0 frames ({_reason(error)})", file=path, remedy=_REMEDY) from error
+    try:
+        for codec in (stream.codec_context for stream in container.streams.video):
+            if codec is None:
+                continue
+            check_image_size((codec.width, codec.height), path, "video")
+            if not codec.width * codec.height:  # unknown, or withheld by FFmpeg because it is too large
+                problem = f"a video with frames of no size, or of more than {MAX_IMAGE_PIXELS // 10**6} million pixels"
+                raise FileError(problem, file=path, remedy=_REMEDY)
+    except FileError:
+        container.close()
+        raise
+    return container
+
+
+def _open(path: Path) -> Any:
+    container = open_container(path)
     if not container.streams.video:
         container.close()
         raise FileError("there is no video stream in this file", file=path, remedy="Name a video file.")

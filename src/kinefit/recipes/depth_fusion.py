@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from kinefit._arguments import renamed
 from kinefit.bodies import Body, BodyState
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
@@ -20,14 +21,15 @@ from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
 
+@renamed(accuracy="sigma")
 def depth_fusion(
     steps: Sequence[Sequence[Frame]],
     body: Body,
     rig: Rig,
     *,
     rate: float,
-    accuracy: Mapping[str, float] | None = None,
-    up: str = "y",
+    sigma: Mapping[str, float] | None = None,
+    up: str = "z",
     start: BodyState | None = None,
     size: bool = True,
     settings: TrackSettings | None = None,
@@ -41,7 +43,7 @@ def depth_fusion(
     body : Body with surfaces; of the catalogue, where `size` fits it to the person.
     rig : Rig of all cameras, depth cameras among them.
     rate : float [Hz] of the steps
-    accuracy : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
+    sigma : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
     up : vertical axis of the world
     start : state of the first step; default: sought.
     size : whether the person's size is found from the first depth images (some seconds of one core each).
@@ -55,6 +57,6 @@ def depth_fusion(
         The body is found in none of the first steps.
     """
     recording = Recording.of_frames(
-        steps, rig, rate=rate, sigma=accuracy, up=up, start=None if start is None else (0, start)
+        steps, rig, rate=rate, sigma=sigma, up=up, start=None if start is None else (0, start)
     )
     return track(recording, body, size=size and start is None, smooth=False, settings=settings, progress=progress)

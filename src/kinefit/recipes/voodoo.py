@@ -1,7 +1,7 @@
 """VooDoo: sensors fused in one fit of a body whose joints are elastic bands.
 
 Knoop, Vacek, Dillmann, "Sensor fusion for 3D human body tracking with an articulated 3D body model", ICRA 2006 (P2).
-As printed: every limb moves by its own closed form (Horn) to what is nearest to it, and bands hold the limbs together.
+Every limb moves by its own closed form (Horn) to what is nearest to it, and bands hold the limbs together.
 `recipes.depth_fusion` is what to use; this is what it is compared with.
 """
 
@@ -39,7 +39,7 @@ class Settings:
     body_box, limb_box : float
         Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
     overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
-        "exclusive" is by depth in the boxes, "nearest" by distance to the surface; the paper leaves open which.
+        "exclusive" is by depth in the boxes; "nearest", by distance to the surface, is not in the paper.
     factor, minimum, maximum : sampling factor, and points of a limb at least and at most.
     bound : float
         Pairs that are farther apart do not count.

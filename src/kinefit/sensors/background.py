@@ -29,6 +29,8 @@ class Background:
     wait : int, images
     """
 
+    state_attributes = ("_mean", "_spread", "_count", "_waiting", "_bound", "_variance", "_empty", "_turn")
+
     def __init__(self, camera: Camera, sigma: float, wait: int) -> None:
         self.camera, self.wait, self._sigma = camera, wait, sigma
         width, height = camera.size

@@ -102,7 +102,7 @@ class Matched(ABC):
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
     turns : {segment: (3,) [rad] in its frame}, one standard deviation by which all that it says of a segment's surface
         is turned against the bone, for as long as the take lasts
-    places : (M,) set and name of the body's points that its `Rows` number by group, "" for landmarks, where every row
+    places : (M,) set and name of the body's points that these channels are of, "" for landmarks, where every row
         says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
     cameras : (M,) number in the rig of the camera that sees each of these points; empty where none does.
     """
@@ -120,6 +120,16 @@ class Matched(ABC):
     def key(self) -> bytes:
         """The same for matches that make the same rows: what shows a fit that nothing discrete changes any more."""
         return b""
+
+    @property
+    def channels(self) -> Sequence[str] | None:
+        """(M,) names, each once, of what the measurement ids of its rows (`Rows.group`; without ids, each row) are of.
+
+        Such as a marker, or a keypoint in a camera: a name means the same all through the take, whatever else is seen.
+        By default those of `places`. None numbers the channels: ids then must be the same whenever there are rows.
+        Where `of_points` is False, segments are the channels.
+        """
+        return None if self.places is None else [f"{of} {name}" if of else name for of, name in self.places]
 
     @abstractmethod
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
@@ -206,10 +216,12 @@ class Sensor(ABC):
     ----------
     name : as frames name it in `sensor`
     unknowns : {name: Unknown} of its own that a subject fit estimates
+    state_attributes : names of the attributes that change while it tracks; checkpoints keep those of kinefit's sensors
     """
 
     name: str
     unknowns: Mapping[str, Unknown] = {}
+    state_attributes: Sequence[str] = ()
 
     @abstractmethod
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
@@ -233,11 +245,13 @@ class RowsOf(Matched):
     make : scene -> rows
     about : further arguments of it
     labels : array, optional; what is discrete of the match, such as which point has which name: its `key`
+    channels : names of the rows' measurement ids, see `Matched`
     """
 
     make: Any
     about: Mapping[str, Any] = field(default_factory=dict)
     labels: ArrayLike | None = None
+    channels: Sequence[str] | None = None  # type: ignore[override]
 
     @property
     def key(self) -> bytes:

@@ -93,7 +93,6 @@ class DepthImageMeasurement(Measurement):
 
     Attributes
     ----------
-    camera : Camera of `depth`
     sigma : float [m] standard deviation of a depth
     box : (3,), (3,) [m] corners of what is about the body
     is_compact : bool, whether only the part about the body is kept.
@@ -106,7 +105,7 @@ class DepthImageMeasurement(Measurement):
         if frame.size != camera.size:
             problem = f"depth images of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
             raise ObservationError(problem, remedy="Give the camera of these images, or camera.scaled(size).")
-        self.sensor, self.time, self.of, self.camera, self.sigma = of.name, frame.time, of, camera, of.sigma
+        self.sensor, self.time, self.of, self.sigma, self._step = of.name, frame.time, of, of.sigma, 1
         vertices, corners = surface.posed(scene.state), np.empty((2, 3))
         kernels.box(vertices, corners)
         self.box = corners[0] - s.reach, corners[1] + s.reach
@@ -124,6 +123,11 @@ class DepthImageMeasurement(Measurement):
         self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
         patches = surface.areas.sum() / (s.patch**2 * max(len(surface.samples), 1))
         self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is measured by both
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of `depth`."""
+        return self.of.coarse(self._step)
 
     @property
     def depth(self) -> NDArray:
@@ -218,7 +222,7 @@ class DepthImageMeasurement(Measurement):
         out._share = np.minimum(thin * self._share[::thin], 1.0).astype(np.float32)
         (top, left), (bottom, right) = self._window
         step = max(int(np.ceil(np.sqrt((bottom - top) * (right - left) / _MOST_PIXELS))), 1)
-        out.camera, first = self.of.coarse(step), (step - 1) // 2
+        out._step, first = step, (step - 1) // 2
         out._at = max(-((first - top) // step), 0), max(-((first - left) // step), 0)
         end = -((first - bottom) // step), -((first - right) // step)
         out._kept = self._kept[first::step, first::step][out._at[0] : end[0], out._at[1] : end[1]].copy()

@@ -93,6 +93,11 @@ class DisplacedMatched(Matched):
         return self.matched.shows_surface
 
     @property
+    def channels(self) -> Sequence[str] | None:
+        """As of the sensor."""
+        return self.matched.channels
+
+    @property
     def turns(self) -> Mapping[int, NDArray]:  # type: ignore[override]
         """As of the sensor, in the frames of the segments."""
         return self.matched.turns

@@ -110,6 +110,11 @@ class ImageLineMatched(Matched):
         """Name of the sensor."""
         return self.measurement.sensor
 
+    @property
+    def channels(self) -> Sequence[str]:
+        """All lines of the sensor."""
+        return self.measurement.titles
+
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a landmark: its pixel should lie on the image line; one robust weight a line."""
         m = self.measurement

@@ -61,11 +61,9 @@ class Layout:
     @cached_property
     def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
         """Of each source its label, its channels, and their names and segments."""
-        out = []
-        for q, label in enumerate(self.channels.sources):
-            mine = np.flatnonzero(self.channels.source == q)
-            out.append((label, mine, tuple(self.points.names[k] for k in mine), self.points.segments[mine]))
-        return out
+        points, sources = self.points, self.channels.sources
+        of = [np.flatnonzero(self.channels.source == q) for q in range(len(sources))]
+        return [(s, k, tuple(points.names[i] for i in k), points.segments[k]) for s, k in zip(sources, of)]
 
     @cached_property
     def trunk(self) -> NDArray:
@@ -98,6 +96,11 @@ class Layout:
         c = self.channels
         known = [(name, point) for name, span in c.sets.items() for point in c.points.names[span]]
         return tuple(known[k] for k in c.column)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """(N,) source and point of every channel."""
+        return tuple(f"{self.channels.sources[q]} {name}" for q, name in zip(self.channels.source, self.points.names))
 
     @staticmethod
     def _of(channels: Channels) -> PointSet:
@@ -242,6 +245,11 @@ class KeypointMatched(Matched):
     def places(self) -> Sequence[tuple[str, str]] | None:  # type: ignore[override]
         """Of every channel; None where other rows than those of pixels take part."""
         return None if self.hidden else self.measurement.layout.places
+
+    @property
+    def channels(self) -> Sequence[str]:
+        """Of every channel its source and point."""
+        return self.measurement.layout.names
 
     @property
     def cameras(self) -> NDArray | None:  # type: ignore[override]

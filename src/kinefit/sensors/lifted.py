@@ -143,6 +143,11 @@ class LiftedMatched(Matched):
         """Name of the sensor."""
         return self.measurement.sensor
 
+    @property
+    def channels(self) -> Sequence[str]:
+        """The landmarks."""
+        return self.measurement.names
+
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """A row a landmark: its depth behind the middle of the hips."""
         m = self.measurement

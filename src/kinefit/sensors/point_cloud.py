@@ -67,7 +67,7 @@ class PointCloudMeasurement(Measurement):
     def __init__(self, of: PointCloudSensor, frame: PointCloud, scene: Scene) -> None:
         s = of.settings
         self.sensor, self.time, self.sigma, self._eye = of.name, frame.time, of.sigma, frame.viewpoint
-        self._camera = of.camera
+        self.of = of
         self._segment = None if frame.segment is None else np.int64(scene.body.tree.segment(frame.segment))
         self._certain = frame.on_body or frame.segment is not None
         x, vertices = frame.points, scene.surface.posed(scene.state)
@@ -78,6 +78,10 @@ class PointCloudMeasurement(Measurement):
         cells = np.floor(np.clip(self.points, -1e6, 1e6) / s.patch).astype(np.int64)
         patches = len(np.unique(cells @ _PRIMES))
         self._point_sigma = of.sigma * np.sqrt(max(len(self.points) / max(patches, 1), 1.0))
+
+    @property
+    def _camera(self) -> Camera | None:
+        return self.of.camera
 
     def match(self, scene: Scene, reach: float) -> PointCloudMatched:
         """Nearest points of the surface; for points known to be the body's twice as far."""

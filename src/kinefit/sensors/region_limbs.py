@@ -7,6 +7,9 @@ eq. 8, for several regions). It needs no correspondences, and tells poses apart 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,9 +36,16 @@ class Limbs:
     body : Body
     mesh : of its skin
     label : (T,) part of the body that each face belongs to
+    drawn : state of `random` to go on from; default: that of its seed
+
+    Attributes
+    ----------
+    random : what poses are drawn from
     """
 
-    def __init__(self, body: Body, mesh: BodyMesh | SkinnedMesh, label: NDArray) -> None:
+    def __init__(
+        self, body: Body, mesh: BodyMesh | SkinnedMesh, label: NDArray, drawn: Mapping[str, Any] | None = None
+    ) -> None:
         tree, x = body.tree, mesh.vertices
         cell = ((x - x.min(axis=0)) / (float(np.ptp(x, axis=0).max()) / _CELLS)).astype(np.int64)
         key = np.column_stack([mesh.segment, cell])
@@ -52,7 +62,9 @@ class Limbs:
         self.segments = [np.flatnonzero(root == s) for s in np.flatnonzero(tree.parents == 0)]
         self.coordinates = [np.flatnonzero(np.isin(tree.owners, limb)) for limb in self.segments]
         self._canvases: dict[tuple[int, int], Canvas] = {}
-        self._random = np.random.default_rng(7)
+        self.random = np.random.default_rng(7)
+        if drawn is not None:
+            self.random.bit_generator.state = drawn
 
     def sought(self, limb: int, state: BodyState, others: list[BodyState], seen: Coloured, camera: Camera) -> BodyState:
         """The state in which a limb explains an image best; all but the limb as given.
@@ -65,7 +77,7 @@ class Limbs:
         tree, own = self.body.tree, self.coordinates[limb]
         lower, upper = np.maximum(tree.lower[own], -np.pi), np.minimum(tree.upper[own], np.pi)
         usual, spread = tree.usual[own], np.minimum(tree.spread[own], 1.5)
-        now, R = state.angles[own], self._random
+        now, R = state.angles[own], self.random
         pool = [now[None], *(o.angles[own][None] for o in others), now + _WIDE * R.normal(size=(_DRAWS, len(own))),
                 usual + spread * R.normal(size=(_DRAWS, len(own)))]  # fmt: skip
         angles = np.clip(np.concatenate(pool), lower, upper)

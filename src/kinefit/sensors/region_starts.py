@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,13 @@ class Starts:
     scene : Scene with the body
     label : (T,) part of the body that each face of its skin belongs to
     settings : TrackSettings
+    searches : of limbs: number and time [s] of the last one, and the state of its random numbers; written in place
     """
 
-    def __init__(self, scene: Scene, label: NDArray, settings: TrackSettings) -> None:
+    def __init__(self, scene: Scene, label: NDArray, settings: TrackSettings, searches: dict[str, Any]) -> None:
         self._body, self._mesh, self._label = scene.body, scene.surface.morphing.mesh, label
         self._jointed = len(scene.body.tree.segments) > 1
-        self._settings, self._turn, self._sought = settings, 0, -np.inf
+        self._settings, self._searches = settings, searches
 
     @cached_property
     def _seeker(self) -> Seeker:
@@ -46,7 +48,7 @@ class Starts:
 
     @cached_property
     def _limbs(self) -> Limbs:
-        return Limbs(self._body, self._mesh, self._label)
+        return Limbs(self._body, self._mesh, self._label, self._searches.get("random"))
 
     def whole(
         self, scene: Scene, camera: Camera, seen: Coloured, information: NDArray | None, told: Evidence
@@ -67,14 +69,15 @@ class Starts:
         ----------
         found : the state that was found, of which `told` says how it agrees
         """
-        limbs, flips, s = self._limbs, self._flips, self._settings
-        if not limbs.segments or abs(time - self._sought) < s.search_every - 1e-6:
+        limbs, flips, s, last = self._limbs, self._flips, self._settings, self._searches
+        if not limbs.segments or abs(time - last.get("time", -np.inf)) < s.search_every - 1e-6:
             return []
-        self._sought, self._turn = time, self._turn + 1
+        last["time"], last["number"] = time, last.get("number", 0) + 1
         poor = [k for k, limb in enumerate(limbs.segments) if (told.quality[limb] < BELIEVED).any()]
         turns = poor or range(len(limbs.segments))
-        limb = turns[self._turn % len(turns)]
+        limb = turns[last["number"] % len(turns)]
         near = flips.near(scene.state, information, found, camera)[: s.regions.flips]
         sought = limbs.sought(limb, found, list(flips.of(found, camera)), seen, camera)
+        last["random"] = limbs.random.bit_generator.state
         leapt = [sought] if np.abs(sought.angles - found.angles).max() > 0.0 else []
         return [*near, *leapt, *flips.untwisted(found, limbs.segments[limb])]

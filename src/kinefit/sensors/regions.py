@@ -64,18 +64,18 @@ class RegionSensor(Sensor):
     settings : TrackSettings
     """
 
+    state_attributes = ("sigma", "_stated", "colours", "ratios", "reach", "_known", "_learnt", "_searches")
+
     def __init__(self, camera: Camera, sigma: float | None, settings: TrackSettings) -> None:
-        self.name, self.camera = f"region {camera.name}", camera
         self.sigma, self._stated = settings.region if sigma is None else sigma, sigma is not None
-        self.settings, self.regions = settings, settings.regions
-        self.bins, self.count = colour_bins(self.regions.space, self.regions.levels)
-        self.colours = RegionColours.none(self.count, self.regions)
+        self.name, self.camera, self.settings = f"region {camera.name}", camera, settings
+        self.bins, self.count = colour_bins(settings.regions.space, settings.regions.levels)
+        self.regions, self.colours = settings.regions, RegionColours.none(self.count, settings.regions)
         self.ratios: Ratios | None = None
-        self.reach = _WIDE  # [px] how far from where it is expected the contour may be
+        self.reach, self._searches = _WIDE, dict[str, Any]()  # [px] how far off the contour may be; of `Starts`
         self._parts: Parts | None = None
         self._starts: Starts | None = None
-        self._known = False  # whether colours were counted where the body was found
-        self._learnt = -np.inf  # [s] when colours were blended in last
+        self._known, self._learnt = False, -np.inf  # colours were counted of the body; [s] when they were last
 
     def parts(self, scene: Scene) -> Parts:
         """Parts of the body that have colours of their own."""
@@ -86,7 +86,7 @@ class RegionSensor(Sensor):
     def starts(self, scene: Scene) -> Starts:
         """What the body is sought with."""
         if self._starts is None:
-            self._starts = Starts(scene, self.parts(scene).label, self.settings)
+            self._starts = Starts(scene, self.parts(scene).label, self.settings, self._searches)
         return self._starts
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
@@ -299,8 +299,7 @@ class RegionMeasurement(Measurement):
 
     def _alone(self, scene: Scene) -> bool:
         """Whether nothing else was measured of a body of rigid parts: its colours alone then tell where limbs are."""
-        rigid = scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1
-        return rigid and len(scene.measurements) == 1
+        return scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1 and len(scene.measurements) == 1
 
     def better(self, new: Scene, old: Scene) -> bool | None:
         """Of a body of parts: whether the colours of all its pixels say so."""
@@ -343,7 +342,7 @@ class RegionMeasurement(Measurement):
         out = copy(self)
         if self.image is not None and self.seen is not None and self._lines is not None:
             out.seen = kept(self.seen, self._lines, _JUDGED * self.of.regions.half, self.of.regions.most)
-        out.image, out._last, out._lines, out._told = None, None, None, None
+        out.image = None
         return out
 
     def __getstate__(self) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from kinefit.images.regions import RegionSettings
 from kinefit.losses import Loss, geman_mcclure
+from kinefit.observations import KEYPOINT_SIGMA
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class TrackSettings:
     patch: float = 0.05
     render_every: int = 4
     depth: float = 0.01
-    pixel: float = 4.0
+    pixel: float = KEYPOINT_SIGMA
     marker: float = 0.005
     silhouette: float = 4.0
     region: float = 0.5

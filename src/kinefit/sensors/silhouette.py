@@ -80,7 +80,6 @@ class SilhouetteMeasurement(Measurement):
 
     Attributes
     ----------
-    camera : Camera of the small image in which outlines are compared; rows see it where the scene's rig has it
     mask : (h, w) uint8 of that image
     outline : (4, M) u, v [px] and unit normals of its outline
     sigma : float [px] there
@@ -92,7 +91,7 @@ class SilhouetteMeasurement(Measurement):
         if frame.size != of.camera.size:
             problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {of.camera.size}"
             raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
-        self.sensor, self.time, self.of, self.camera, self.sigma = of.name, frame.time, of, of.small, of.sigma
+        self.sensor, self.time, self.of, self.sigma = of.name, frame.time, of, of.sigma
         mask = frame.mask
         if of.scale < 1.0:
             mask = cv2.resize(mask, self.camera.size, interpolation=cv2.INTER_AREA)
@@ -117,6 +116,11 @@ class SilhouetteMeasurement(Measurement):
         # Over a patch of the surface the errors of an outline are alike, and every place is measured from both sides.
         share = min(_SPACING / (of.settings.patch * self.pixels_per_metre), 1.0)
         self._row_sigma = self.sigma / np.sqrt(share / 2.0)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera with the image in which outlines are compared."""
+        return self.of.small
 
     def _parted(self, mask: NDArray, scene: Scene) -> NDArray:
         """(h, w) bool, where the silhouette is another person's."""

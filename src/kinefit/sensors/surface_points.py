@@ -40,6 +40,8 @@ class SurfacePointSensor(Sensor):
     most : int, points that are used at a time, spread evenly
     """
 
+    state_attributes = ("anchors", "turns", "_last", "_waited")
+
     def __init__(self, name: str, *, slide: float = 0.01, most: int = 400) -> None:
         if not (0 < slide < np.inf) or most < 1:
             raise ObservationError(f"a slide of {slide} m, {most} points", remedy="Give positive numbers.")

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import io
-import os
-import pickle
 import tempfile
 import weakref
 from array import array
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import IO, Any, Generic, TypeVar, overload
+from collections.abc import Iterable, Sequence
+from typing import Any, Generic, TypeVar, overload
 
-import numpy as np
-
-from kinefit.bodies import Body
-from kinefit.errors import ObservationError
-from kinefit.geometry.camera import Camera, Rig
-from kinefit.sensors.base import Sensor
-from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import Layout
-from kinefit.sensors.settings import TrackSettings
+from kinefit._records import RecordFile
+from kinefit.errors import ExportError
+from kinefit.smoothing.record_classes import CODEC
 
 T = TypeVar("T")
 
@@ -31,49 +20,95 @@ IN_MEMORY = 16 * 2**20
 STRETCH = 2000
 """Frames of which arrays over all channels are made at once."""
 
-_OF_ALL_FRAMES = Body, Sensor, Camera, Rig, Channels, Layout, TrackSettings
-_PLAIN = {
-    tuple, list, dict, set, frozenset, str, bytes, bytearray, int, float, bool, complex, type(None), np.ndarray,
-    np.dtype, pickle.PickleBuffer,
-}  # fmt: skip
-
 
 def stretches(frames: int) -> list[slice]:
     """Of a take, so long that what is computed of all channels in one stays small."""
     return [slice(start, min(start + STRETCH, frames)) for start in range(0, max(frames, 1), STRETCH)]
 
 
-def _goes_along(kind: type) -> bool:
-    """Whether things of a type are written; others stay as they are."""
-    if kind in _PLAIN or issubclass(kind, np.generic | np.dtype):
-        return True
-    return kind.__module__.startswith("kinefit.") and not issubclass(kind, _OF_ALL_FRAMES)
+class Store:
+    """A file of records, and the objects that they refer to.
+
+    Records hold arrays and the classes of `record_classes`. All other objects (bodies, sensors, cameras, measurements
+    of a sensor of one's own) stay in memory as they are.
+
+    Parameters
+    ----------
+    in_memory : bytes up to which no file is made; default `IN_MEMORY`
+    records : file that stays; default: a temporary one
+    """
+
+    def __init__(self, in_memory: int | None = None, *, records: RecordFile | None = None) -> None:
+        if records is None:
+            file = tempfile.SpooledTemporaryFile(max(IN_MEMORY if in_memory is None else in_memory, 1))
+            weakref.finalize(self, file.close)
+            records = RecordFile(file)
+        self._records, self._shared, self._numbers = records, list[Any](), dict[int, int]()
+
+    def write(self, thing: Any, tag: int = 0, number: int = 0) -> int:
+        """The byte at which an object is written; tag and number as of `RecordFile.append`.
+
+        Raises
+        ------
+        ExportError
+            No room for it.
+        """
+        try:
+            return self._records.append(CODEC.encode(thing, self._refer), tag, number)
+        except OSError as error:
+            raise self._full(error) from error
+
+    def read(self, at: int) -> Any:
+        """What was written at a byte: a copy.
+
+        Raises
+        ------
+        FileError
+            It is damaged.
+        """
+        return CODEC.decode(self._records.read(at), self._resolve, name=self._records.name)
+
+    def _full(self, error: OSError) -> ExportError:
+        remedy = "Set TMPDIR to a folder with more room: up to 1 MB for each frame with depth or silhouettes."
+        return ExportError(f"frames cannot be kept: {error.strerror}", file=tempfile.gettempdir(), remedy=remedy)
+
+    def _refer(self, thing: Any) -> int | str:
+        number = self._numbers.get(id(thing))
+        if number is None:
+            number = self._numbers[id(thing)] = len(self._shared)
+            self._shared.append(thing)
+        return number
+
+    def _resolve(self, reference: int | str) -> Any:
+        return self._shared[reference]  # type: ignore[index]
 
 
 class Spool(Sequence[T], Generic[T]):
     """Records of many frames, read back one by one; what is read is a copy.
 
-    Arrays and kinefit's own records are written. What belongs to all frames (bodies, sensors, cameras), and objects of
-    classes that are not kinefit's, such as measurements of a sensor of one's own, stay in memory as they are. The file
-    lies in the system's temporary folder (`TMPDIR`), without a name where the system allows it, and is gone with the
-    spool or the process.
+    The file lies in the system's temporary folder (`TMPDIR`), without a name where the system allows it, and is gone
+    with the spool or the process.
 
     Parameters
     ----------
     things : to begin with
-    in_memory : bytes up to which no file is made; default `IN_MEMORY`
-    file : that records go to from the first on, and that stays; default: a temporary one
+    in_memory : see `Store`
+    store : that records go to, of several spools; default: one of its own
+    tag : of its records there
+    places : bytes at which records begin that are in the store already
     """
 
-    def __init__(self, things: Iterable[T] = (), *, in_memory: int | None = None, file: Path | None = None) -> None:
-        self._store = _Store(IN_MEMORY if in_memory is None else in_memory, file)
-        self._places = array("q")  # first byte and number of bytes, one after the other
-        self._last: tuple[tuple[int, int], T] | None = None
+    def __init__(
+        self, things: Iterable[T] = (), *, in_memory: int | None = None, store: Store | None = None, tag: int = 0,
+        places: Iterable[int] = (),
+    ) -> None:  # fmt: skip
+        self._store, self._tag, self._places = store or Store(in_memory), tag, array("q", places)
+        self._last: tuple[int, T] | None = None
         for thing in things:
             self.append(thing)
 
     def __len__(self) -> int:
-        return len(self._places) // 2
+        return len(self._places)
 
     @overload
     def __getitem__(self, which: int) -> T: ...
@@ -84,147 +119,24 @@ class Spool(Sequence[T], Generic[T]):
     def __getitem__(self, which: int | slice) -> T | Spool[T]:
         if isinstance(which, slice):
             return self.chosen(range(len(self))[which])
-        place = self._place(which)
+        place = self._places[which]
         if self._last is None or self._last[0] != place:
             self._last = place, self._store.read(place)
         return self._last[1]
 
     def __setitem__(self, which: int, thing: T) -> None:
-        self._place(which)
-        self._places[2 * which : (2 * which + 2) or None] = array("q", self._store.write(thing))
+        self._places[which] = self._store.write(thing, self._tag)
 
-    def append(self, thing: T) -> None:
-        """Add one at the end.
+    def append(self, thing: T, number: int = 0) -> None:
+        """Add one at the end, with a number of its own for whoever scans the file.
 
         Raises
         ------
-        ObservationError
+        ExportError
             No room in the temporary folder.
         """
-        self._places.extend(self._store.write(thing))
+        self._places.append(self._store.write(thing, self._tag, number))
 
     def chosen(self, which: Iterable[int]) -> Spool[T]:
         """Some of them, in this order, in the same file."""
-        out: Spool[T] = object.__new__(Spool)
-        out._store, out._last = self._store, None
-        out._places = array("q", [number for i in which for number in self._place(i)])
-        return out
-
-    def _place(self, which: int) -> tuple[int, int]:
-        if not -len(self) <= which < len(self):
-            raise IndexError(f"record {which} of {len(self)}")
-        which %= len(self)
-        return self._places[2 * which], self._places[2 * which + 1]
-
-    def state(self) -> SpoolState:
-        """What there is beside the file, for `restore`; what was appended is in the file then, whatever happens."""
-        self._store.flush()
-        return SpoolState(bytes(self._places), tuple(self._store.shared))
-
-    def restore(self, state: SpoolState) -> bool:
-        """Have the records of this spool's file that were there at a state, and no others; False if it is damaged."""
-        places = array("q")
-        places.frombytes(state.places)
-        if not self._store.cut(places[-2] + places[-1] if places else 0, state.shared):
-            return False
-        self._places, self._last = places, None
-        return True
-
-
-@dataclass(frozen=True, eq=False)
-class SpoolState:
-    """Where records lie in a file, and the objects that they refer to."""
-
-    places: bytes
-    shared: tuple[Any, ...]
-
-
-def _kept(number: int) -> Any:
-    """Stands in a record for a thing that was not written; `_Unpickler` knows which."""
-    raise LookupError(f"thing {number} of a record")
-
-
-class _Pickler(pickle.Pickler):
-    """Writes a record, with a number in place of each thing that is not written."""
-
-    def __init__(self, file: io.BytesIO, number: Callable[[Any], int | None]) -> None:
-        super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self._number = number
-
-    def reducer_override(self, thing: Any) -> Any:
-        number = None if thing is _kept else self._number(thing)
-        return NotImplemented if number is None else (_kept, (number,))
-
-
-class _Unpickler(pickle.Unpickler):
-    """Reads a record, with the things that were not written by their numbers."""
-
-    def __init__(self, file: io.BytesIO, shared: Sequence[Any]) -> None:
-        super().__init__(file)
-        self._shared = shared
-
-    def find_class(self, module: str, name: str) -> Any:
-        return self._shared.__getitem__ if name == _kept.__name__ else super().find_class(module, name)
-
-
-class _Store:
-    """A file of records, and what they refer to."""
-
-    def __init__(self, in_memory: int, file: Path | None = None) -> None:
-        self._file: IO[bytes]
-        if file is None:
-            self._file = tempfile.SpooledTemporaryFile(max(in_memory, 1))
-        else:
-            self._file = open(file, "r+b" if file.exists() else "w+b")
-        self._end = 0
-        self.shared: list[Any] = []
-        self._numbers: dict[int, int] = {}
-        self._written: dict[type, bool] = {}
-        weakref.finalize(self, self._file.close)
-
-    def flush(self) -> None:
-        """Have all that was written in the file."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
-
-    def cut(self, end: int, shared: Iterable[Any]) -> bool:
-        """Leave out what comes after so many bytes; False where there are not so many."""
-        if self._file.seek(0, os.SEEK_END) < end:
-            return False
-        self._file.truncate(end)
-        self._end, self.shared = end, list(shared)
-        self._numbers = {id(thing): k for k, thing in enumerate(self.shared)}
-        return True
-
-    def write(self, thing: Any) -> tuple[int, int]:
-        """Where it was written: first byte, and how many."""
-        buffer = io.BytesIO()
-        _Pickler(buffer, self._number).dump(thing)
-        data, place = buffer.getbuffer(), (self._end, buffer.tell())
-        try:
-            self._file.seek(self._end)
-            self._file.write(data)
-        except OSError as error:
-            remedy = "Set TMPDIR to a folder with more room: up to 1 MB for each frame with depth or silhouettes."
-            raise ObservationError(
-                f"measurements cannot be kept: {error.strerror}", file=tempfile.gettempdir(), remedy=remedy
-            ) from error
-        self._end += place[1]
-        return place
-
-    def read(self, place: tuple[int, int]) -> Any:
-        self._file.seek(place[0])
-        return _Unpickler(io.BytesIO(self._file.read(place[1])), self.shared).load()
-
-    def _number(self, thing: Any) -> int | None:
-        """Of what is kept as it is; None for what is written."""
-        kind = type(thing)
-        if kind not in self._written:
-            self._written[kind] = _goes_along(kind)
-        if self._written[kind]:
-            return None
-        number = self._numbers.get(id(thing))
-        if number is None:
-            number = self._numbers[id(thing)] = len(self.shared)
-            self.shared.append(thing)
-        return number
+        return Spool(store=self._store, tag=self._tag, places=[self._places[i] for i in which])

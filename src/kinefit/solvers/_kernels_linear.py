@@ -15,6 +15,12 @@ import numpy as np
 
 from kinefit._jit import jit
 
+LEAST_DAMPING = 1e-12
+"""Least λ, as a share of H's mean diagonal: without it λ falls to 0 and never grows again. 1e-15 to 1e-6 do as well."""
+
+_MAX_STOPS = 4  # rounds of stopping coordinates at limits; 8 save no step, 1 needs 14 % more where limits are active
+_ROUNDING = 1e-15  # share of angle and limit by which the way to a limit is longer; `retract` ends at the limit itself
+
 
 @jit
 def pack(H, chain, depth, C):
@@ -70,15 +76,11 @@ def solve_tree(L, chain, depth, x):
 
 
 @jit
-def hold(angles, lower, upper, locked, chain, depth, C, g):
-    """Take degrees of freedom out of a step: locked ones, and those at a limit that the gradient pushes out of."""
+def hold(held, chain, depth, C, g):
+    """Take degrees of freedom `held` (n,) out of a step: their rows and columns of C become the identity's, g zero."""
     n = g.size
     for k in range(n):
-        stop = locked[k]
-        if k >= 6 and not stop:
-            d = k - 6
-            stop = (angles[d] <= lower[d] and g[k] < 0.0) or (angles[d] >= upper[d] and g[k] > 0.0)
-        if stop:
+        if held[k]:
             t = depth[k]
             g[k] = 0.0
             for i in range(t):
@@ -91,32 +93,83 @@ def hold(angles, lower, upper, locked, chain, depth, C, g):
 
 @jit
 def damped_step(C, g, damping, chain, depth, angles, lower, upper, locked, L, delta):
-    """δ of (H + λ) δ = g with limits held; returns the predicted fall of the cost, negative if that failed."""
+    """δ of (H + λ) δ = g within limits; returns the predicted fall of the cost, negative if that failed.
+
+    Coordinates that are locked, or at a limit that the gradient pushes out of, stay. Coordinates that the step would
+    take beyond a limit end at it, and the step of the others is solved anew: clipping alone makes most such steps bad.
+    """
     n = g.size
-    for i in range(n):
-        for t in range(depth[i] + 1):
-            L[i, t] = C[i, t]
-        delta[i] = g[i]
-    hold(angles, lower, upper, locked, chain, depth, L, delta)
-    for i in range(n):
-        L[i, depth[i]] += damping
-    if not factor_tree(L, chain, depth):
-        return -1.0
-    solve_tree(L, chain, depth, delta)
+    held, way, stops = np.empty(n, np.bool_), np.zeros(n), 0
+    for k in range(n):
+        held[k] = locked[k]
+        if k >= 6:
+            d = k - 6
+            held[k] |= (angles[d] <= lower[d] and g[k] < 0.0) or (angles[d] >= upper[d] and g[k] > 0.0)
+    for tried in range(_MAX_STOPS + 1):
+        for i in range(n):
+            for t in range(depth[i] + 1):
+                L[i, t] = C[i, t]
+            delta[i] = g[i]
+        if stops > 0:
+            subtract_product(C, chain, depth, way, delta)
+        hold(held, chain, depth, L, delta)
+        for i in range(n):
+            L[i, depth[i]] += damping
+        if not factor_tree(L, chain, depth):
+            return -1.0
+        solve_tree(L, chain, depth, delta)
+        crossing = 0
+        for k in range(6, n):
+            d = k - 6
+            if held[k]:
+                continue
+            q = angles[d] + delta[k]
+            if q < lower[d] or q > upper[d]:
+                crossing += 1
+                if tried < _MAX_STOPS:
+                    held[k] = True
+                    limit = lower[d] if q < lower[d] else upper[d]
+                    way[k] = limit - angles[d]
+                    if way[k] != 0.0:
+                        way[k] += math.copysign(_ROUNDING * (abs(limit) + abs(angles[d])), way[k])
+        if crossing == 0 or tried == _MAX_STOPS:
+            break
+        stops += crossing
     fall = 0.0
     for i in range(n):
         fall += delta[i] * (g[i] + damping * delta[i])
+    if stops > 0:
+        for i in range(n):
+            delta[i] += way[i]
+        left = g.copy()
+        subtract_product(C, chain, depth, delta, left)
+        for i in range(n):
+            fall += way[i] * (g[i] + left[i])
     return fall
 
 
 @jit
-def adapt(damping, growth, fall, predicted):
-    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule)."""
+def subtract_product(C, chain, depth, x, out):
+    """out −= H x."""
+    for k in range(depth.size):
+        d, v = depth[k], 0.0
+        for t in range(d):
+            v += C[k, t] * x[chain[k, t]]
+            out[chain[k, t]] -= C[k, t] * x[k]
+        out[k] -= v + C[k, d] * x[k]
+
+
+@jit
+def adapt(damping, growth, fall, predicted, least):
+    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule).
+
+    The damping never falls below `least` > 0: `LEAST_DAMPING` of H's mean diagonal.
+    """
     if not fall > 0.0:
         return damping * growth, 2.0 * growth
     gain = 2.0 * fall / predicted - 1.0
     shrink = 1.0 - gain * gain * gain
-    return damping * (shrink if shrink > 0.1 else 0.1), 2.0
+    return max(damping * (shrink if shrink > 0.1 else 0.1), least), 2.0
 
 
 @jit

@@ -10,7 +10,7 @@ from kinefit._jit import jit
 from kinefit.bodies._kernels import difference, forward, retract
 from kinefit.correspondences._kernels import pixel_rows
 from kinefit.solvers._kernels import assemble
-from kinefit.solvers._kernels_linear import adapt, damped_step
+from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step
 
 
 @jit
@@ -53,7 +53,7 @@ def minimum(
     L, delta, gap, away = np.empty((n, n)), np.zeros(n), np.empty(n), np.empty(held.size)
     retract(roots[0], angles[0], delta, lower, upper, roots[1], angles[1])
     now, tried, cost, mean, growth, predicted = 0, 0, math.inf, 0.0, 2.0, 0.0
-    nothing = 0.0
+    nothing, least = 0.0, 0.0
     while True:
         new = 1 - now
         root, q, A, b = roots[new], angles[new], H[new], g[new]
@@ -80,10 +80,11 @@ def minimum(
             for k in range(n):
                 mean += A[k, k] / n
             mean += 1e-300
-            damping, nothing = max(damping, 1e-12 * mean), 1e-16 * value
+            least, nothing = LEAST_DAMPING * mean, 1e-16 * value
+            damping = max(damping, least)
             now, cost = new, value
         else:
-            damping, growth = adapt(damping, growth, cost - value, predicted)
+            damping, growth = adapt(damping, growth, cost - value, predicted, least)
             if value < cost:
                 now, cost = new, value
             elif damping > 1e16 * mean:
@@ -97,7 +98,7 @@ def minimum(
                 H[now], g[now], damping, every, all_before, angles[now], lower, upper, locked, L, delta
             )
             if predicted < 0.0:
-                damping, growth = adapt(damping, growth, -1.0, 1.0)
+                damping, growth = adapt(damping, growth, -1.0, 1.0, least)
         if predicted <= tolerance * cost + nothing:
             return now, cost, tried
         retract(roots[now], angles[now], delta, lower, upper, roots[1 - now], angles[1 - now])

@@ -10,7 +10,7 @@ from kinefit._jit import jit
 from kinefit.bodies._kernels import forward, retract
 from kinefit.correspondences._kernels import plane_rows, point_rows
 from kinefit.solvers._kernels import assemble, joint_moves
-from kinefit.solvers._kernels_linear import adapt, damped_step, invert
+from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step, invert
 
 _TRIES = 60  # of more damping, for a matrix that is not positive
 
@@ -59,7 +59,7 @@ def fit_sequence(
     for f in range(roots.shape[0]):
         delta[:] = 0.0
         retract(root, q, delta, lower, upper, root, q)
-        cost, predicted, count = 0.0, 0.0, 0
+        cost, predicted, count, least = 0.0, 0.0, 0, 0.0
         used = 0
         gather(plane_order, plane_x[f], plane_n[f], plane_w, target_lines, normal_lines, plane_weight)
         for attempt in range(max_iterations + 1):
@@ -83,14 +83,16 @@ def fit_sequence(
             if first:
                 cost = new_cost
                 H, other_H, g, other_g = other_H, H, other_g, g
-                most = 0.0
+                mean = 1e-300
                 for i in range(n):
-                    most += damping_share * H[i, depth[i]] / n
+                    mean += H[i, depth[i]] / n
+                least, most = LEAST_DAMPING * mean, damping_share * mean
                 if not 0.0 <= damping <= most:  # a frame that fitted exactly leaves it high
                     damping = most
+                damping = max(damping, least)
                 growth = 2.0
             else:
-                damping, growth = adapt(damping, growth, cost - new_cost, predicted)
+                damping, growth = adapt(damping, growth, cost - new_cost, predicted, least)
                 if new_cost < cost:
                     cost = new_cost
                     H, other_H, g, other_g = other_H, H, other_g, g
@@ -102,7 +104,7 @@ def fit_sequence(
             for _ in range(_TRIES):
                 if predicted >= 0.0:
                     break
-                damping = 10.0 * damping + 1e-12
+                damping = 10.0 * damping
                 predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
             retract(root, q, delta, lower, upper, new_root, new_q)
             if predicted <= tolerance * cost + 1e-30:

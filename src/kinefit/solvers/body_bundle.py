@@ -25,6 +25,7 @@ from kinefit.solvers.cameras import (
     robust_cost,
 )
 from kinefit.solvers.equations import dense_pattern
+from kinefit.solvers.least_squares import LEAST_SCALED_DAMPING, relax
 from kinefit.solvers.shape import PixelFrames, ShapeParameters
 
 
@@ -160,12 +161,13 @@ def fit_body_and_cameras(
             new = cost_of(new_rig, new_offsets, new_theta, new_states, new_x)
             if new < cost:
                 rig, offsets, theta, states, x_static = new_rig, new_offsets, new_theta, new_states, new_x
-                cost, damping = new, max(0.1 * damping, 1e-9)
+                cost, damping = new, relax(damping)
                 break
             damping *= 10.0
         if not before - cost > tolerance * cost:
             break
-    S, _, _, _ = reduced(systems_of(rig, offsets, theta, states), theta, rig, offsets, x_static, 1e-9)
+    last = systems_of(rig, offsets, theta, states)
+    S, _, _, _ = reduced(last, theta, rig, offsets, x_static, LEAST_SCALED_DAMPING)
     body, across, cameras = S[:p, :p], S[:p, p:], S[p:, p:]
     S = cameras - across.T @ np.linalg.solve(body, across)
     return BodyBundle(rig, offsets, theta, tuple(states), x_static, cost, S)

@@ -33,7 +33,6 @@ from kinefit.solvers.border_frames import (
 from kinefit.solvers.equations import lock
 
 _FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
-_LITTLE = 1e-9  # damping, as such a share, that is as good as none
 _STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
 _MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
 _NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
@@ -136,6 +135,7 @@ def solve(
     frames, states = settle(problem, theta, states, task.weighing, settling)
     cost, blocks, near = task.cost(theta, frames), None, None
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
+    least = _kernels_linear.LEAST_DAMPING * mean
     damping, growth, converged, iterations, far = _FIRST * mean, 2.0, False, 0, 0.0
     while iterations < max_iterations and not converged:
         iterations += 1
@@ -149,8 +149,7 @@ def solve(
         moved = [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)]
         settled, moved = settle(problem, trial, moved, task.weighing, settling)
         new = task.cost(trial, settled)
-        damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted)
-        damping = max(damping, _LITTLE * mean)
+        damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted, least)
         if new < cost:
             turns = np.array([a.difference(b) for a, b in zip(states, moved)])
             far += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())

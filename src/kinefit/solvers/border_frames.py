@@ -159,14 +159,15 @@ def settle(
     bounds, frames, out = limits(problem.body(theta)), [], []
     for f, state in enumerate(states):
         frame = frame_at(problem, theta, f, state, weighing)
-        damping, growth = _FIRST * float(np.trace(frame.H)) / len(frame.H) + 1e-12, 2.0
+        mean = float(np.trace(frame.H)) / len(frame.H) + 1e-12
+        damping, growth, least = _FIRST * mean, 2.0, _kernels_linear.LEAST_DAMPING * mean
         for _ in range(steps):
             move, predicted = frame.step(damping)
             if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
                 break
             moved = state.retract(move, bounds)
             new = frame_at(problem, theta, f, moved, weighing)
-            damping, growth = _kernels_linear.adapt(damping, growth, frame.cost - new.cost, predicted)
+            damping, growth = _kernels_linear.adapt(damping, growth, frame.cost - new.cost, predicted, least)
             if new.cost < frame.cost:
                 frame, state = new, moved
         frames.append(frame)

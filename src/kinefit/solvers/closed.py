@@ -152,7 +152,8 @@ def closed_fit(
     if off > CLOSED:
         return Fit(state, eq, 1, False, damping or 0.0)
     mean = float(eq.diagonal.mean()) + 1e-300
-    damping, growth = (0.1 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    least = _kernels_linear.LEAST_DAMPING * mean
+    damping, growth = (0.1 * mean if damping is None else max(damping, least)), 2.0
     nothing, H, g = 1e-16 * eq.cost, eq.matrix, eq.gradient
     c, A = constraint(state)
     for iteration in range(1, max_iterations + 1):
@@ -164,7 +165,7 @@ def closed_fit(
         if off <= CLOSED:
             new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
             fall = eq.cost - new.cost
-        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted)
+        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
         if new is not None and fall > 0.0:
             state, eq, H, g = candidate, new, new.matrix, new.gradient
             c, A = constraint(state)
@@ -179,7 +180,7 @@ def closed_step(
     """One constrained Gauss-Newton step for rows linearised at `state`; for loops that renew their rows (ICP)."""
     bounds, held = bounds_of(body, True), lock(body, None)
     eq = normal_equations(body, state, rows, loss=loss)
-    damping = 1e-12 * float(eq.diagonal.mean()) + 1e-300
+    damping = _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300
     c, A = constraint(state)
     delta, _ = _step(eq.matrix, eq.gradient, damping, A, c, state, bounds, held)
     moved, _ = onto(body, state.retract(delta, bounds), constraint)

@@ -17,6 +17,9 @@ from kinefit.solvers.equations import Equations, lock, normal_equations
 
 _TRIES = 30  # of more damping, for a matrix that is not positive
 
+LEAST_SCALED_DAMPING = 1e-9
+"""Least λ of solvers that scale each diagonal element of H by 1 + λ, as bundles do: it alone holds a free gauge."""
+
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
 
 
@@ -55,6 +58,11 @@ class Step:
         return self.equations.cost
 
 
+def relax(damping: float) -> float:
+    """Reduce the λ that scales the diagonal of H, after a step that lowered the cost."""
+    return max(0.1 * damping, LEAST_SCALED_DAMPING)
+
+
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
     n = len(eq.gradient)
     L, delta = np.empty(eq.chain.shape), np.empty(n)
@@ -88,12 +96,11 @@ def gauss_newton(
     Parameters
     ----------
     damping : float
-        λ, added to the diagonal as it is; a trillionth of H's mean diagonal is the least.
+        λ, added to the diagonal as it is; `LEAST_DAMPING` of H's mean diagonal is the least.
     """
     eq = normal_equations(body, state, rows, loss=loss)
     bounds, held = bounds_of(body, limits), lock(body, locked)
-    floor = 1e-12 * float(eq.diagonal.mean()) + 1e-300
-    damping = max(damping, floor)
+    damping = max(damping, _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300)
     delta, fall = _step(eq, damping, bounds, held)
     for _ in range(_TRIES):
         if fall >= 0:
@@ -135,18 +142,19 @@ def levenberg_marquardt(
     state = state.retract(np.zeros(body.tree.n_dofs), bounds)
     eq = normal_equations(body, state, make_rows(state), loss=loss)
     mean = float(eq.diagonal.mean()) + 1e-300
-    damping, growth = (0.1 * mean if damping is None else max(damping, 1e-12 * mean)), 2.0
+    least = _kernels_linear.LEAST_DAMPING * mean
+    damping, growth = (0.1 * mean if damping is None else max(damping, least)), 2.0
     nothing = 1e-16 * eq.cost
     for iteration in range(1, max_iterations + 1):
         delta, predicted = _step(eq, damping, bounds, held)
         if predicted < 0.0:
-            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0)
+            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0, least)
             continue
         if predicted <= tolerance * eq.cost + nothing:
             return Fit(state, eq, iteration, True, damping)
         candidate = state.retract(delta, bounds)
         new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
-        damping, growth = _kernels_linear.adapt(damping, growth, eq.cost - new.cost, predicted)
+        damping, growth = _kernels_linear.adapt(damping, growth, eq.cost - new.cost, predicted, least)
         if new.cost < eq.cost:
             state, eq = candidate, new
         elif damping > 1e16 * mean:

@@ -15,22 +15,26 @@ def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
         return np.asarray(np.nanmedian(values, axis=axis))
 
 
-def rigid_frames(x: NDArray, y: NDArray, prior: NDArray | None = None) -> tuple[NDArray, NDArray]:
+def rigid_frames(
+    x: NDArray, y: NDArray, prior: NDArray | None = None, weight: NDArray | None = None
+) -> tuple[NDArray, NDArray]:
     """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
 
-    What the points leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where
-    nothing is seen.
+    Points count by `weight` (k,), by default alike. What they leave open (two of them, or one) follows `prior`
+    (F, 3, 3), by default the identity. NaN where nothing is seen.
     """
     prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
     seen = np.isfinite(y[..., 0])
-    count = np.maximum(seen.sum(1), 1)[:, None]
+    share = np.where(seen, 1.0 if weight is None else weight / weight.max(), 0.0)[..., None]
+    count = np.maximum(share.sum(1), 1e-300)
     x_all = np.where(seen[..., None], x, 0.0)
     y_all = np.where(seen[..., None], y, 0.0)
-    x_mid, y_mid = x_all.sum(1) / count, y_all.sum(1) / count
+    x_mid, y_mid = (share * x_all).sum(1) / count, (share * y_all).sum(1) / count
     a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
     b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
-    size = (a * a).sum((1, 2))[:, None, None]
-    cross = np.einsum("fki,fkj->fij", b, a) + (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
+    size = (share * a * a).sum((1, 2))[:, None, None]
+    cross = np.einsum("fki,fkj->fij", share * b, a)
+    cross += (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
     u, _, vt = np.linalg.svd(cross)
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
     R = u @ vt

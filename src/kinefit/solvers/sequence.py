@@ -60,7 +60,7 @@ def fit_sequence(
     posture: float = 0.0,
     usual: NDArray | None = None,
     damping: float = 1e-3,
-    max_iterations: int = 50,
+    max_iterations: int = 200,
     tolerance: float = 1e-6,
 ) -> Sequence:
     """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).

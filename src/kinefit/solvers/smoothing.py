@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.solvers import _kernels_band, _kernels_smoothing
-from kinefit.solvers._kernels_linear import adapt
+from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
 from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.marginal import Entering, start_of
 from kinefit.solvers.motion_prior import MotionPrior
@@ -162,7 +162,7 @@ def smooth(
         new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
         _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
         new = _system(body, new_roots, new_angles, equations, prior, depth, entering)
-        damping, growth = adapt(damping, growth, now.cost - new.cost, predicted)
+        damping, growth = adapt(damping, growth, now.cost - new.cost, predicted, LEAST_DAMPING * mean)
         if new.cost < now.cost:
             fresh, now, roots, angles = True, new, new_roots, new_angles
     if any_held and not fresh:

@@ -7,13 +7,15 @@ one F-th of the variance of a single one. That ratio is by how much the data of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.rows import AnyRows, DofRows, Rows
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Matched
+from kinefit.sensors.channel_names import ChannelNames
 from kinefit.solvers.whitened import residuals
 
 _FEWEST = 10  # residuals of a sensor, below which nothing is said of their errors
@@ -24,10 +26,17 @@ _LEAST = 1e-3  # that is told, of a sensor whose residuals are all but zero
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """Whitened residuals (N,) of one sensor over all frames, and the channel (N,) of each."""
+    """Whitened residuals (N,) of one sensor over so many frames, and the channel (N,) of each."""
 
     value: NDArray
     channel: NDArray
+    of_points: bool
+    frames: int
+
+    @property
+    def looks(self) -> float:
+        """Number of mean residuals: of channels, or of a frame's rows where segments are the channels."""
+        return len(np.unique(self.channel)) if self.of_points else len(self.value) / self.frames
 
     def sums(self) -> tuple[NDArray, NDArray, float]:
         """Count and sum (C,) of every channel without outliers, and a residual's standard deviation."""
@@ -43,16 +52,12 @@ class Seen:
 
     Parameters
     ----------
-    sensor : str
-    rows : Sequence of rows of any kind
-    of_points : whether each point has errors of its own; else those of one segment err alike
-    names : of the points, where ids of measurements (`Rows.group`) count those seen only; else the ids name them
+    matched : with its sensor and channels
+    rows : its rows, of any kind
     """
 
-    sensor: str
+    matched: Matched
     rows: Sequence[AnyRows]
-    of_points: bool = True
-    names: tuple[str, ...] | None = None
 
 
 def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float]:
@@ -66,16 +71,12 @@ def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float
     frames : what every frame's sensors saw
     followed : number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data give.
     """
-    by_channel, by_segment = _collect(frames, _channels), _collect(frames, _segments)
-    surfaces = {one.sensor for several in frames for one in several if not one.of_points}
-    sums = {name: one.sums() for name, one in by_channel.items() if len(one.value) >= _FEWEST}
-    channels = sum(len(count) for count, _, _ in sums.values())
-    hidden = min(followed / max(channels, 1), _MOST_HIDDEN)
+    found = {name: one for name, one in _collect(frames).items() if len(one.value) >= _FEWEST}
+    hidden = min(followed / max(sum(one.looks for one in found.values()), 1), _MOST_HIDDEN)
     out = {}
-    for name, (count, total, size) in sums.items():
-        lasting = _lasting(count, total) / (1.0 - hidden)
-        if name in surfaces:
-            lasting = max(lasting, _lasting(*by_segment[name].sums()[:2]))
+    for name, one in found.items():
+        count, total, size = one.sums()
+        lasting = _lasting(count, total) / (1.0 - (hidden if one.of_points else 0.0))
         out[name] = max(lasting, size**2, _LEAST)
     return out
 
@@ -85,36 +86,22 @@ def _lasting(count: NDArray, total: NDArray) -> float:
     return float(np.sum(total**2)) / max(float(count.sum()), 1.0)
 
 
-def _collect(
-    frames: Sequence[Sequence[Seen]], channels: Callable[[AnyRows, tuple[str, ...] | None, int], list[Hashable]]
-) -> dict[str, _Residuals]:
+def _collect(frames: Sequence[Sequence[Seen]]) -> dict[str, _Residuals]:
     """Residuals of each sensor with their channels."""
     values: dict[str, list[NDArray]] = {}
     found: dict[str, list[int]] = {}
     known: dict[Hashable, int] = {}
-    for several in frames:
-        for one in several:
-            for place, rows in enumerate(one.rows):
-                felt = rows.weight > 0.0 if rows.weight.ndim == 1 else np.ones(len(rows), bool)
-                values.setdefault(one.sensor, []).append(residuals(rows)[felt])
-                own = channels(rows, one.names, place)
-                ids = [known.setdefault(own[k], len(known)) for k in np.flatnonzero(felt)]
-                found.setdefault(one.sensor, []).extend(ids)
-    return {s: _Residuals(np.concatenate(v), np.array(found[s], np.int64)) for s, v in values.items()}
-
-
-def _segments(rows: AnyRows, names: tuple[str, ...] | None, place: int) -> list[Hashable]:
-    """(N,) segment of each row; one for all where they are on several."""
-    return rows.segment.tolist() if isinstance(rows, Rows) else [0] * len(rows)
-
-
-def _channels(rows: AnyRows, names: tuple[str, ...] | None, place: int) -> list[Hashable]:
-    """(N,) what each row measures: which rows of a measurement, its id or name, and its place in it."""
-    if not isinstance(rows, Rows | DofRows):
-        return [(place, k) for k in range(len(rows))]
-    count: dict[int, int] = {}
-    out: list[Hashable] = []
-    for g in rows.group.tolist():
-        count[g] = count.get(g, -1) + 1
-        out.append((place, names[g] if names is not None and 0 <= g < len(names) else g, count[g]))
-    return out
+    of_points: dict[str, bool] = {}
+    names = ChannelNames()
+    for one in (one for several in frames for one in several):
+        sensor = one.matched.sensor
+        of_points[sensor] = one.matched.of_points
+        for rows, own in zip(one.rows, names.channels(one.matched, one.rows)):
+            felt = rows.weight > 0.0 if rows.weight.ndim == 1 else np.ones(len(rows), bool)
+            values.setdefault(sensor, []).append(residuals(rows)[felt])
+            ids = [known.setdefault((sensor, own[k]), len(known)) for k in np.flatnonzero(felt)]
+            found.setdefault(sensor, []).extend(ids)
+    return {
+        s: _Residuals(np.concatenate(v), np.array(found[s], np.int64), of_points[s], len(frames))
+        for s, v in values.items()
+    }

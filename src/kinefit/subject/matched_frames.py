@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Matched, Measurement, leftovers_at, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.border_frames import Part, apart
 from kinefit.subject.closure_moves import ClosureMoves, closing_rows
@@ -192,18 +192,15 @@ class MatchedFrames:
         return out
 
     def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
-        """What every frame's sensors saw, with the names of what they saw."""
-        world, out = self._worlds.at(theta), []
-        for f, state in enumerate(states):
-            scene = self._scene(world, f, state)
-            out.append([
-                Seen(
-                    m.sensor, self._rows((f, i), m.sensor, matched, scene, world), matched.of_points,
-                    _names(matched, scene),
-                )
-                for i, (m, matched) in enumerate(zip(self._steps[f], self._matched[f], strict=True))
-            ])
-        return out
+        """What every frame's sensors saw."""
+        world = self._worlds.at(theta)
+        return [
+            [
+                Seen(matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
+                for i, matched in enumerate(self._matched[f])
+            ]
+            for f, state in enumerate(states)
+        ]
 
     def _rows(
         self, key: tuple[int, int], sensor: str, matched: Matched, scene: Scene, world: World
@@ -241,12 +238,6 @@ def closing_moves(found: SubjectFit, body: Body) -> ClosureMoves | None:
         return None
     world = replace(found.prior_world, body=replace(found.prior_world.body, closures=body.closures))
     return Worlds(world, found.parameters).closing(found.mean, stacked(found.parameters)[3])
-
-
-def _names(matched: Matched, scene: Scene) -> tuple[str, ...] | None:
-    """Names of the points that a match counts, where it has those of one detector or marker system only."""
-    told = leftovers_at(matched, scene) if matched.of_points else []
-    return told[0].names if len(told) == 1 and told[0].rms is None else None
 
 
 def _alike(a: World, b: World, sensor: str, of_surface: bool) -> bool:

@@ -13,6 +13,7 @@ from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces._kernels_metaballs import nearest_on_metaballs
 from kinefit.bodies.surfaces.metaballs import pack_balls
 from kinefit.errors import BodyError, ObservationError
+from kinefit.solvers.least_squares import relax
 from kinefit.subject.parameters import World
 
 GIRTH = 0.2  # standard deviation of a radius' logarithm between people, as of cylinders' half axes
@@ -186,7 +187,7 @@ def fit_balls(
         there = _unmeshed(limb, trial, weights)
         H2, b2, cost2, rms2 = _normal(there, x, s, weights)
         if cost2 + prior @ trial**2 <= cost + prior @ theta**2:
-            theta, now, H, b, cost, rms, damping = trial, there, H2, b2, cost2, rms2, 0.1 * damping
+            theta, now, H, b, cost, rms, damping = trial, there, H2, b2, cost2, rms2, relax(damping)
             if np.abs(step).max() < _DONE:
                 break
         else:

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import renamed
 from kinefit.bodies import BodyState
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
@@ -19,6 +20,7 @@ from kinefit.multiview.followed import Followed, follow
 from kinefit.multiview.one_camera import lifted_alone
 from kinefit.multiview.people import Person
 from kinefit.observations import (
+    KEYPOINT_SIGMA,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -113,8 +115,9 @@ class Recording:
         return np.array(UP_AXES[self.up])
 
     @classmethod
+    @renamed(accuracy="sigma")
     def of_keypoints(
-        cls, rig: Rig, keypoints: Sequence[Keypoints], *, accuracy: float | Sequence[float] = 8.0,
+        cls, rig: Rig, keypoints: Sequence[Keypoints], *, sigma: float | Sequence[float] = KEYPOINT_SIGMA,
         person: int | str | None = None, people: Sequence[Person] | None = None, **more: Any,
     ) -> Recording:  # fmt: skip
         """Keypoints of calibrated cameras; the person is chosen among all detected.
@@ -123,7 +126,7 @@ class Recording:
         ----------
         rig : Rig
         keypoints : records of the same number of frames and the same rate.
-        accuracy : [px] standard deviation of a sure keypoint, one for all records or one for each.
+        sigma : [px] standard deviation of a keypoint of confidence 1, one for all records or one for each.
         person : "first" (of whom most is seen, the default), "moving", "largest", "nearest X Y Z" [m], or a number
         people : everybody in view, where `people_in_view` has found them; default: they are looked for
         more : other arguments of a recording
@@ -144,13 +147,13 @@ class Recording:
         if len(lengths) > 1 or len(rates) > 1:
             told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
             raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
-        sigma = _sigmas(accuracy, len(keypoints))
+        sigmas = _sigmas(sigma, len(keypoints))
         one = follow(rig, keypoints, person, people)
         whose = tuple(choose_people(rig, one.keypoints))
         steps = _lifted_steps(lifted_alone(one.keypoints), one.keypoints, whose)
         return cls(
             keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=whose, followed=one,
-            keypoint_sigma=sigma, **{"steps": steps, **more},
+            keypoint_sigma=sigmas, **{"steps": steps, **more},
         )  # fmt: skip
 
     @property
@@ -201,13 +204,13 @@ class Recording:
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = _records(steps, times, rate)
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
-        accuracy = tuple(sigma.get(r.camera, 4.0) for r in records)
+        sigmas = tuple(sigma.get(r.camera, KEYPOINT_SIGMA) for r in records)
         worn = _marker_records(steps, rate)
         known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
         return cls(
             times, rate, rig, steps=lambda i: others[i], keypoints=records,
             people=tuple(np.where((r.confidence > 0).any(axis=(1, 2)), 0, -1) for r in records),
-            keypoint_sigma=accuracy, sigma=sigma, depth=_first_depth(steps, rate), **{**known, **more},
+            keypoint_sigma=sigmas, sigma=sigma, depth=_first_depth(steps, rate), **{**known, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -249,9 +252,9 @@ def _cut(record: Keypoints, frames: slice) -> Keypoints:
     return record.rows(frames, record.time_offset + first / record.rate)
 
 
-def _sigmas(accuracy: float | Sequence[float], count: int) -> tuple[float, ...]:
+def _sigmas(sigma: float | Sequence[float], count: int) -> tuple[float, ...]:
     """One standard deviation [px] for each of the records."""
-    values = np.asarray(accuracy, float).ravel()
+    values = np.asarray(sigma, float).ravel()
     if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
         problem = f"standard deviations {values}"
         raise ObservationError(problem, remedy=f"Give one positive number of pixels, or {count}.")

@@ -37,6 +37,8 @@ class Recovery:
     body, rig, up, settings, rate : as of the `Tracker`
     """
 
+    state_attributes = ("_good", "_root", "_sought", "_lost_since")  # see `save_state`
+
     def __init__(self, body: Body, rig: Rig, up: NDArray, settings: TrackSettings, rate: float) -> None:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought

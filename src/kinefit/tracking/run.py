@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from kinefit._mapped import release
@@ -15,18 +16,18 @@ from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.spool import Spool, SpoolState
+from kinefit.smoothing.spool import Spool
 from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.frame_file import KINDS
 from kinefit.tracking.others import OtherPeople
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.so_far import append_rows
 from kinefit.tracking.tracker import Tracker
+from kinefit.tracking.tracker_state import restore_tracker, save_tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
-_KINDS = "results", "measurements", "leftovers"
-_TOLD = "so-far.csv"
 _EVERY = 300  # steps after which a checkpoint is written: ten seconds of video, a second of work or half a minute
 
 
@@ -52,66 +53,37 @@ class Tracked:
     complete: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Before the step `at`: the tracker, the steps done in their order, what is kept of each."""
-
-    at: int
-    tracker: Tracker
-    steps: tuple[int, ...]
-    spools: tuple[SpoolState, ...]
-
-
 class _Frames:
-    """What is kept of all steps done, in the order in which they were done; in files that stay, with a checkpoint."""
+    """What is kept of all steps done, in the order in which they were done; in a file that stays, with a checkpoint."""
 
     def __init__(self, checkpoint: Checkpoint | None) -> None:
-        files = [None if checkpoint is None else checkpoint.file(f"{what}.bin") for what in _KINDS]
-        self.results = Spool[FrameResult](file=files[0])
-        self.measurements = Spool[tuple[Measurement, ...]](file=files[1])
-        self.leftovers = Spool[tuple[Leftover, ...]](file=files[2])
-        self.place, self.told = dict[int, int](), 0
+        store = None if checkpoint is None else checkpoint.frames
+        places = [()] * len(KINDS) if store is None else store.places
+        self.results, self.measurements, self.leftovers = (
+            Spool[Any](store=store, tag=kind, places=there) for kind, there in zip(KINDS, places, strict=True)
+        )
+        self.place = {step: k for k, step in enumerate(() if store is None else store.steps)}
+        self.written = 0  # rows of the table
 
     def add(self, i: int, one: KeptFrame) -> None:
         count = len(self.place)
-        self.results.append(one.result)
-        self.measurements.append(one.measurements)
-        self.leftovers.append(one.leftovers)
+        self.results.append(one.result, i)
+        self.measurements.append(one.measurements, i)
+        self.leftovers.append(one.leftovers, i)
         self.place[i] = count  # last: Ctrl-C may come between
 
-    @property
-    def spools(self) -> tuple[Spool[Any], ...]:
-        return self.results, self.measurements, self.leftovers
+    def keep(self, checkpoint: Checkpoint, tracker: Tracker, at: int, anew: Callable[[], Tracker]) -> Tracker:
+        """Have all that was done in the folder; the tracker to go on with, as it will be read back."""
+        return self.go_on(checkpoint, checkpoint.frames.keep(at, save_tracker(tracker)), anew())
 
-    def keep(self, checkpoint: Checkpoint, tracker: Tracker, at: int) -> Tracker:
-        """Write a checkpoint before a step; returns the tracker to go on with."""
-        state = _State(at, tracker, tuple(self.place), tuple(spool.state() for spool in self.spools))
-        state = checkpoint.keep("frames", state)
-        self._restore(state)
-        self._tell(checkpoint, state.tracker.body)
-        return state.tracker
-
-    def go_on(self, checkpoint: Checkpoint, tracker: Tracker, at: int) -> tuple[Tracker, int]:
-        """The tracker and the step to go on with, after those of an earlier run; as given where there is none."""
-        checkpoint.file(_TOLD).unlink(missing_ok=True)
-        state = checkpoint.load("frames")
-        if state is None or not self._restore(state):
-            self.place = {}
-            for spool in self.spools:
-                spool.restore(SpoolState(b"", ()))
-            return tracker, at
-        self._tell(checkpoint, state.tracker.body)
-        return state.tracker, state.at
-
-    def _tell(self, checkpoint: Checkpoint, body: Body) -> None:
-        new = list(self.place)[self.told :]
-        append_rows(checkpoint.file(_TOLD), body, ((step, self.results[self.place[step]]) for step in new))
-        self.told = len(self.place)
-
-    def _restore(self, state: _State) -> bool:
-        self.place = {step: k for k, step in enumerate(state.steps)}
-        whole = [spool.restore(told) for spool, told in zip(self.spools, state.spools, strict=True)]
-        return all(whole)
+    def go_on(self, checkpoint: Checkpoint, state: Any, tracker: Tracker) -> Tracker:
+        """A tracker that was made anew, in a state that was kept."""
+        restore_tracker(tracker, state)
+        checkpoint.frames.name_sensors(tracker.sensors)
+        new = list(self.place)[self.written :]
+        append_rows(checkpoint.rows, tracker.body, ((step, self.results[self.place[step]]) for step in new))
+        self.written = len(self.place)
+        return tracker
 
     def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> Tracked:
         """In the order of time; `steps` of the whole recording."""
@@ -129,7 +101,7 @@ def tracker_of(
     """A tracker for all sensors of a recording, which knows what it states of them; arguments as of `run`."""
     sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
     tracker = Tracker(
-        body, recording.rig, rate=recording.rate, accuracy=sigma, up=recording.up_axis,
+        body, recording.rig, rate=recording.rate, sigma=sigma, up=recording.up_axis,
         on_body=recording.on_body, settings=settings, sensors=deepcopy(recording.sensors), values=values,
     )  # fmt: skip
     for name, depth in recording.backgrounds.items():
@@ -155,16 +127,18 @@ def run(
     TrackingError
         The body is found in none of the first steps.
     """
-    tracker = tracker_of(recording, body, settings, values=values)
-    layout, times, begin = Layout(channels, body), recording.times, 0
+    anew = partial(tracker_of, recording, body, settings, values=values)
+    tracker, layout, times, begin = anew(), Layout(channels, body), recording.times, 0
     if start is not None:
         begin, state = start
         tracker.start_at(state)
     frames, at = _Frames(checkpoint), begin
     others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
     if checkpoint is not None:
-        checkpoint.know(layout=layout, channels=channels, body=body, found_rig=recording.rig, settings=settings)
-        tracker, at = frames.go_on(checkpoint, tracker, at)
+        checkpoint.frames.name(layout=layout, body=body)
+        if checkpoint.frames.at is not None:
+            at = checkpoint.frames.at
+            tracker = frames.go_on(checkpoint, checkpoint.frames.state, anew())
 
     def step(tracker: Tracker, i: int, time: float) -> bool:
         seen = list(recording.steps(i))
@@ -183,7 +157,7 @@ def run(
             if i > at and (i - begin) % _EVERY == 0:
                 release(channels.uv, channels.confidence)
                 if checkpoint is not None:
-                    tracker = frames.keep(checkpoint, tracker, i)
+                    tracker = frames.keep(checkpoint, tracker, i, anew)
             found = step(tracker, i, float(times[i])) or frames.place
             if not found and i - begin >= _GIVE_UP and tracker.sees_surfaces:
                 break
@@ -193,7 +167,7 @@ def run(
             remedy = "Begin with a step that shows the whole person; check units, calibration and the range gate."
             raise TrackingError(f"the body is found in none of the first {i + 1 - begin} steps", remedy=remedy)
         if checkpoint is not None and len(times) > at:
-            tracker = frames.keep(checkpoint, tracker, len(times))
+            tracker = frames.keep(checkpoint, tracker, len(times), anew)
         first = min(frames.place)
         back = tracker.backwards(frames.results[frames.place[first]].state)
         for i in range(first - 1, -1, -1):

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
+from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
+from kinefit.observations.arrays import numbers
 from kinefit.sensors.base import Leftover, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
@@ -207,3 +209,19 @@ def _keys(channels: Channels) -> list[tuple[_Key, str]]:
 def axis_of(up: NDArray) -> str:
     """Name of the axis of the world that is nearest to a direction (3,)."""
     return max(UP_AXES, key=lambda name: float(np.dot(up, UP_AXES[name])))
+
+
+def up_vector(up: str | ArrayLike) -> NDArray:
+    """(3,) upwards in the world, of the name of an axis ("z", "-y", ...) or of three numbers.
+
+    Raises
+    ------
+    ObservationError
+        No such axis; not three numbers.
+    """
+    if isinstance(up, str) and up not in UP_AXES:
+        raise ObservationError(choices("vertical axis", up, UP_AXES))
+    vector = numbers(UP_AXES[up] if isinstance(up, str) else up, float, "up")
+    if vector.shape != (3,):
+        raise ObservationError(f"up has shape {vector.shape}", remedy="Give three numbers, such as (0, 0, 1).")
+    return vector

@@ -11,6 +11,9 @@ from kinefit.bodies import Body
 from kinefit.errors import ExportError
 from kinefit.frame.results import FrameResult
 
+BEGIN = b"frame,time [s],quality,"
+"""What such a file begins with."""
+
 
 def append_rows(file: Path, body: Body, results: Iterable[tuple[int, FrameResult]]) -> None:
     """Add frames as the tracker left them, not smoothed: time, quality, the root's place, every coordinate.

@@ -9,7 +9,8 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
-from kinefit.errors import TakeError, command
+from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
+from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people
@@ -27,6 +28,7 @@ from kinefit.subject.subject import Subject
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.in_view import InView, people_in_view
+from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
@@ -44,6 +46,7 @@ def track_take(
     Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
     videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays), with
     cameras where the fit found them. `view`: who is in view, where `people_in_view` has looked before.
+    `provenance["findings"]` has the faults of images, cameras and keypoints that a quick check finds, always.
 
     Raises
     ------
@@ -85,11 +88,18 @@ def track_take(
         recording = view.recording(recording, body, take.person, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings)
-    motion = track(
-        recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
-        size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings, progress=progress,
-        checkpoint=checkpoint,
-    )  # fmt: skip
+    findings = input_findings(take, seen, recording.keypoints, body)
+    try:
+        motion = track(
+            recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
+            size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
+            progress=progress, checkpoint=checkpoint,
+        )  # fmt: skip
+    except TrackingInterrupted as stopped:
+        raise TrackingInterrupted(with_findings(stopped.motion, findings, seen, take.height), stopped.total) from None
+    except KinefitError as error:
+        raise with_cause(error, findings) from error
+    motion = with_findings(motion, findings, seen, take.height)
     return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
 
 
@@ -126,7 +136,7 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
         )
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
-    accuracy, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
+    sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
     keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
-    channels = make_channels(body, seen.rig, keypoints, choose_people(seen.rig, keypoints), accuracy)
+    channels = make_channels(body, seen.rig, keypoints, choose_people(seen.rig, keypoints), sigma)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

@@ -110,7 +110,7 @@ def recording_of(
         bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
         keypoints = seen.keypoints if bare else [replace(k, lifted=None) for k in seen.keypoints]
         pixels = Recording.of_keypoints(
-            rig, keypoints, accuracy=[entry.sigma for entry in take.keypoints], person=take.person, people=people
+            rig, keypoints, sigma=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,
@@ -127,7 +127,7 @@ def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) 
     shown = [f for f in recording.steps(step) if isinstance(f, SilhouetteFrame)]
     if not shown:
         return recording
-    found = coarse_to_fine(body, recording.rig, shown, state, accuracy=recording.sigma, settings=settings)
+    found = coarse_to_fine(body, recording.rig, shown, state, sigma=recording.sigma, settings=settings)
     return replace(recording, start=(step, found.result.state))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import renamed
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
@@ -21,7 +22,7 @@ from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import DepthFrame
-from kinefit.observations.arrays import is_number, numbers
+from kinefit.observations.arrays import is_number
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.checks import of_kind
@@ -34,7 +35,7 @@ from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject
 from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recovery import Recovery
-from kinefit.tracking.session import Session, axis_of
+from kinefit.tracking.session import Session, axis_of, up_vector
 
 __all__ = ["FrameResult", "TrackSettings", "Tracker"]
 
@@ -47,9 +48,9 @@ class Tracker:
     body : Body, with surfaces where depth or silhouettes are to be used.
     rig : Rig of all cameras, depth cameras among them; without cameras `Rig(())`.
     rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
-    accuracy : {sensor: standard deviation}
+    sigma : {sensor: standard deviation}
         [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
-    up : (3,) upwards in the world, for a start with no pose given.
+    up : vertical axis of the world ("z", "-y", ...) or (3,) upwards in it, for a start with no pose given.
     on_body : depth cameras whose images show nothing but the body: no background is learnt.
     settings : TrackSettings
     sensors : of one's own (`kinefit.sensors.base`); the built-in kinds need not be named.
@@ -62,26 +63,27 @@ class Tracker:
     late : int, updates that came after a later one and were left out.
     """
 
+    state_attributes = ("_time", "_seen", "dropped", "late")  # see `save_state`
+
+    @renamed(accuracy="sigma")
     def __init__(
-        self, body: Body, rig: Rig, *, rate: float = 30.0, accuracy: Mapping[str, float] | None = None,
-        up: ArrayLike = (0.0, 1.0, 0.0), on_body: Collection[str] = (), settings: TrackSettings | None = None,
+        self, body: Body, rig: Rig, *, rate: float = 30.0, sigma: Mapping[str, float] | None = None,
+        up: str | ArrayLike = "z", on_body: Collection[str] = (), settings: TrackSettings | None = None,
         sensors: Sequence[Sensor] = (), values: Mapping[str, Mapping[str, float]] | None = None,
         keep: bool = False,
     ) -> None:  # fmt: skip
         of_kind(body, Body, "the body", 'Load it: load_body("humanoid").')
         of_kind(rig, Rig, "the rig", "Give a Rig, such as read_calibration returns; without cameras Rig(()).")
         of_kind(settings or TrackSettings(), TrackSettings, "settings", "Give TrackSettings(...), or leave it out.")
-        of_kind(accuracy or {}, Mapping, "accuracy", 'Give {"cam01": 8.0}: a number for each sensor.', each=Real)
+        of_kind(sigma or {}, Mapping, "sigma", 'Give {"cam01": 8.0}: a number for each sensor.', each=Real)
         of_kind(values or {}, Mapping, "values", 'Give {sensor: {name: value}}.', each=Mapping)
         of_kind(sensors, Sequence, "sensors", "Give a list of sensors.")
         of_kind(on_body, Collection, "on_body", "Give a list of names, also of one.")
         if not (is_number(rate) and 0.0 < rate < np.inf):
             raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
-        self.rig, self.rate, self.up = rig, rate, numbers(up, float, "up")
-        if self.up.shape != (3,):
-            raise ObservationError(f"up has shape {self.up.shape}", remedy="Give three numbers, such as (0, 0, 1).")
+        self.rig, self.rate, self.up = rig, rate, up_vector(up)
         self.settings, self.values = settings or TrackSettings(), values or {}
-        self.sensors = Sensors(rig, rate, accuracy or {}, self.settings, sensors, tuple(on_body))
+        self.sensors = Sensors(rig, rate, sigma or {}, self.settings, sensors, tuple(on_body))
         unknown = [name for name in self.values if name not in {sensor.name for sensor in self.sensors.own}]
         if unknown:
             names = [sensor.name for sensor in self.sensors.own]
@@ -119,7 +121,7 @@ class Tracker:
         return any(isinstance(s, DepthImageSensor | PointCloudSensor) for s in self.sensors)
 
     @property
-    def accuracy(self) -> Mapping[str, float]:
+    def sigma(self) -> Mapping[str, float]:
         """Standard deviations as they were given, by sensor."""
         return self.sensors.sigma
 
@@ -152,7 +154,7 @@ class Tracker:
     def backwards(self, state: BodyState) -> Tracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
         out = Tracker(
-            self.body, self.rig, rate=self.rate, accuracy=self.accuracy, up=self.up, settings=self.settings,
+            self.body, self.rig, rate=self.rate, sigma=self.sigma, up=self.up, settings=self.settings,
             sensors=self.sensors.own, values=self.values,
         )  # fmt: skip
         out.sensors, out._direction = self.sensors.anew(), -1.0
@@ -262,6 +264,7 @@ class Tracker:
         if result is not None:
             moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self._others}
             scene = self._scene.at(result.state, time=time, covariance=covariance, **moving)
+            self.sensors.check_channels(result.matched, scene)
             for m in measurements:
                 sensor = self.sensors.of(m.sensor)
                 if sensor is not None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
@@ -88,20 +86,14 @@ def track(
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     settings = settings or TrackSettings()
     channels = channels_of(recording, body)
-    fitted = partial(
-        fitted_to_person, recording, body, channels, settings, subject=subject, trial=trial, height=height, size=size,
+    foreign = [sensor for sensor in recording.sensors if type(sensor).__module__.partition(".")[0] != "kinefit"]
+    if checkpoint is not None and foreign:
+        problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
+        raise ObservationError(problem, remedy="Leave the checkpoint out.")
+    person = fitted_to_person(
+        recording, body, channels, settings, subject=subject, trial=trial, height=height, size=size,
         frames=shape_frames, progress=progress,
     )  # fmt: skip
-    if checkpoint is None:
-        person = fitted()
-    else:
-        if any(type(sensor).__module__.partition(".")[0] != "kinefit" for sensor in recording.sensors):
-            problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
-            raise ObservationError(problem, remedy="Leave the checkpoint out.")
-        whole = {name: getattr(recording, name) for name in ("steps", "keypoints", "people", "markers", "depth", "rig")}
-        pixels = {"uv": channels.uv, "confidence": channels.confidence}
-        checkpoint.know(recording=recording, settings=settings, **whole, **pixels)
-        person = checkpoint.piece("person", fitted)
     tracked = run(
         person.recording, person.subject.body, person.channels, settings, start=person.start, values=person.values,
         progress=progress, checkpoint=checkpoint,

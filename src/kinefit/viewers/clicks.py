@@ -1,25 +1,39 @@
-"""A page on which joints are clicked in the images of one time: served to the browser by the standard library."""
+"""A page on which joints are clicked in the images of one time."""
 
 from __future__ import annotations
 
-import json
+import asyncio
 from collections.abc import Callable, Mapping, Sequence
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from threading import Event, Thread
+from threading import Event
 from typing import Any
 from urllib.parse import unquote
 
+import msgspec
+
 from kinefit.errors import KinefitError
+from kinefit.serving.access import Access
+from kinefit.serving.server import Connection, Page, PageServer
 
 Take = Callable[[dict[str, Any]], str]
 """What is done with clicks as JSON has them; it returns what to tell, or raises a `KinefitError`."""
 
-_LARGEST = 1_000_000  # bytes of clicks
+_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'"
+_FILES = {
+    "/": ("clicks.html", "text/html; charset=utf-8"), "/clicks.css": ("clicks.css", "text/css; charset=utf-8"),
+    "/clicks.js": ("clicks.js", "text/javascript; charset=utf-8"),
+}  # fmt: skip
+
+
+class _Told(msgspec.Struct, forbid_unknown_fields=True):
+    """What the page sends when the user is done; no part of it is of any depth."""
+
+    step: int
+    points: dict[str, dict[str, list[float]]]
 
 
 class ClickPage:
-    """Images of one time in the browser, in which joints are clicked.
+    """Images of one time in the browser, in which joints are clicked; served from the start until `close`.
 
     Parameters
     ----------
@@ -27,69 +41,54 @@ class ClickPage:
     joints : names that are asked for, in this order
     take : what is done with the clicks when the user is done; its message, or its error, is shown on the page
     step : of the images
-    port : 0 for any free one
+
+    Attributes
+    ----------
+    done : Event, set when clicks were taken
     """
 
-    def __init__(
-        self, pictures: Mapping[str, bytes], joints: Sequence[str], take: Take, *, step: int = 0, port: int = 0
-    ) -> None:
-        self.pictures, self.joints, self.take, self.step = dict(pictures), tuple(joints), take, step
+    def __init__(self, pictures: Mapping[str, bytes], joints: Sequence[str], take: Take, *, step: int = 0) -> None:
+        self.pictures, self.take = dict(pictures), take
         self.done = Event()
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), _handler(self))
-        self._thread = Thread(target=self._server.serve_forever, daemon=True)
+        self._asked = msgspec.json.encode({"cameras": list(pictures), "joints": list(joints), "step": step}).decode()
+        self._taking = asyncio.Lock()
+        self._server = PageServer(Access(), 0, page=self._page, talk=self._talk)
 
     @property
     def url(self) -> str:
         """Of the page."""
-        return f"http://127.0.0.1:{self._server.server_address[1]}/"
+        return self._server.url
 
-    def start(self) -> None:
-        """Serve the page from now on; `done` is set when clicks were taken."""
-        self._thread.start()
-
-    def stop(self) -> None:
+    def close(self) -> None:
         """Serve it no more."""
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.close()
 
+    def _page(self, path: str) -> Page | None:
+        if path in _FILES:
+            name, kind = _FILES[path]
+            return Page((resources.files("kinefit.viewers") / name).read_bytes(), kind, _POLICY)
+        picture = self.pictures.get(unquote(path).removeprefix("/picture/"))
+        if picture is None:
+            return None
+        return Page(picture, "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg")
 
-def _handler(page: ClickPage) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def log_message(self, *_: Any) -> None:
-            """Say nothing on the screen."""
-
-        def _answer(self, content: bytes, kind: str, status: int = 200) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(content)))
-            self.end_headers()
-            self.wfile.write(content)
-
-        def do_GET(self) -> None:
-            name = unquote(self.path.partition("?")[0]).removeprefix("/")
-            if not name:
-                html = (resources.files("kinefit.viewers") / "clicks.html").read_bytes()
-                self._answer(html, "text/html; charset=utf-8")
-            elif name == "asked.json":
-                asked = {"cameras": list(page.pictures), "joints": page.joints, "step": page.step}
-                self._answer(json.dumps(asked).encode(), "application/json")
-            elif name.removeprefix("picture/") in page.pictures:
-                picture = page.pictures[name.removeprefix("picture/")]
-                self._answer(picture, "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg")
-            else:
-                self._answer(b"no such page", "text/plain", 404)
-
-        def do_POST(self) -> None:
-            length = int(self.headers.get("Content-Length") or 0)
+    async def _talk(self, connection: Connection) -> None:
+        """Say what is asked for, and answer clicks."""
+        await connection.send(self._asked)
+        while True:
+            text = await connection.recv(decode=False)
+            async with self._taking:  # files are written
+                answer, taken = await asyncio.to_thread(self._answer, text)
             try:
-                told = json.loads(self.rfile.read(min(length, _LARGEST)))
-                answer, taken = page.take(told), True
-            except ValueError as error:
-                answer, taken = f"no JSON: {error}", False
-            except KinefitError as error:
-                answer, taken = str(error), False
-            self._answer(json.dumps({"taken": taken, "told": answer}).encode(), "application/json")
-            if taken:
-                page.done.set()
+                await connection.send(msgspec.json.encode({"taken": taken, "told": answer}).decode())
+            finally:  # also where the browser is gone
+                if taken:
+                    self.done.set()
 
-    return Handler
+    def _answer(self, text: bytes) -> tuple[str, bool]:
+        try:
+            return self.take(msgspec.to_builtins(msgspec.json.decode(text, type=_Told))), True
+        except msgspec.DecodeError as error:
+            return f"These are no clicks: {error}.", False
+        except KinefitError as error:
+            return str(error), False

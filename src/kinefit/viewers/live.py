@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from types import TracebackType
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, CalibrationError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.serving.access import Access
 from kinefit.viewers import figure, pictures, stage
 
 
@@ -38,12 +40,15 @@ class View:
     port : int
         The next free one is taken where it is in use; 0 for any.
     host : str
-        "127.0.0.1" shows the page on this computer alone, "0.0.0.0" to all that can reach it.
+        "127.0.0.1" shows the page on this computer alone, "0.0.0.0" to all that can reach it and know the address: a
+        warning says what that means.
+    token : str, optional
+        Of the address, 16 characters or more; by default a random one.
 
     Raises
     ------
     ExportError
-        viser is missing, or nothing can be served.
+        viser is missing, or nothing can be served; a token that cannot be used.
     """
 
     def __init__(
@@ -56,10 +61,14 @@ class View:
         floor: float = 0.0,
         port: int = 8080,
         host: str = "127.0.0.1",
+        token: str | None = None,
     ) -> None:
         self.body = body
-        self._port, self._host, self._up, self._floor, self._rig = port, host, up, floor, rig
-        self.server = stage.open_server(port, host=host, label=f"kinefit: {body.name}")
+        self._up, self._floor, self._rig = up, floor, rig
+        self._access = Access(host, token)
+        if self._access.warning:
+            warnings.warn(self._access.warning, stacklevel=2)
+        self.server = stage.open_server(port, self._access, label=f"kinefit: {body.name}")
         self._figure: figure.Figure | None = None
         self._stage: stage.Stage | None = None
         self._frames = dict(image_frames or {})
@@ -70,9 +79,8 @@ class View:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
-        host = "localhost" if self._host in ("127.0.0.1", "0.0.0.0") else self._host
-        return f"http://{host}:{self.server.get_port()}"
+        """Where the page is, with its token."""
+        return self._access.url(self.server.get_port())
 
     def show(
         self,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.viewers.show import Choice, Recording, Show
-from kinefit.viewers.stage import open_server, quiet
+from kinefit.viewers.stage import POLICY, open_server, quiet
 
 MOST_FRAMES, MOST_PICTURES = 600, 240
 """Frames and camera pictures that a page holds at most, so that it stays below 10 MB and loads at once."""
@@ -37,7 +37,8 @@ def page(recording: Recording, *, choice: Choice = Choice()) -> tuple[str, int]:
             show.frame(int(i), choice, pictures=k in with_pictures)
             step = frames[k + 1] - i if k + 1 < len(frames) else 1
             serializer.insert_sleep(float(step) / recording.rate)
-        return serializer.as_html(), len(frames)
+        policy = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        return serializer.as_html().replace("<head>", policy, 1), len(frames)
     finally:
         with quiet():
             server.stop()

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import socket
+import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from kinefit.errors import ExportError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES
+from kinefit.serving.access import Access
 from kinefit.viewers.pictures import View, flat_view
 
 if TYPE_CHECKING:
@@ -24,27 +26,76 @@ if TYPE_CHECKING:
 SMALL, LARGE = 320, 1080  # [px] longer side of a camera's picture on its frustum, and when looked through
 _PLANES = {"x": "yz", "y": "xz", "z": "xy"}
 _SHADE = (70, 75, 85)
+POLICY = (
+    "connect-src 'self' data: blob:; img-src 'self' data: blob:; font-src data:; media-src 'none'; frame-src 'none'; "
+    "object-src 'none'; base-uri 'none'; form-action 'none'"
+)
+"""Content security policy of viser's page: its scripts are its own, but what they see they can send nowhere else."""
+
 _FARTHEST = 10.0  # [m] from which a person still fills about a fifth of the window's height
 
 
-def open_server(port: int, *, host: str = "127.0.0.1", label: str = "kinefit") -> viser.ViserServer:
+def open_server(port: int, access: Access | None = None, *, label: str = "kinefit") -> viser.ViserServer:
     """A server on a port, or on the next one that is free; `get_port()` tells which.
+
+    Parameters
+    ----------
+    access : who may connect, at `access.url(server.get_port())`; default: this computer with a random token
 
     Raises
     ------
     ExportError
-        viser is not installed, no port is free, or the host's name is not one of this computer.
+        viser is not installed, no port is free, the host's name is not one of this computer, or this version of viser
+        cannot be kept from foreign pages.
     """
     try:
         import viser
     except ImportError as error:
         remedy = "Install it: pip install viser."
         raise ExportError("the 3D viewer needs the package viser", remedy=remedy) from error
-    port = free_port(host, port)
-    with quiet():
-        server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
+    access = access or Access()
+    port = free_port(access.host, port)
+    with quiet(), _guarded(access) as used:
+        server = viser.ViserServer(host=access.host, port=port, label=label, verbose=False)
+        if not used:
+            server.stop()
+            raise ExportError(f"viser {viser.__version__} serves in another way", remedy="Install viser 1.1.")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     return server
+
+
+_GUARDING = threading.Lock()
+
+
+@contextlib.contextmanager
+def _guarded(access: Access) -> Iterator[list[int]]:
+    """Put `access` before the pages of a viser server that is made meanwhile; the list has its port then.
+
+    viser has no place for it, and asks `websockets.asyncio.server` by name for what it serves with.
+    """
+    from websockets.asyncio import server
+
+    from kinefit.serving.server import connection_log, guard
+
+    plain, used = server.serve, list[int]()
+
+    def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        def respond(connection: Any, request: Any) -> Any:
+            response = process_request(connection, request)
+            if response is not None:
+                response.headers["Content-Security-Policy"] = POLICY
+            return response
+
+        used.append(port)
+        options |= {"process_request": guard(access, respond), "logger": connection_log()}
+        return plain(handler, host, port, **options)
+
+    with _GUARDING:
+        server.serve = serve  # type: ignore[assignment, misc]
+        try:
+            yield used
+        finally:
+            server.serve = plain  # type: ignore[misc]
 
 
 def free_port(host: str, port: int) -> int:

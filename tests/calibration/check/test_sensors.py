@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.sensor_fit import SensorFit, doubts_of
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
 from kinefit.cli._check_refine import Refined
+from kinefit.diagnostics.sensor_fit import SensorFit, doubts_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.take.entries import DepthEntry, MarkersEntry

@@ -20,7 +20,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @pytest.fixture(scope="module")
 def found():
     nowhere = tuple(c.with_pose(np.eye(4)) for c in room())
-    return calibrate_people(nowhere, seen(), BODY, accuracy=2.0, height=BODY.stature)
+    return calibrate_people(nowhere, seen(), BODY, sigma=2.0, height=BODY.stature)
 
 
 def test_poses_come_from_nothing(found):
@@ -57,7 +57,7 @@ def test_the_world_stands_as_it_is_asked_to(found):
 
 def test_two_cameras_are_enough_when_they_stand_apart():
     pair, keypoints = room().select(("cam01", "cam02")), seen()[:2]
-    result = calibrate_people(tuple(pair), keypoints, BODY, accuracy=2.0)
+    result = calibrate_people(tuple(pair), keypoints, BODY, sigma=2.0)
     turn, _ = errors(result.rig, pair)
     assert turn < 0.5
 
@@ -71,7 +71,7 @@ def test_nearly_opposite_cameras_work_or_are_refused():
     pair = Rig((rig.cameras[0], opposite))
     keypoints = simulate_keypoints(walker(), pair, "BODY_25B", seed=4, **ERRORS)
     try:
-        result = calibrate_people(tuple(pair), keypoints, BODY, accuracy=2.0)
+        result = calibrate_people(tuple(pair), keypoints, BODY, sigma=2.0)
     except CalibrationError as error:
         assert error.remedy
     else:
@@ -85,7 +85,7 @@ def test_cameras_beside_each_other_alone_are_refused():
     pair = Rig((rig.cameras[0], replace(rig.cameras[0], name="cam02").with_pose(T)))
     keypoints = simulate_keypoints(walker(), pair, "BODY_25B", seed=5, **ERRORS)
     with pytest.raises(CalibrationError, match="differ"):
-        calibrate_people(tuple(pair), keypoints, BODY, accuracy=2.0)
+        calibrate_people(tuple(pair), keypoints, BODY, sigma=2.0)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_a_camera_beside_another_is_placed_by_the_rest():
     T[0, 3] += 0.05
     five = Rig((*rig.cameras, replace(rig.cameras[0], name="cam05").with_pose(T)))
     keypoints = simulate_keypoints(walker(), five, "BODY_25B", seed=6, **ERRORS)
-    result = calibrate_people(tuple(five), keypoints, BODY, accuracy=2.0)
+    result = calibrate_people(tuple(five), keypoints, BODY, sigma=2.0)
     assert errors(result.rig, five)[0] < 0.15
 
 
@@ -104,7 +104,7 @@ def test_a_camera_of_another_recording_is_named():
     points = np.random.default_rng(0).uniform(200, 900, keypoints[3].points.shape)
     keypoints[3] = replace(keypoints[3], points=points)
     with pytest.raises(CalibrationError, match="cam04"):
-        calibrate_people(tuple(room()), keypoints, BODY, accuracy=2.0)
+        calibrate_people(tuple(room()), keypoints, BODY, sigma=2.0)
 
 
 def test_a_camera_that_saw_nobody_is_named():
@@ -112,13 +112,13 @@ def test_a_camera_that_saw_nobody_is_named():
     blind = np.zeros_like(keypoints[1].confidence)
     keypoints[1] = replace(keypoints[1], points=np.full_like(keypoints[1].points, np.nan), confidence=blind)
     with pytest.raises(CalibrationError, match="cam02"):
-        calibrate_people(tuple(room()), keypoints, BODY, accuracy=2.0)
+        calibrate_people(tuple(room()), keypoints, BODY, sigma=2.0)
 
 
 @pytest.mark.slow
 def test_exchanged_sides_hardly_matter():
     swapped = simulate_keypoints(walker(), room(), "BODY_25B", seed=7, swaps=0.2, **ERRORS)
-    result = calibrate_people(tuple(room()), swapped, BODY, accuracy=2.0)
+    result = calibrate_people(tuple(room()), swapped, BODY, sigma=2.0)
     assert errors(result.rig, room())[0] < 0.15
 
 

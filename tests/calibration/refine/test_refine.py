@@ -26,7 +26,7 @@ def knocked(rig, seed=0, degrees=0.6, metres=0.03):
 
 @pytest.fixture(scope="module")
 def refined():
-    return refine(knocked(room()), seen(), BODY, accuracy=2.0)
+    return refine(knocked(room()), seen(), BODY, sigma=2.0)
 
 
 def test_a_knocked_rig_comes_back(refined):
@@ -64,11 +64,11 @@ def test_what_it_tells_names_every_camera(refined):
 @pytest.mark.slow
 def test_a_height_or_a_length_sets_the_scale():
     wide = resized(knocked(room()), 1.1)
-    by_height = refine(wide, seen(), BODY, accuracy=2.0, height=BODY.stature)
+    by_height = refine(wide, seen(), BODY, sigma=2.0, height=BODY.stature)
     assert aligned(by_height.rig, room())[2] == pytest.approx(1.0, abs=0.02)
     thigh = walker().positions(BODY.keypoints("BODY_25B").select(("RHip", "RKnee")))
     true = np.linalg.norm(np.diff(thigh, axis=1), axis=-1)
-    by_length = refine(wide, seen(), BODY, accuracy=2.0, known_length=("RHip", "RKnee", float(true.mean())))
+    by_length = refine(wide, seen(), BODY, sigma=2.0, known_length=("RHip", "RKnee", float(true.mean())))
     assert aligned(by_length.rig, room())[2] == pytest.approx(1.0, abs=0.03)
     assert "RHip to RKnee" in by_length.gauge
 
@@ -77,7 +77,7 @@ def test_static_points_join():
     random = np.random.default_rng(1)
     x = np.column_stack([random.uniform(-1.5, 1.5, (8, 2)), random.uniform(0, 1.8, 8)])
     points = {f"p{k}": {c.name: tuple(c.project(x[k])) for c in room()} for k in range(8)}
-    found = refine(knocked(room()), seen(), BODY, accuracy=2.0, static_points=points)
+    found = refine(knocked(room()), seen(), BODY, sigma=2.0, static_points=points)
     assert max(found.static.values()) < 1.0
     rig = aligned(found.rig, room())[0]
     left = np.concatenate([camera.project(x) - rig[camera.name].project(x) for camera in room()])
@@ -89,7 +89,7 @@ def test_clocks_are_found_to_a_fraction_of_a_frame():
     """The take has one and a half slow seconds; see benchmarks/calibrate.py for longer ones."""
     late = (0.0, 2.3, -0.6, 0.0)
     keypoints = [shifted(k, -f / 30.0) for k, f in zip(seen(), late, strict=True)]
-    found = refine(room(), keypoints, BODY, accuracy=2.0, time_offsets=True)
+    found = refine(room(), keypoints, BODY, sigma=2.0, time_offsets=True)
     np.testing.assert_allclose([30.0 * t for t in found.time_offsets.values()], late, atol=0.2)
 
 
@@ -99,7 +99,7 @@ def test_focal_lengths_are_found_on_request():
         tuple(replace(c, matrix=c.matrix * np.array([[f, 1, 1], [1, f, 1], [1, 1, 1]]))
               for c, f in zip(room(), (1.02, 0.98, 1.0, 1.01), strict=True))
     )  # fmt: skip
-    found = refine(wrong, seen(), BODY, accuracy=2.0, focal=True)
+    found = refine(wrong, seen(), BODY, sigma=2.0, focal=True)
     for camera, true in zip(found.rig, room(), strict=True):
         assert camera.matrix[0, 0] == pytest.approx(true.matrix[0, 0], rel=0.006)
         assert camera.matrix[0, 2] == true.matrix[0, 2]
@@ -113,7 +113,7 @@ def test_exchanged_cameras_are_named():
     names = room().names
     swapped = Rig(tuple(replace(room().cameras[k], name=n) for k, n in zip((0, 2, 1, 3), names, strict=True)))
     with pytest.raises(CalibrationError, match="exchanged"):
-        refine(swapped, seen(), BODY, accuracy=2.0)
+        refine(swapped, seen(), BODY, sigma=2.0)
 
 
 def test_a_person_who_hardly_moves_is_too_little():
@@ -133,7 +133,7 @@ def test_a_person_who_hardly_moves_is_too_little():
 def test_too_few_frames_are_refused():
     few = [replace(k, points=k.points[:6], confidence=k.confidence[:6]) for k in seen()]
     with pytest.raises(CalibrationError, match="only 6 of 6 frames"):
-        refine(room(), few, BODY, accuracy=2.0)
+        refine(room(), few, BODY, sigma=2.0)
 
 
 def test_impossible_wishes_are_refused():
@@ -211,7 +211,7 @@ def test_correlation_time_of_errors_that_last():
 
 
 def test_independent_errors_are_not_together():
-    sighting = sight(room(), seen(), BODY, accuracy=2.0, up="z", offsets={})
+    sighting = sight(room(), seen(), BODY, sigma=2.0, up="z", offsets={})
     assert togetherness(sighting) < 0.2
     c = sighting.channels
     group = c.source * 100 + c.points.segments[c.column]

@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import hashlib
 import json
 import re
 
@@ -32,6 +33,25 @@ def test_a_page_names_no_address_outside_of_itself():
         assert address.startswith(("#", "data:image/")), address
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
     assert "default-src 'none'" in policy and "http" not in policy
+
+
+def test_a_page_runs_its_own_scripts_and_styles_alone():
+    """By their hashes, as a browser takes them: of an element's whole text. plotly.js comes out of its package."""
+    from plotly.offline import get_plotlyjs
+
+    player = p.Html('<div class="player"></div>')
+    shots = p.gallery([p.picture(np.zeros((4, 4, 3), np.uint8))], size="small")
+    text = p.page("All", [p.plot([{"y": [1, 2]}]), p.table(["a"], [[p.shaded("x", 0.5)]]), player, shots])
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    allowed = dict(rule.split(" ", 1) for rule in policy.split("; "))
+
+    def hashes(texts):
+        return {f"'sha256-{base64.b64encode(hashlib.sha256(t.encode()).digest()).decode()}'" for t in texts}
+
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.S)
+    assert len(scripts) == 2 and set(allowed["script-src"].split()) == hashes([*scripts, get_plotlyjs()])
+    assert set(allowed["style-src"].split()) == hashes([*re.findall(r"<style>(.*?)</style>", text, re.S), ""])
+    assert "unsafe" not in policy and not re.search(r"<[^>]* (style|on\w+)=", own(text))
 
 
 def test_plotly_is_there_once_and_whole_where_there_are_plots_and_not_elsewhere():
@@ -115,10 +135,13 @@ def test_the_contents_link_to_the_sections_and_choices_show_the_first():
 
 
 def test_shades_grow_with_the_share_and_unknown_has_none():
-    grounds = [re.search(r"rgb\((\d+),(\d+),(\d+)\)", p.shaded("x", share)).groups() for share in (0.0, 0.5, 1.0, 7.0)]
+    style, grounds = p._shades(), []
+    for share in (0.0, 0.5, 1.0, 7.0):
+        name = re.search(r'class="([^"]*)"', p.shaded("x", share))[1]
+        grounds.append(re.search(rf"\.{name} {{ background: rgb\((\d+),(\d+),(\d+)\)", style).groups())
     blue = [int(ground[2]) for ground in grounds]
     assert blue[0] == 255 > blue[1] > blue[2] == blue[3]
-    assert "style" not in p.shaded("–", np.nan)
+    assert "class" not in p.shaded("–", np.nan)
 
 
 def test_the_files_that_a_page_is_made_of_name_no_address():

@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.audit import audit_take
 from kinefit.identification.audit.swaps import crossings, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
+from kinefit.simulation import squat_and_wave
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +58,36 @@ def test_an_exchange_of_one_frame_is_found_even_with_a_hidden_marker(walk, a, b,
     assert (found[0].first, found[0].last) == (120, 120)
 
 
+@pytest.fixture(scope="module")
+def waving():
+    """A simulated person with 41 labelled markers and 1 mm of noise: arms wave, knees bend."""
+    truth = squat_and_wave(rate=60.0, duration=4.0)
+    points, rng = placement(truth.body, "CMU_41").points, np.random.default_rng(0)
+    x = truth.positions(points)
+    return Markers(points.names, truth.rate, x + rng.normal(0.0, 0.001, x.shape), up=truth.up)
+
+
+@pytest.mark.parametrize("way", ["islands", "one island", "the other hidden", "at its end", "leaps into a gap"])
+@pytest.mark.parametrize(("a", "b"), [("LFWT", "LBWT"), ("RKNE", "RSHN"), ("LELB", "LFRM"), ("LTOE", "LHEE")])
+def test_an_exchange_of_one_frame_inside_a_gap_is_found(waving, way, a, b):
+    i, j = waving.names.index(a), waving.names.index(b)
+    x = np.array(waving.positions)
+    if way != "leaps into a gap":
+        x[90 if way != "at its end" else 120 : 140, i] = np.nan
+    if way != "one island":
+        x[95:130, j] = np.nan
+    x[120, i] = waving.positions[120, j]
+    x[120, j] = waving.positions[120, i] if way in ("islands", "one island") else np.nan
+    found = wrong(audit_take(replace(waving, positions=x)))
+    assert [(set(f.labels), f.first, f.last) for f in found] == [({a, b}, 120, 120)]
+
+
+def test_islands_with_their_own_labels_raise_no_alarm(waving):
+    rng, x = np.random.default_rng(1), np.array(waving.positions)
+    x[30:210] = np.where(rng.random((180, x.shape[1], 1)) < 0.5, np.nan, x[30:210])
+    assert wrong(audit_take(replace(waving, positions=x))) == []
+
+
 def test_three_turned_round_are_found_as_exchanges_of_them(walk):
     take = exchanged(exchanged(walk, "RELB", "RFRM", 50, 150), "RFRM", "RWRA", 50, 150)
     found = wrong(audit_take(take))
@@ -88,6 +120,15 @@ def test_real_errors_are_found(data_dir):
     take = read_markers(data_dir("markers_bmc_run") / "run" / "ExpData" / "motion_capture_run.trc")
     found = wrong(audit_take(take))  # two markers of a foot that change places every third frame
     assert found and all(set(f.labels) == {"RTOE", "RMT5"} for f in found)
+
+
+@pytest.mark.parametrize("trial", ["walking1", "walkingTO1"])
+def test_real_exchanges_at_the_ends_of_gaps_are_found(data_dir, trial):
+    """A thigh's markers: 2 to 5 mm from the other's place, 53 to 111 mm from their own."""
+    found = wrong(audit_take(read_markers(data_dir("forces_nimblephysics") / "subject4" / f"{trial}.trc")))
+    spans = {frozenset(f.labels): (f.first, f.last) for f in found}
+    right, left = frozenset({"r_thigh3", "r_thigh5"}), frozenset({"L_thigh2", "L_thigh4"})
+    assert spans == ({right: (7, 10)} if trial == "walking1" else {right: (6, 14), left: (18, 22)})
 
 
 @pytest.mark.parametrize(("file", "pairs"), [

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.calibration.board.bundle import moved_camera, pixel_columns
 from kinefit.geometry.camera import Rig
+from kinefit.solvers.least_squares import relax
 
 POSE = 6
 INTERIOR = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -129,7 +130,7 @@ class Problem:
                 new_x = x_world + d_ends.reshape(x_world.shape)
                 new = self.system(new_rig, new_x)
                 if new.cost < system.cost:
-                    rig, x_world, system, damping = new_rig, new_x, new, max(0.1 * damping, 1e-10)
+                    rig, x_world, system, damping = new_rig, new_x, new, relax(damping)
                     break
                 damping *= 10.0
             if not before - system.cost > 1e-7 * system.cost:

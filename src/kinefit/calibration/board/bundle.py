@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.solvers.least_squares import relax
 
 _POSE = 6
 _HUBER = 1.345  # standard deviations: 95 % efficient where errors are normal (Huber, 1981)
@@ -194,7 +195,7 @@ class _Problem:
                 new_boards = np.stack([T @ se3.exp(d) for T, d in zip(Ts_world_board, d_boards)])
                 new = self.system(new_rig, new_boards)
                 if new.cost < system.cost:
-                    rig, Ts_world_board, system, damping = new_rig, new_boards, new, max(0.1 * damping, 1e-9)
+                    rig, Ts_world_board, system, damping = new_rig, new_boards, new, relax(damping)
                     break
                 damping *= 10.0
             if not before - system.cost > 1e-6 * system.cost:

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from kinefit.calibration.check.findings import Finding
-from kinefit.calibration.check.sensor_fit import SURE, SensorFit, marker_index
+from kinefit.diagnostics.sensor_fit import SURE, SensorFit, marker_index
 from kinefit.errors import command
+from kinefit.findings import Finding
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.readers.take.entries import MarkersEntry

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
-from kinefit.calibration.check.sensor_fit import PRIOR, SensorFit, doubts_of
+from kinefit.diagnostics.sensor_fit import PRIOR, SensorFit, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.rigid_pairs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
@@ -21,7 +21,7 @@ from kinefit.calibration.refine.sightings import Progress, Sighting
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.observations import Keypoints
+from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import CameraPrior, PointPixels
 
@@ -31,6 +31,7 @@ _ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
 _AGREE = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
 
 
+@renamed(accuracy="sigma")
 @checked
 def calibrate_people(
     cameras: Sequence[Camera],
@@ -42,7 +43,7 @@ def calibrate_people(
     focal: bool = False,
     time_offsets: bool = False,
     up: str = "z",
-    accuracy: float = 8.0,
+    sigma: float = KEYPOINT_SIGMA,
     progress: Progress | None = None,
 ) -> Refinement:
     """Poses of cameras whose intrinsics are known, from a person who moves in front of them.
@@ -72,23 +73,23 @@ def calibrate_people(
     check_input(given, keypoints, height, known_length)
     step("first cameras", 0, 2)
     alone = [steady_person(record) for record in keypoints]
-    channels = make_channels(body, given, alone, [np.zeros(len(k), int) for k in alone], [accuracy] * len(alone))
+    channels = make_channels(body, given, alone, [np.zeros(len(k), int) for k in alone], [sigma] * len(alone))
     uv = common_pixels(channels)
-    rig = first_rig(given, uv.reshape(-1, len(given), 2), accuracy)
+    rig = first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
-    rig, x = _adjusted(rig, uv, accuracy, focal=focal)
+    rig, x = _adjusted(rig, uv, sigma, focal=focal)
     factor = _whole_scale(body, channels.points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, channels.points), up=up)
     step("first cameras", 2, 2)
-    sigma = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=time_offsets)
-    sigma[:, :3], sigma[:, 3:6] = _ANYWHERE
-    prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), sigma)
+    prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=time_offsets)
+    prior_std[:, :3], prior_std[:, 3:6] = _ANYWHERE
+    prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
     def stand(rig: Rig, seen: Sighting) -> tuple[Rig, str]:
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
     return refine_from(
-        rig, keypoints, body, prior, up=up, accuracy=accuracy, progress=progress, gauge=stand,
+        rig, keypoints, body, prior, up=up, sigma=sigma, progress=progress, gauge=stand,
         from_scratch=True,
     )  # fmt: skip
 
@@ -130,19 +131,19 @@ def common_pixels(channels: Channels) -> NDArray:
     return out
 
 
-def _adjusted(rig: Rig, uv: NDArray, accuracy: float, *, focal: bool) -> tuple[Rig, NDArray]:
+def _adjusted(rig: Rig, uv: NDArray, sigma: float, *, focal: bool) -> tuple[Rig, NDArray]:
     """The rig adjusted with free points, and the points (F, K, 3) in its units."""
     flat = uv.reshape(-1, len(rig), 2)
-    x, agree, _ = triangulate_robust(rig, flat, max_residual_px=_AGREE * accuracy)
+    x, agree, _ = triangulate_robust(rig, flat, max_residual_px=_AGREE * sigma)
     good = np.flatnonzero(agree.sum(axis=1) >= 2)
     good = good[np.unique(np.linspace(0, len(good) - 1, min(_MOST, len(good))).astype(int))]
     point, camera = np.nonzero(np.isfinite(flat[good]).all(axis=-1))
-    pixels = PointPixels(camera, point, flat[good][point, camera], np.full(len(point), accuracy**-2))
-    sigma = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=False)
+    pixels = PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
+    prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=False)
     size = np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0))
-    sigma[:, :3], sigma[:, 3:6] = 10.0 * size, _ANYWHERE[1]
-    rig = bundle_adjust(rig, pixels, x[good], CameraPrior(rig, sigma)).rig
-    x = triangulate_robust(rig, flat, max_residual_px=_AGREE * accuracy)[0]
+    prior_std[:, :3], prior_std[:, 3:6] = 10.0 * size, _ANYWHERE[1]
+    rig = bundle_adjust(rig, pixels, x[good], CameraPrior(rig, prior_std)).rig
+    x = triangulate_robust(rig, flat, max_residual_px=_AGREE * sigma)[0]
     return rig, x.reshape(*uv.shape[:2], 3)
 
 

@@ -17,7 +17,7 @@ _APART = np.radians(3.0)  # angle between two cameras' rays below which they tel
 _WITHIN = 3.0  # standard deviations of a keypoint that agrees
 
 
-def first_rig(rig: Rig, uv: NDArray, accuracy: float) -> Rig:
+def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
     """Poses of all cameras of a rig up to place, turn and scale; the poses it has are not used.
 
     The pair with the most keypoints that agree, seen from the most different sides, comes first (essential matrix by
@@ -27,7 +27,7 @@ def first_rig(rig: Rig, uv: NDArray, accuracy: float) -> Rig:
     Parameters
     ----------
     uv : (P, C, 2) [px] of points that one or more cameras saw, NaN where unseen.
-    accuracy : float [px] standard deviation of a pixel.
+    sigma : float [px] standard deviation of a pixel.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def first_rig(rig: Rig, uv: NDArray, accuracy: float) -> Rig:
     pairs = {
         (i, j): found
         for i in range(len(rig)) for j in range(i + 1, len(rig))
-        if (found := _relative_pose(rig, flat, i, j, accuracy)) is not None
+        if (found := _relative_pose(rig, flat, i, j, sigma)) is not None
     }
     if not pairs:
         raise CalibrationError(
@@ -48,8 +48,8 @@ def first_rig(rig: Rig, uv: NDArray, accuracy: float) -> Rig:
     first = max(pairs, key=lambda pair: pairs[pair][1])
     poses: dict[int, NDArray] = {first[0]: np.eye(4), first[1]: pairs[first][0]}
     while len(poses) < len(rig):
-        x = _points(rig, poses, uv, accuracy)
-        trials = {c: _laid_on(rig.cameras[c], flat[:, c], x, accuracy) for c in range(len(rig)) if c not in poses}
+        x = _points(rig, poses, uv, sigma)
+        trials = {c: _laid_on(rig.cameras[c], flat[:, c], x, sigma) for c in range(len(rig)) if c not in poses}
         best = max(trials, key=lambda c: trials[c][1])
         if trials[best][1] < _LEAST:
             names = ", ".join(rig.names[c] for c in trials)
@@ -71,7 +71,7 @@ def _thinned(index: NDArray) -> NDArray:
     return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MOST)).astype(int))]
 
 
-def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, accuracy: float) -> tuple[NDArray, float] | None:
+def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, sigma: float) -> tuple[NDArray, float] | None:
     """T_j_i (4, 4), translation of length 1, and how good a start the pair is; None where it is none."""
     both = _thinned(np.flatnonzero(np.isfinite(flat[:, [i, j]]).all(axis=(1, 2))))
     if len(both) < _LEAST:
@@ -80,7 +80,7 @@ def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, accuracy: float) -> 
     focal = np.mean([rig.cameras[c].matrix[0, 0] for c in (i, j)])
     cv2.setRNGSeed(0)
     E, mask = cv2.findEssentialMat(
-        a, b, np.eye(3), method=cv2.RANSAC, prob=0.99999, threshold=_WITHIN * accuracy / focal, maxIters=3000
+        a, b, np.eye(3), method=cv2.RANSAC, prob=0.99999, threshold=_WITHIN * sigma / focal, maxIters=3000
     )
     if E is None or E.shape != (3, 3):
         return None
@@ -95,14 +95,14 @@ def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, accuracy: float) -> 
     return (T, count * np.sin(angle)) if _APART < angle < np.pi - _APART else None
 
 
-def _points(rig: Rig, poses: dict[int, NDArray], uv: NDArray, accuracy: float) -> NDArray:
+def _points(rig: Rig, poses: dict[int, NDArray], uv: NDArray, sigma: float) -> NDArray:
     """(P, 3) points on which two of the cameras known so far agree, NaN elsewhere."""
     known = sorted(poses)
     part = Rig(tuple(rig.cameras[c].with_pose(poses[c]) for c in known))
-    return triangulate_robust(part, uv[:, known], max_residual_px=_WITHIN * accuracy)[0]
+    return triangulate_robust(part, uv[:, known], max_residual_px=_WITHIN * sigma)[0]
 
 
-def _laid_on(camera: Camera, flat: NDArray, x: NDArray, accuracy: float) -> tuple[NDArray, int]:
+def _laid_on(camera: Camera, flat: NDArray, x: NDArray, sigma: float) -> tuple[NDArray, int]:
     """T_camera_world (4, 4) of a camera that sees points x (P, 3), and how many agree."""
     both = _thinned(np.flatnonzero(np.isfinite(flat).all(axis=1) & np.isfinite(x).all(axis=1)))
     if len(both) < _LEAST:
@@ -110,7 +110,7 @@ def _laid_on(camera: Camera, flat: NDArray, x: NDArray, accuracy: float) -> tupl
     cv2.setRNGSeed(0)
     ok, turn, shift, inliers = cv2.solvePnPRansac(
         np.ascontiguousarray(x[both]), np.ascontiguousarray(flat[both]), np.eye(3), None, iterationsCount=1000,
-        reprojectionError=_WITHIN * accuracy / camera.matrix[0, 0], confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
+        reprojectionError=_WITHIN * sigma / camera.matrix[0, 0], confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
     )
     if not ok or inliers is None or len(inliers) < _LEAST:
         return np.eye(4), 0

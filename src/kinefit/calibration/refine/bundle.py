@@ -19,6 +19,7 @@ from kinefit.solvers.cameras import (
     residuals,
     robust_cost,
 )
+from kinefit.solvers.least_squares import relax
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ def bundle_adjust(
             new_x, new_offsets = x + system.points_step(delta), offsets + by_camera[:, TIME]
             new = cost_of(new_rig, new_offsets, new_x)
             if new < cost:
-                rig, x, offsets, cost, damping = new_rig, new_x, new_offsets, new, max(0.1 * damping, 1e-9)
+                rig, x, offsets, cost, damping = new_rig, new_x, new_offsets, new, relax(damping)
                 break
             damping *= 10.0
         if not before - cost > tolerance * cost:

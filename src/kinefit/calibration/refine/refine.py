@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
 from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
@@ -24,7 +24,7 @@ from kinefit.calibration.refine.uncertainty import bias, chance
 from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
-from kinefit.observations import Keypoints
+from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.solvers.body_bundle import fit_body_and_cameras
 from kinefit.solvers.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
@@ -47,6 +47,7 @@ Length = tuple[str, str, float]
 Gauge = Callable[[Rig, Sighting], tuple[Rig, str]]
 
 
+@renamed(accuracy="sigma")
 @checked
 def refine(
     rig: Rig,
@@ -60,7 +61,7 @@ def refine(
     height: float | None = None,
     known_length: Length | None = None,
     up: str = "z",
-    accuracy: float = 8.0,
+    sigma: float = KEYPOINT_SIGMA,
     progress: Progress | None = None,
 ) -> Refinement:
     """A rig set right by the person that it saw, and by static points where some are given.
@@ -78,7 +79,7 @@ def refine(
     static_points : {name: {camera: (u, v)}} [px] in the calibration's image, of things that did not move.
     height : float [m] stature of the person: sets the scale.
     known_length : (point, point, [m]): sets the scale; static points or keypoints of the body.
-    accuracy : float [px] standard deviation of a sure keypoint.
+    sigma : float [px] standard deviation of a sure keypoint.
 
     Raises
     ------
@@ -88,30 +89,30 @@ def refine(
         Streams that differ; a height, length or static point that cannot be.
     """
     check_input(rig, keypoints, height, known_length, static_points)
-    sigma = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
+    prior_std = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
 
     def gauge(new: Rig, seen: Sighting) -> tuple[Rig, str]:
         return _in_old_frame(new, rig, seen, static_points or {}, height, known_length)
 
     return refine_from(
-        rig, keypoints, body, CameraPrior(rig, sigma), up=up, accuracy=accuracy, gauge=gauge,
+        rig, keypoints, body, CameraPrior(rig, prior_std), up=up, sigma=sigma, gauge=gauge,
         static_points=static_points, progress=progress,
     )  # fmt: skip
 
 
 def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bool) -> NDArray:
     """(C, 10) how far each parameter of a calibrated camera may be off."""
-    sigma = np.zeros((cameras, COLUMNS))
-    sigma[:, :3], sigma[:, 3:6] = PLACE_SIGMA, TURN_SIGMA
-    sigma[:, FOCAL] = _FOCAL_SIGMA * focal
-    sigma[:, RADIAL] = _RADIAL_SIGMA * distortion
-    sigma[:, TIME] = _TIME_SIGMA * time_offsets
-    return sigma
+    prior_std = np.zeros((cameras, COLUMNS))
+    prior_std[:, :3], prior_std[:, 3:6] = PLACE_SIGMA, TURN_SIGMA
+    prior_std[:, FOCAL] = _FOCAL_SIGMA * focal
+    prior_std[:, RADIAL] = _RADIAL_SIGMA * distortion
+    prior_std[:, TIME] = _TIME_SIGMA * time_offsets
+    return prior_std
 
 
 def refine_from(
     rig: Rig, keypoints: Sequence[Keypoints], body: Body, prior: CameraPrior, *, up: str,
-    accuracy: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
+    sigma: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
     from_scratch: bool = False,
 ) -> Refinement:  # fmt: skip
     """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule."""
@@ -122,10 +123,10 @@ def refine_from(
     rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
-        seen = _sight(rig, keypoints, body, accuracy, up, offsets)
+        seen = _sight(rig, keypoints, body, sigma, up, offsets)
         first = first or seen
         off = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH
-        if off > 2.0 * accuracy:  # so far off, a robust loss would take most of what is seen for outliers
+        if off > 2.0 * sigma:  # so far off, a robust loss would take most of what is seen for outliers
             seen = _sight(rig, keypoints, body, min(off, _COARSEST), up, offsets)
         chosen = spread_frames(seen, _MOST_FRAMES)
         _check_frames(seen, chosen)
@@ -143,7 +144,7 @@ def refine_from(
     step("refining", rounds, rounds + 1)
     covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, velocity, prior, static)
     rig, rule = gauge(rig, seen)
-    last = _sight(rig, keypoints, body, accuracy, up, offsets)
+    last = _sight(rig, keypoints, body, sigma, up, offsets)
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
@@ -156,11 +157,11 @@ def refine_from(
 
 
 def _sight(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, accuracy: float, up: str, offsets: NDArray
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, sigma: float, up: str, offsets: NDArray
 ) -> Sighting:
     try:
         late = dict(zip(rig.names, offsets.tolist(), strict=True))
-        return sight(rig, keypoints, body, accuracy=accuracy, up=up, offsets=late)
+        return sight(rig, keypoints, body, sigma=sigma, up=up, offsets=late)
     except TrackingError as error:
         raise CalibrationError(
             f"the cameras agree on nobody ({error.problem})",

@@ -90,14 +90,14 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
 
 
 def sight(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, *, accuracy: float, up: str,
+    rig: Rig, keypoints: Sequence[Keypoints], body: Body, *, sigma: float, up: str,
     offsets: Mapping[str, float], progress: Progress | None = None,
 ) -> Sighting:  # fmt: skip
     """Track one person with a rig whose cameras' clocks are late by `offsets` [s]."""
     alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
-    channels = make_channels(body, rig, alone, choose_people(rig, alone), [accuracy] * len(alone))
+    channels = make_channels(body, rig, alone, choose_people(rig, alone), [sigma] * len(alone))
     subject = fit_subject(body, channels)
-    recording = Recording.of_keypoints(rig, alone, accuracy=accuracy, up=up)
+    recording = Recording.of_keypoints(rig, alone, sigma=sigma, up=up)
     motion = track(recording, body, subject=subject, smooth=False, progress=progress)
     uv = np.concatenate([motion.residuals[name].measured for name in channels.sources], axis=1)
     own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)

@@ -220,12 +220,12 @@ def _stacked(
         }  # fmt: skip
         unseen = [c.side or "all of it" for c in sides if not np.isfinite(c.std).any()]
         stem = sides[0].stem
-        text = f"<b>{NAMES.get(stem, stem)}</b>" + (f"  {stem}" if stem in NAMES else "")
+        text = NAMES.get(stem, stem) + (f"  {stem}" if stem in NAMES else "")
         text += f"  + {_POSITIVE[sides[0].stem]}" if sides[0].stem in _POSITIVE else ""
-        text += f"  <i>not observed: {' and '.join(unseen)}</i>" if unseen else ""
+        text += f"  (not observed: {' and '.join(unseen)})" if unseen else ""
         notes.append({
             "text": text, "x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom",
-            "showarrow": False, "font": {"size": 12.5},
+            "showarrow": False, "font": {"size": 12.5, "weight": 600},  # a part in bold would be a style of its element
         })  # fmt: skip
     layout["xaxis"] = {"title": x, "anchor": f"y{n}" if n > 1 else "y"}
     layout |= {"annotations": notes, "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1 + 32 / height,

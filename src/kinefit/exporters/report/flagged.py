@@ -31,7 +31,7 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
             for camera, frames in pictures.items() if m.worst in frames
         ]  # fmt: skip
         severity = "bad" if motion.quality[m.worst] <= 0 else "warning"
-        seen = [p.folded("Pictures", p.gallery(shots, smallest=170))] if shots else []
+        seen = [p.folded("Pictures", p.gallery(shots, size="small"))] if shots else []
         out.append(p.callout(severity, _when(motion, m), " ".join(m.what + m.causes), *seen))
     if len(moments) > MOMENTS:
         rest = moments[MOMENTS : MOMENTS + _MOST]

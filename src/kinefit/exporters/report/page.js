@@ -49,7 +49,7 @@
   const shown = place => place.offsetParent !== null;
   const watch = new IntersectionObserver(entries => entries.forEach(e => { if (e.isIntersecting) draw(e.target); }),
     { rootMargin: "400px" });
-  document.querySelectorAll(".plot").forEach(place => watch.observe(place));
+  document.querySelectorAll(".plot").forEach(place => { place.style.height = `${place.dataset.height}px`; watch.observe(place); });
   // The library is unpacked when the page has come to rest, so that printing finds it ready.
   if (document.querySelector(".plot")) addEventListener("load", () => setTimeout(plotly, 500));
   addEventListener("beforeprint", () => document.querySelectorAll(".plot").forEach(draw));

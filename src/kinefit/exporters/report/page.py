@@ -30,16 +30,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
+from kinefit.serving.policy import inline_policy
 
 # Okabe and Ito's colours, which common kinds of colour blindness tell apart; left blue, right orange as in overlays.
 LEFT, RIGHT, CENTRE = "#0072b2", "#d55e00", "#009e73"
 SERIES = (LEFT, RIGHT, CENTRE, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
 SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
 
-_POLICY = (
-    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
-    "script-src 'unsafe-inline' 'unsafe-eval'; font-src data:; base-uri 'none'; form-action 'none'"
-)
+_SHADES = 20  # steps of the ground of a table's cell, from white to the right side's orange; text stays dark on all
 
 
 class Html(str):
@@ -72,22 +70,27 @@ def page(title: str, sections: Iterable[Section | str], *, subtitle: str = "", c
     parts = list(sections)
     links = [f'<a href="#{p.anchor}">{escape(p.title)}</a>' for p in parts if isinstance(p, Section)]
     body = "\n".join(_section_html(p) if isinstance(p, Section) else inline(p) for p in parts)
-    scripts = [f"<script>{_resource('page.js')}</script>"]
-    if 'class="player"' in body:
-        scripts.append(f"<script>{_resource('player.js')}</script>")
+    scripts = [_resource(name) for name in ("page.js", *(["player.js"] if 'class="player"' in body else []))]
+    style, library, allowed = _resource("page.css") + _shades(), "", list(scripts)
     if 'class="plot"' in body:
-        scripts.insert(0, f'<script type="text/plain" id="plotly-gzip">{_plotly()}</script>')
+        from plotly.offline import get_plotlyjs
+
+        library = f'<script type="text/plain" id="plotly-gzip">{_plotly()}</script>'
+        allowed.append(get_plotlyjs())
+    # plotly.js adds its rules to style elements that are empty when they are made
+    policy = inline_policy(allowed, [style, ""], "img-src data: blob:; font-src data:")
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{escape(title)}</title>\n<style>{_resource('page.css')}</style>\n</head>\n<body>",
+            f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>",
             f"<header><h1>{escape(title)}</h1>" + (f'<p class="sub">{inline(subtitle)}</p>' if subtitle else ""),
             (f"<nav>{''.join(links)}</nav>" if contents and links else "") + "</header>\n<main>",
             "<noscript><p>The plots and the moving figure of this page need JavaScript.</p></noscript>",
             f"{body}\n</main>",
-            *scripts,
+            library,
+            *(f"<script>{script}</script>" for script in scripts),
             "</body>\n</html>\n",
         ]
     )
@@ -196,9 +199,7 @@ def shaded(text: str, share: float) -> Html:
     """Cell of a table whose ground is the darker the nearer `share` is to 1; none where it is not finite."""
     if not math.isfinite(share):
         return Html(f"<td>{inline(text)}</td>")
-    share = min(max(share, 0.0), 1.0)  # white to the right side's orange; text stays dark on all of them
-    red, green, blue = (round(255 + (end - 255) * 0.75 * share) for end in (213, 94, 0))
-    return Html(f'<td style="background:rgb({red},{green},{blue})">{inline(text)}</td>')
+    return Html(f'<td class="shade-{round(_SHADES * min(max(share, 0.0), 1.0))}">{inline(text)}</td>')
 
 
 def quote(text: str) -> Html:
@@ -245,9 +246,9 @@ def picture(
     )
 
 
-def gallery(pictures: Iterable[Html], *, smallest: int = 220) -> Html:
-    """Pictures side by side, none narrower than `smallest` px."""
-    return Html(f'<div class="gallery" style="--least:{smallest}px">{"".join(pictures)}</div>')
+def gallery(pictures: Iterable[Html], *, size: str = "medium") -> Html:
+    """Pictures side by side, none narrower than 170 ("small"), 230 ("medium") or 420 px ("large")."""
+    return Html(f'<div class="gallery gallery-{size}">{"".join(pictures)}</div>')
 
 
 def plot(
@@ -274,7 +275,7 @@ def plot(
     data = to_json({"data": list(traces), "layout": {**dict(layout or {}), "height": height}})
     marks = " data-seeks" if seeks else ""
     return Html(
-        f'<div class="plot" role="img" aria-label="{escape(label)}" style="height:{height}px"{marks}>'
+        f'<div class="plot" role="img" aria-label="{escape(label)}" data-height="{height}"{marks}>'
         f'<script type="application/json">{data}</script></div>'
     )
 
@@ -308,6 +309,15 @@ def _section_html(part: Section) -> Html:
 @lru_cache(maxsize=8)
 def _resource(name: str) -> str:
     return Path(__file__).with_name(name).read_text("utf-8")
+
+
+def _shades() -> str:
+    """Rules of `shaded` cells: a page's policy allows no style of a single element."""
+    rules = []
+    for k in range(_SHADES + 1):
+        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in (213, 94, 0))
+        rules.append(f".shade-{k} {{ background: rgb({red},{green},{blue}); }}\n")
+    return "".join(rules)
 
 
 @lru_cache(maxsize=1)

@@ -23,6 +23,7 @@ from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import cycle_plots, joint_plots
 from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
+from kinefit.exporters.report.findings import fault_sections
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
 from kinefit.exporters.report.flagged import Pictures, flagged
 from kinefit.exporters.report.methods import lengths_table, methods
@@ -39,6 +40,7 @@ from kinefit.exporters.report.names import spoken
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.pictures import report_frames
 from kinefit.exporters.report.ranges import ranges_table
+from kinefit.findings import of_provenance
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
@@ -100,6 +102,7 @@ def write_report(
     _check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
     sections = [
+        *fault_sections(of_provenance(motion.provenance)),
         _summary(motion, moments, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
             "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; grey was not "
@@ -142,7 +145,8 @@ def _summary(
 ) -> p.Section:
     nobody = float(np.mean(motion.quality <= 0))
     doubtful = float(np.mean(motion.quality < DOUBTFUL))
-    severity = "bad" if nobody > 0.1 or doubtful > 0.5 else "warning" if moments else "good"
+    wrong = nobody > 0.1 or doubtful > 0.5 or of_provenance(motion.provenance)
+    severity = "bad" if wrong else "warning" if moments else "good"
     severity = severity if motion.residuals else "note"
     notes: list[str] = []
     if moments:
@@ -287,5 +291,5 @@ def _pictures(motion: Motion, pictures: Pictures, width: int) -> list[p.Html]:
             for f, what in sorted(names.items()) if f in frames
         ]  # fmt: skip
         if shots:
-            out += [p.heading(camera), p.gallery(shots, smallest=170)]
+            out += [p.heading(camera), p.gallery(shots, size="small")]
     return out

@@ -122,7 +122,8 @@ def _bvh(motion: Motion, found: Retargeted) -> Iterator[str]:
     """Lines of the character's BVH with another motion."""
     character = found.character
     head = re.split(r"^[ \t]*MOTION\b", character.text, maxsplit=1, flags=re.M | re.I)[0]
-    channels = [words.lower().split() for words in re.findall(r"^\s*CHANNELS\s+\d+\s+(.*)$", head, flags=re.M | re.I)]
+    lines = re.findall(r"^[ \t]*CHANNELS[ \t]+\d+[ \t]+(.*)$", head, flags=re.M | re.I)
+    channels = [words.lower().split() for words in lines]
     joints = [node for node, name in enumerate(character.names) if not name.endswith("_end")]
     if len(channels) != len(joints):
         remedy = "Export the character again, one CHANNELS line for each joint."

@@ -240,14 +240,14 @@ def _root(
 
 
 def _lowest(character: Character, nodes: Mapping[str, int], D: NDArray, places: NDArray) -> NDArray:
-    """(F,) [m] height of the lowest point of the soles; without a mesh, of the joints of the feet."""
+    """(F,) [m] height of the lowest point of the soles; without a mesh of them, of the joints of the feet."""
     out = []
     for side in "lr":
         below = _below(character, nodes[f"foot_{side}"])
-        floor = character.positions[below, 1].min()
+        floor, soles = character.positions[below, 1].min(), np.isin(character.owners, below).any()
         for node in below:
             points = character.points[character.owners == node]
-            if not len(character.points):  # below each joint, at the height of the lowest
+            if not soles:  # below each joint, at the height of the lowest
                 points = character.positions[[node]] * (1.0, 0.0, 1.0) + (0.0, floor, 0.0)
             if len(points):
                 away = _hull(points) - character.positions[node]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
+from kinefit.identification.audit.gaps import exchanges_in_gaps
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
-from kinefit.identification.audit.swaps import best_run, crossings, glitches, pair_gain, swap_gains
+from kinefit.identification.audit.swaps import JOIN, best_run, crossings, glitches, pair_gain, runs, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import Consistency
@@ -48,9 +50,6 @@ LEAST_FRAMES = 3
 
 LEAP = 0.02
 """[m] by which a trajectory that changes over to another marker's jumps, at least."""
-
-JOIN = 10
-"""Frames between two spans of one thing that are told as one span."""
 
 MOST_FRAMES = 400
 """Frames at which all exchanges of two are tried, spread over the take; jumps are looked for in all."""
@@ -151,7 +150,8 @@ def _sorted(found: list[AuditFinding]) -> list[AuditFinding]:
         last = out[-1] if out else None
         same = last is not None and f.kind == "swapped" and (last.kind, last.labels) == (f.kind, f.labels)
         if last is not None and same and f.first - last.last <= JOIN:
-            what = last.text.partition(" in frames ")[0].removesuffix(", on and off,")
+            each = {g.text.partition(" in frames ")[0].removesuffix(", on and off,") for g in (last, f)}
+            what = each.pop() if len(each) == 1 else f"{f.labels[0]} and {f.labels[1]} are swapped"
             text = f"{what}, on and off, in frames {last.first} to {f.last}"
             out[-1] = replace(last, last=f.last, text=text)
         else:
@@ -192,12 +192,13 @@ def _swaps(
     step = max(1, -(-len(positions) // MOST_FRAMES))
     found: list[AuditFinding] = []
     broken = crossings(positions, LEAP)[1]
-    for a, b, first, last in glitches(positions, least=LEAP):
-        span = slice(first, last + 1)
-        better = pair_gain(positions[span], a, b, mean, deviation).sum() > 0
-        if better and not _stay(agree, positions, broken, (a, b), first, last):
-            found.append(_swap(positions[span], (a, b), labels, first, last, len(positions)))
-            positions[span, a], positions[span, b] = positions[span, b].copy(), positions[span, a].copy()
+    for look in (glitches, partial(exchanges_in_gaps, mean=mean, deviation=deviation)):
+        for a, b, first, last in look(positions, least=LEAP):
+            span = slice(first, last + 1)
+            better = pair_gain(positions[span], a, b, mean, deviation).sum() > 0
+            if better and not _stay(agree, positions, broken, (a, b), first, last):
+                found.append(_swap(positions[span], (a, b), labels, first, last, len(positions)))
+                positions[span, a], positions[span, b] = positions[span, b].copy(), positions[span, a].copy()
     met, broken = crossings(positions, LEAP)
     refused: set[tuple[int, int, int, int]] = set()
     told = len(found)
@@ -338,12 +339,3 @@ def _swap(
     when = "throughout" if always else f"in frames {first} to {last}"
     text = f"{what} {when}" + (f" ({100 * size:.0f} cm apart)" if np.isfinite(size) else "")
     return AuditFinding("throughout" if always else "swapped", names, first, last, size, text)
-
-
-def runs(flags: NDArray, join: int = JOIN) -> list[tuple[int, int]]:
-    """First and last of each run of true flags; runs less than `join` apart are one."""
-    at = np.flatnonzero(flags)
-    if not len(at):
-        return []
-    cut = np.flatnonzero(np.diff(at) > join)
-    return [(int(at[a]), int(at[b])) for a, b in zip([0, *(cut + 1)], [*cut, len(at) - 1])]

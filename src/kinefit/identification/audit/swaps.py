@@ -11,6 +11,9 @@ MOST = 5.0
 TAIL = 1.5
 """A distance strays this much more than its deviation tells: it is learnt from the middle of what was seen."""
 
+JOIN = 10
+"""Frames between two spans of one thing that are told as one span."""
+
 
 def place_costs(positions: NDArray, mean: NDArray, deviation: NDArray) -> tuple[NDArray, NDArray]:
     """What it costs to call a point by another's label.
@@ -112,6 +115,14 @@ def crossings(
     return found, broken
 
 
+def passing(positions: NDArray, length: int) -> tuple[NDArray, NDArray]:
+    """(n, length, K, 3) [m] where labels are in spans of so many frames, and where they pass from before to after."""
+    before, after = positions[: -length - 1], positions[length + 1 :]
+    usual = np.stack([before + (after - before) * (i + 1) / (length + 1) for i in range(length)], axis=1)
+    here = np.stack([positions[i + 1 : len(positions) - length + i] for i in range(length)], axis=1)
+    return here, usual
+
+
 def glitches(
     positions: NDArray, longest: int = 2, least: float = 0.02, better: float = 0.35
 ) -> list[tuple[int, int, int, int]]:
@@ -123,9 +134,7 @@ def glitches(
     found: list[tuple[int, int, int, int]] = []
     taken = np.zeros(positions.shape[:2], bool)
     for length in range(1, longest + 1):
-        before, after = positions[: -length - 1], positions[length + 1 :]
-        usual = np.stack([before + (after - before) * (i + 1) / (length + 1) for i in range(length)], axis=1)
-        here = np.stack([positions[i + 1 : len(positions) - length + i] for i in range(length)], axis=1)
+        here, usual = passing(positions, length)
         off = np.linalg.norm(here - usual, axis=-1).min(axis=1)  # (F, K), NaN where not seen throughout
         for f, a in np.argwhere(off > least).tolist():
             across = np.linalg.norm(here[f][:, a, None] - usual[f], axis=-1).max(axis=0)
@@ -141,3 +150,12 @@ def glitches(
                 taken[rows, a] = taken[rows, b] = True
                 found.append((min(a, b), max(a, b), f + 1, f + length))
     return found
+
+
+def runs(flags: NDArray, join: int = JOIN) -> list[tuple[int, int]]:
+    """First and last of each run of true flags; runs less than `join` apart are one."""
+    at = np.flatnonzero(flags)
+    if not len(at):
+        return []
+    cut = np.flatnonzero(np.diff(at) > join)
+    return [(int(at[a]), int(at[b])) for a, b in zip([0, *(cut + 1)], [*cut, len(at) - 1])]

@@ -47,7 +47,7 @@
   function open() {
     socket = new WebSocket(location.href.replace(/^http/, "ws"));
     socket.onmessage = event => { const p = JSON.parse(event.data); (act[p.type] || (() => {}))(p); };
-    socket.onclose = () => { told.textContent = "the session is over; this page waits for the next one"; setTimeout(open, 1000); };
+    socket.onclose = () => { told.textContent = "the session is over; a next one with the same token is shown here"; setTimeout(open, 1000); };
   }
   open();
 })();

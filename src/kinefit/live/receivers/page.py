@@ -11,12 +11,16 @@ from kinefit.bodies import Body
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import to_json
 from kinefit.motion import rotation_between_up
+from kinefit.serving.policy import inline_policy
+from kinefit.serving.server import Page
+
+_WAITING = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="1"><p>waiting for the body'
 
 
-def page(title: str, body: Body | None, up: str) -> str:
+def live_page(title: str, body: Body | None, up: str) -> Page:
     """Self-contained HTML; without a body it loads itself again until there is one."""
     if body is None:
-        return '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="1"><p>waiting for the body'
+        return Page(_WAITING.encode())
     figure, capsules = live_figure(body)
     report = resources.files("kinefit.exporters.report")
     own = resources.files("kinefit.live.receivers")
@@ -24,12 +28,13 @@ def page(title: str, body: Body | None, up: str) -> str:
         "segments": np.asarray(capsules.segments), "points": np.asarray(capsules.points),
         "turn": rotation_between_up(up, "z"),
     }  # fmt: skip
-    return (
+    style = (report / "page.css").read_text("utf-8") + (own / "page.css").read_text("utf-8")
+    scripts = [(room / name).read_text("utf-8") for room, name in ((report, "player.js"), (own, "page.js"))]
+    html = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{(report / "page.css").read_text()}'
-        f'{(own / "page.css").read_text()}</style></head><body><main><h1>{escape(title)}</h1>'
-        f'<p id="told">waiting</p>{figure}<p id="sensors"></p></main>'
+        f'<meta name="viewport" content="width=device-width"><style>{style}</style></head><body><main>'
+        f'<h1>{escape(title)}</h1><p id="told">waiting</p>{figure}<p id="sensors"></p></main>'
         f'<script type="application/json" id="capsules">{to_json(places)}</script>'
-        f'<script>{(report / "player.js").read_text()}</script><script>{(own / "page.js").read_text()}</script>'
-        "</body></html>"
+        f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>"
     )
+    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"))

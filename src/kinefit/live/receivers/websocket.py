@@ -6,24 +6,21 @@ Each receiver has one slot: a slow one gets the newest pose and misses those bet
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable, Mapping
-from http import HTTPStatus
 from typing import Any
 
 import msgspec
-from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
 
 from kinefit.bodies import Body
-from kinefit.errors import ExportError
 from kinefit.live.packets import Posed
-from kinefit.live.receivers.page import page
+from kinefit.live.receivers.page import live_page
+from kinefit.live.wishes import Answer
+from kinefit.serving.access import Access
+from kinefit.serving.server import Connection, PageServer
 
-_LARGEST = 65536  # [bytes] of what a client may ask
-Ask = Callable[[Mapping[str, Any]], None]
+_MAX_WAITING_ANSWERS = 100  # of a client that does not read them: then it is disconnected
+Ask = Callable[[bytes, Answer], None]
 
 
 class _Client:
@@ -51,41 +48,39 @@ class WebSockets:
     ----------
     port : the next free one is not taken: receivers are told one port. 0 for any.
     host : "127.0.0.1" or "0.0.0.0" for all networks
+    token : of the address, see `serving.access.Access`; a random one where it is None
     title : of the page
-    ask : what is done with clients' wishes; None where they are to be left unheard
+    ask : what is done with clients' wishes, each a JSON text with the place for its answer; None where they are to be
+        left unheard
 
     Raises
     ------
     ExportError
-        The port is in use, or the host none of this computer.
+        The port is in use, the host none of this computer, or a token that cannot be used.
     """
 
-    def __init__(self, port: int, *, host: str = "127.0.0.1", title: str = "kinefit", ask: Ask | None = None) -> None:
-        self._ask, self._title, self._host = ask, title, host
+    def __init__(
+        self, port: int, *, host: str = "127.0.0.1", token: str | None = None, title: str = "kinefit",
+        ask: Ask | None = None,
+    ) -> None:  # fmt: skip
+        self._ask, self._title = ask, title
         self._clients: set[_Client] = set()
         self._hello: bytes | None = None
-        self._body: Body | None = None
-        self._up = "z"
-        self._ready = threading.Event()
-        self._wrong: OSError | None = None
-        self._loop = asyncio.new_event_loop()
-        self._over = asyncio.Event()
-        self.port = port
-        self._thread = threading.Thread(target=self._run, daemon=True, name="websocket")
-        self._thread.start()
-        self._ready.wait()
-        if self._wrong is not None:
-            self._thread.join()
-            raise ExportError(
-                f"nothing can be served at {host}:{port} ({self._wrong.strerror or self._wrong})", place="--port",
-                remedy="Name another port, or stop what uses it.",
-            )  # fmt: skip
+        self._page = live_page(title, None, "z")
+        self.access = Access(host, token, readers=True)
+        self._server = PageServer(
+            self.access, port, page=lambda path: self._page if path == "/" else None, talk=self._talk
+        )
 
     @property
-    def address(self) -> str:
-        """Of the page."""
-        host = "localhost" if self._host in ("127.0.0.1", "0.0.0.0") else self._host
-        return f"http://{host}:{self.port}"
+    def port(self) -> int:
+        """At which poses and page are."""
+        return self._server.port
+
+    @property
+    def url(self) -> str:
+        """Address of the page, with the token; that of poses and wishes begins with ws instead of http."""
+        return self._server.url
 
     @property
     def receivers(self) -> int:
@@ -94,19 +89,18 @@ class WebSockets:
 
     def hello(self, body: Body, packet: bytes) -> None:
         """Tell all, and everybody who comes later, of the body."""
-        self._up = msgspec.json.decode(packet)["up"]
-        self._body, self._hello = body, packet
-        self._loop.call_soon_threadsafe(self._spread, packet, True)
+        self._page = live_page(self._title, body, msgspec.json.decode(packet)["up"])
+        self._hello = packet
+        self._server.call(self._spread, packet, True)
 
     def pose(self, posed: Posed, packet: bytes) -> None:
         """Put a pose into every receiver's slot."""
         if self._clients:
-            self._loop.call_soon_threadsafe(self._spread, packet, False)
+            self._server.call(self._spread, packet, False)
 
     def close(self) -> None:
         """Close all connections."""
-        self._loop.call_soon_threadsafe(self._over.set)
-        self._thread.join(timeout=5.0)
+        self._server.close()
 
     def _spread(self, packet: bytes, hello: bool) -> None:
         for client in self._clients:
@@ -116,71 +110,48 @@ class WebSockets:
                 client.pose = packet
             client.news.set()
 
-    def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve())
-        except OSError as error:
-            self._wrong = error
-        finally:
-            self._ready.set()
-            self._loop.close()
-
-    async def _serve(self) -> None:
-        server: Server
-        async with serve(
-            self._client, self._host, self.port, process_request=self._page, max_size=_LARGEST, compression=None,
-        ) as server:  # fmt: skip
-            self.port = next(iter(server.sockets)).getsockname()[1]
-            self._ready.set()
-            await self._over.wait()
-
-    def _page(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page to browsers that ask for it; WebSockets go on."""
-        if request.headers.get("Upgrade", "").lower() == "websocket":
-            return None
-        if request.path.partition("?")[0] != "/":
-            return connection.respond(HTTPStatus.NOT_FOUND, "no such page\n")
-        content = page(self._title, self._body, self._up).encode()
-        headers = Headers([("Content-Type", "text/html; charset=utf-8"), ("Content-Length", str(len(content)))])
-        return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, headers, content)
-
-    async def _client(self, connection: ServerConnection) -> None:
+    async def _talk(self, connection: Connection) -> None:
+        """Send packets and hear wishes, until the client is gone."""
         client = _Client()
         if self._hello is not None:
             client.hello = self._hello
             client.news.set()
         self._clients.add(client)
-        listening = asyncio.ensure_future(self._listen(connection, client))
+        sending = asyncio.ensure_future(_send(connection, client))
         try:
-            while True:
-                for packet in await client.next():
-                    await connection.send(packet.decode())
-        except ConnectionClosed:
-            return
+            await self._listen(connection, client)
         finally:
             self._clients.discard(client)
-            listening.cancel()
+            sending.cancel()
 
-    async def _listen(self, connection: ServerConnection, client: _Client) -> None:
-        """Pass on what a client asks for; what cannot be read is answered at once."""
+    async def _listen(self, connection: Connection, client: _Client) -> None:
+        """Pass on what a client asks for; what may not be asked is answered at once."""
 
         def answer(told: Mapping[str, Any]) -> None:  # from any thread
-            self._loop.call_soon_threadsafe(back, msgspec.json.encode(told))
+            self._server.call(back, msgspec.json.encode(told))
 
         def back(packet: bytes) -> None:
-            client.answers.append(packet)
-            client.news.set()
+            if len(client.answers) >= _MAX_WAITING_ANSWERS:
+                connection.drop("answers are not read")
+            else:
+                client.answers.append(packet)
+                client.news.set()
 
-        async for text in connection:
-            try:
-                wish = msgspec.json.decode(text)
-            except msgspec.DecodeError as error:
-                answer({"type": "refused", "why": f"this is no JSON: {error}"})
-                continue
-            if not isinstance(wish, dict) or "answer" in wish:
-                answer({"type": "refused", "why": 'Ask with one JSON object, such as {"stop": true}.'})
+        while True:
+            wish = await connection.recv(decode=False)
+            if not connection.has_token:
+                why = "A wish needs the token: connect to the address that the command printed, with ws for http."
+                answer({"type": "refused", "why": why})
             elif self._ask is None:
                 answer({"type": "refused", "why": "This session takes no wishes."})
             else:
-                self._ask({**wish, "answer": answer})
+                self._ask(wish, answer)
+
+
+async def _send(connection: Connection, client: _Client) -> None:
+    try:
+        while True:
+            for packet in await client.next():
+                await connection.send(packet.decode())
+    except ConnectionClosed:
+        return

@@ -17,6 +17,7 @@ from kinefit.errors import CalibrationError, ExportError, FileError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
+from kinefit.readers.calibration.file_storage import parse_xml
 from kinefit.readers.calibration.qualisys import qualisys_cameras
 from kinefit.readers.calibration.tables import (
     camera_from_table,
@@ -33,6 +34,10 @@ FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML, COLMAP text "
     "(cameras.txt and images.txt), MCAP of ROS 2"
 )
+MAX_CALIBRATION_BYTES = 2_000_000
+"""Bytes of one file of a calibration; a camera takes about a thousand."""
+
+_MAX_CAMERAS = 1000  # of a rig; the largest domes have 500
 _FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
 
 
@@ -85,7 +90,7 @@ def read_calibration(
     text = _read_text(path)
     kind = recognise(text, path)
     if kind == "qualisys":
-        cameras = qualisys_cameras(ElementTree.fromstring(text), path)
+        cameras = qualisys_cameras(_xml_root(text, path), path)
         return _rig(cameras, path, "mm" if unit == "auto" else unit)
     tree = read_table(text, kind, path)
     tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
@@ -209,6 +214,9 @@ def _rig_of(
     image_size: tuple[int, int] | None,
     exteriors: bool = True,
 ) -> Rig:
+    if len(tables) > _MAX_CAMERAS:
+        problem = f"{len(tables)} cameras, more than {_MAX_CAMERAS}"
+        raise CalibrationError(problem, file=path, remedy="Leave out those that recorded nothing.")
     cameras = [
         camera_from_table(name, table, file, image_size=image_size, pose_needed=exteriors and len(tables) > 1)
         for name, table, file in tables
@@ -226,6 +234,9 @@ def _tree(path: Path) -> dict:
 
 def _read_text(path: Path) -> str:
     try:
+        if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
+            problem = f"{size / 1e6:.0f} MB, more than any calibration"
+            raise FileError(problem, file=path, remedy=f"Is it another file? kinefit reads {FORMATS}.")
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
@@ -235,23 +246,26 @@ def recognise(text: str, path: Path) -> str:
     """Tell "toml", "json", "yaml", "xml" (OpenCV) or "qualisys" from the content."""
     start = text.lstrip()
     if start.startswith("<"):
-        try:
-            tag = ElementTree.fromstring(text).tag
-        except ElementTree.ParseError as error:
-            raise CalibrationError(
-                f"broken XML: {error}", file=path, remedy="Export it again; it may be cut."
-            ) from None
+        tag = _xml_root(text, path).tag
         if tag in ("calibration", "opencv_storage"):
             return "qualisys" if tag == "calibration" else "xml"
     elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):
         return "json"
     elif start.startswith(("%YAML", "---")):
         return "yaml"
-    elif re.search(r"^\s*\[", text, re.M) or re.search(r"^\s*[\w-]+\s*=", text, re.M):
+    elif re.search(r"^[ \t]*+(?:\[|[\w-]++[ \t]*+=)", text, re.M):
         return "toml"
-    elif re.search(r"^\s*[\w-]+\s*:", text, re.M):
+    elif re.search(r"^[ \t]*+[\w-]++[ \t]*+:", text, re.M):
         return "yaml"
     raise FileError("not a calibration that kinefit knows", file=path, remedy=f"kinefit reads {FORMATS}.")
+
+
+def _xml_root(text: str, path: Path) -> ElementTree.Element:
+    try:
+        return parse_xml(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        remedy = "Export it again; it may be cut."
+        raise CalibrationError(f"broken XML: {error}", file=path, remedy=remedy) from None
 
 
 def _chosen_unit(tree: dict, unit: str | float) -> str | float:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +15,7 @@ from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, transform
+from kinefit.readers.calibration.file_storage import storage_of_xml, storage_of_yaml
 
 Table = dict[str, Any]
 
@@ -33,8 +34,7 @@ _KEYS = {
     "model": ("distortionmodel", "model", "cameramodel"),
 }  # fmt: skip
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
-_LEVELS = re.compile(r"(?P<open>[\[{]|<\w[^<>]*+(?<!/)>)|(?P<close>[\]}]|</)|(?:-\s++){40}")
-_DEEPEST = 40  # tables within tables; some thousands end the process in OpenCV's parser
+_PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage_of_yaml, "xml": storage_of_xml}
 
 
 def read_table(text: str, kind: str, path: Path) -> Table:
@@ -42,46 +42,13 @@ def read_table(text: str, kind: str, path: Path) -> Table:
     try:
         if kind == "toml":
             return parse_toml(text, path, CalibrationError)
-        if kind == "json":
-            tree = _matrices(json.loads(text))
-        else:
-            tree = _file_storage(text, kind)
+        tree = _matrices(_PARSERS[kind](text))
         return tree if isinstance(tree, dict) else {"cameras": tree}
-    except (ValueError, TypeError, RecursionError, OverflowError, cv2.error, SystemError) as error:
+    except (ValueError, TypeError, RecursionError, OverflowError, ElementTree.ParseError) as error:
         reason = str(error).strip().splitlines()[-1] if str(error).strip() else "broken syntax"
         raise CalibrationError(
             f"not a readable {kind.upper()} file: {reason}", file=path, remedy="Write the file again; it may be cut."
         ) from None
-
-
-def _file_storage(text: str, kind: str) -> Table:
-    depth = 0
-    for level in _LEVELS.finditer(text):
-        depth += {"open": 1, "close": -1, None: _DEEPEST}[level.lastgroup]
-        if depth >= _DEEPEST:
-            raise ValueError("tables within tables, deeper than any calibration")
-    if kind == "yaml":  # headers differ: OpenCV 4 writes "%YAML:1.0", OpenCV 5 "%YAML 1.2", hands write none
-        lines = [line for line in text.splitlines() if not line.startswith("%")]
-        text = "\n".join(["%YAML:1.0", *([] if lines and lines[0].startswith("---") else ["---"]), *lines, ""])
-    flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-    storage = cv2.FileStorage(text, flags | (cv2.FILE_STORAGE_FORMAT_YAML if kind == "yaml" else 0))
-    if not storage.isOpened():
-        raise ValueError("OpenCV cannot open it")
-    try:
-        return _node(storage.root())
-    finally:
-        storage.release()
-
-
-def _node(node: Any) -> Any:
-    """Plain values of an OpenCV file node."""
-    if node.isMap():
-        return _matrix({key: _node(node.getNode(key)) for key in node.keys()})
-    if node.isSeq():
-        return [_node(node.at(i)) for i in range(node.size())]
-    if node.isString():
-        return node.string()
-    return node.real() if node.isReal() else int(node.real()) if node.isInt() else None
 
 
 def _matrices(value: Any) -> Any:

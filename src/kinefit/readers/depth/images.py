@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_npz
-from kinefit._pictures import read_picture
+from kinefit._pictures import page_sizes, read_page, read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import Camera
 
@@ -76,20 +76,14 @@ def listed(path: Path) -> list[Path]:
 
 def picture_source(files: list[Path]) -> DepthSource:
     """Depth in 16-bit pictures (counts) or 32-bit float TIFF (metres), one file a frame."""
-    first = depth_picture(files[0])
+    pages = len(page_sizes(files[0])) if len(files) == 1 else 1  # one TIFF of many pages
+
+    def image(i: int) -> NDArray:
+        return depth_picture(files[i]) if pages == 1 else _depth_of(read_page(files[0], i), files[0])
+
+    first, names = image(0), tuple(f.name for f in files) if pages == 1 else ()
     unit = 0.001 if first.dtype == np.uint16 else 1.0
-    if len(files) == 1 and cv2.imcount(str(files[0])) > 1:  # one TIFF of many pages
-        pages = cv2.imcount(str(files[0]))
-        return DepthSource(pages, lambda i: counts_of(_page(files[0], i)), first.shape[::-1], unit)
-    names = tuple(f.name for f in files)
-    return DepthSource(len(files), lambda i: counts_of(depth_picture(files[i])), first.shape[::-1], unit, names=names)
-
-
-def _page(file: Path, i: int) -> NDArray:
-    ok, pages = cv2.imreadmulti(str(file), i, 1, flags=cv2.IMREAD_UNCHANGED)
-    if not ok or len(pages) != 1:
-        raise FileError("a page that cannot be decoded", file=file, place=f"frame {i}", remedy="Copy it again.")
-    return pages[0]
+    return DepthSource(len(files) * pages, lambda i: counts_of(image(i)), first.shape[::-1], unit, names=names)
 
 
 def depth_picture(file: Path) -> NDArray:
@@ -102,7 +96,10 @@ def depth_picture(file: Path) -> NDArray:
     ObservationError
         An image that is no depth: of 8 bits, or of several channels.
     """
-    picture = read_picture(file, cv2.IMREAD_UNCHANGED)
+    return _depth_of(read_picture(file, cv2.IMREAD_UNCHANGED), file)
+
+
+def _depth_of(picture: NDArray, file: Path) -> NDArray:
     if picture.ndim != 2 or picture.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if picture.ndim == 2 else picture.shape[2]
         raise ObservationError(
@@ -169,10 +166,9 @@ def array_source(path: Path) -> DepthSource:
         )  # fmt: skip
     depth = depth if depth.ndim == 3 else depth[None]
     times = content.get("times")
-    if times is not None and times.shape != (len(depth),):
-        raise ObservationError(
-            f"{times.shape} times for {len(depth)} frames", file=path, remedy="Give `times` (frames,) in seconds."
-        )
+    if times is not None and (times.shape != (len(depth),) or times.dtype.kind not in "uif"):
+        problem = f"{times.shape} times for {len(depth)} frames, of type {times.dtype}"
+        raise ObservationError(problem, file=path, remedy="Give `times` (frames,) in seconds.")
     number = {}
     for key in ("unit", "rate"):
         if key in content:

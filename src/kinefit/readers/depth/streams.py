@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kinefit.errors import CalibrationError, FileError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
+from kinefit.readers.video_files import open_container
 
 # Image of each depth mode of the Azure Kinect: size -> (size it is binned to, offset of the crop), Azure Kinect Sensor
 # SDK, mode_specific_calibration.c.
@@ -47,7 +48,7 @@ class _Track:
 
     def _seek(self, i: int) -> None:
         if self._container is None:
-            self._container = av.open(str(self._path))
+            self._container = open_container(self._path)
         stream = self._container.streams[self._index]
         self._container.seek(self._times[i], stream=stream, backward=True)
         packets = self._container.demux(stream)
@@ -72,7 +73,7 @@ class _Track:
 def track_source(path: Path, name: str) -> DepthSource:
     """Depth of an Azure Kinect recording, or of any lossless video of one 16-bit grey channel."""
     try:
-        with av.open(str(path)) as container:
+        with open_container(path) as container:
             stream = _depth_stream(container, path)
             index, base = stream.index, float(stream.time_base)
             codec = stream.codec_context

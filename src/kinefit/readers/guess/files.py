@@ -18,7 +18,7 @@ from kinefit._files import npy_header
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, read_calibration
 from kinefit.readers.guess.names import natural
 from kinefit.readers.image_folders import ENDINGS, ImageFolder
 from kinefit.readers.ros.recordings import inside
@@ -38,7 +38,6 @@ DRAWN_ON = re.compile(r"(?<![a-z])(?:pose|overlay|labell?ed|annotated|results?|d
 
 _RESULTS = ("-kinefit", "-detect")  # folders that kinefit leaves
 _DEEPEST = 6  # folders below the given one
-_LARGEST = 5_000_000  # [bytes] no calibration is larger
 _MANY = 12  # json files of numbered names in one folder are a detector's, not a camera's each
 _JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
 _CALISCOPE = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
@@ -121,7 +120,7 @@ def find_calibrations(files: list[Path]) -> tuple[list[CalibrationFile], list[Pa
     for path in files:
         if not path.name.lower().endswith(CALIBRATIONS) or (path.parent in detectors and _numbered(path)):
             continue
-        if path.stat().st_size > _LARGEST:
+        if path.stat().st_size > MAX_CALIBRATION_BYTES:
             continue
         read = _try(path, faults)
         if read and len(read.rig) > 1:

@@ -18,7 +18,6 @@ from kinefit.readers.video import Video
 Size = tuple[int, int]
 
 _BLACK = 32  # of 255: a row three quarters of which are darker is a bar's; compression smears edges into bars
-_LOOKED_AT = 5  # pictures of a video
 _FRAMES = 60  # of the keypoints, spread over the recording
 _CONFIDENT = 0.3
 _AGREE = 0.03  # two cameras agree on a point within this share of the picture's diagonal
@@ -102,9 +101,9 @@ def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> Image
     return frame.then(make(turned, size)) if make else frame
 
 
-def black_bars(video: Video) -> tuple[int, int]:
-    """Width [px] of the dark bars (left or right, above or below), the smaller of both sides."""
-    numbers = np.unique(np.linspace(0, len(video) - 1, _LOOKED_AT).astype(int))
+def black_bars(video: Video, frames: int = 5) -> tuple[int, int]:
+    """Width [px] of the dark bars (left or right, above or below), the smaller of both sides, in some of its frames."""
+    numbers = np.unique(np.linspace(0, len(video) - 1, frames).astype(int))
     brightest = np.max([video.read(int(i)) for i in numbers], axis=0).max(axis=2)
     columns, rows = (np.percentile(brightest, 75, axis=axis) > _BLACK for axis in (0, 1))
     return _dark_ends(columns), _dark_ends(rows)

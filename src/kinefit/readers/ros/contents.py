@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kinefit.readers.ros.images import UNITS, encoding, info_topic, is_colour, is_rectified
-from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Topics, reading
+from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Topics, median_rate, reading
 from kinefit.readers.ros.rig import camera_names
 
 
@@ -43,6 +43,8 @@ def shown(path: Path) -> list[Shown]:
     ------
     FileError
         As `readers.ros.recordings.reading`.
+    ObservationError
+        As `readers.ros.recordings.median_rate`.
     """
     out: dict[tuple[str, bool], Shown] = {}
     with reading(path) as reader:
@@ -54,7 +56,7 @@ def shown(path: Path) -> list[Shown]:
             times = topics.times(topic)[0] if deep or is_colour(first) else np.zeros(0)
             if len(times) > 1:
                 folder = (info_topic(topics, topic) or "").rpartition("/")[0]
-                rate = round(1.0 / float(np.median(np.diff(times))), 3)
+                rate = round(median_rate(times, topic, path), 3)
                 found = Shown(topic, deep, names.get(folder), len(times), rate)
                 out.setdefault((found.name, deep), found)
     return sorted(out.values(), key=lambda one: one.topic)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._pictures import check_image_size, decode_picture
 from kinefit.errors import CalibrationError, FileError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, INFO, Topics
@@ -58,9 +59,8 @@ def counts(message: Any, path: Path) -> NDArray:
     if hasattr(message, "encoding"):
         return _raw(message, np.dtype({"16UC1": "u2", "32FC1": "f4"}[message.encoding]), 1, path)[..., 0]
     data = bytes(message.data)
-    packed = np.frombuffer(data, np.uint8)[_HEADER:]
-    image = cv2.imdecode(packed, cv2.IMREAD_UNCHANGED) if len(packed) else None
-    if image is None or image.ndim != 2 or image.dtype != np.uint16:
+    image = decode_picture(data[_HEADER:], cv2.IMREAD_UNCHANGED, file=path, place="a compressed depth image")
+    if image.ndim != 2 or image.dtype != np.uint16:
         raise FileError("a compressed depth image that is no PNG of 16 bits", file=path, remedy="Record it raw.")
     if encoding(message) == "32FC1":  # inverse depth in steps (compressed_depth_image_transport)
         _, a, b = struct.unpack_from("<iff", data)
@@ -78,12 +78,7 @@ def colours(message: Any, path: Path) -> NDArray[np.uint8]:
         A damaged image.
     """
     if not hasattr(message, "encoding"):
-        packed = np.frombuffer(bytes(message.data), np.uint8)
-        image = cv2.imdecode(packed, cv2.IMREAD_COLOR) if len(packed) else None
-        if image is None:
-            raise FileError(f"a compressed image ({message.format}) that cannot be read", file=path,
-                            remedy="Copy the recording again.")  # fmt: skip
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+        return decode_picture(bytes(message.data), file=path, place=f"a compressed image ({message.format})")
     kind = str(message.encoding)
     image = _raw(message, np.dtype("u1"), _CHANNELS.get(kind, 1), path)
     change = COLOURS[kind]
@@ -95,6 +90,7 @@ def _raw(message: Any, kind: np.dtype, channels: int, path: Path) -> NDArray:
     """(H, W, channels) of an image that is not compressed."""
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
+    check_image_size((width, height), path, "an image")
     data, row = bytes(message.data), width * channels * kind.itemsize
     if not (height and width and step >= row and len(data) == height * step):
         told = f"{len(data)} bytes for {width}x{height} px, {step} bytes a row"

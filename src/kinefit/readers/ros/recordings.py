@@ -22,6 +22,10 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 _ENDING = ".mcap"
+_MAX_CHUNK_BYTES = 110_000_000  # unpacked; recorders write 1 to 16 MB, or one image, which in 8K RGB takes 100 MB
+_CHUNK_SIZE_OFFSET = 1 + 8 + 8 + 8  # [bytes] from a chunk's record to its unpacked size: opcode, length, two times
+_CHUNK_HEAD_BYTES = 8 + 4 + 4 + 8 + 8 + 18  # size, checksum, length and text of the compression, length, frame's header
+_MIN_STEP_S = 1e-6  # between images; as `Video`, which takes folders of images up to a million a second
 _MUCH = 2**20  # [bytes] that are asked for at once, from which on it is seen whether they are there
 
 
@@ -139,6 +143,24 @@ class Topics:
         return (by - begin) * 1e-9, logged
 
 
+def median_rate(times: NDArray, topic: str, path: Path) -> float:
+    """[Hz] of a topic's images, by the median step of their times (N,) [s].
+
+    Raises
+    ------
+    ObservationError
+        One image alone, or most of them at one time.
+    """
+    steps = np.diff(times)
+    if not len(steps):
+        raise ObservationError(f"one image alone on the topic {topic}", file=path, remedy="Record it for longer.")
+    step = float(np.median(steps))
+    if step < _MIN_STEP_S:
+        problem = f"a median step of {step:g} s between the images on the topic {topic}"
+        raise ObservationError(problem, file=path, remedy="Record them with the times at which they were taken.")
+    return 1.0 / step
+
+
 class Messages:
     """Messages of a topic by number; in order they are read on, else they are sought.
 
@@ -201,11 +223,46 @@ def reading(path: Path) -> Iterator[Any]:
         ) from None  # fmt: skip
     try:
         with _Bounded(io.FileIO(path)) as file:
-            yield make_reader(file, decoder_factories=[DecoderFactory()])
+            reader = make_reader(file, decoder_factories=[DecoderFactory()])
+            _check_chunks(reader, file, path)
+            yield reader
     except KinefitError:
         raise
     except Exception as error:  # of damaged files libraries raise anything
         raise _damaged(error, path) from error
+
+
+def _check_chunks(reader: Any, file: io.BufferedReader, path: Path) -> None:
+    """Raise FileError where a chunk unpacks to more than `_MAX_CHUNK_BYTES`, by its record and its Zstandard frame."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    summary = reader.get_summary()
+    if summary is not None and summary.chunk_indexes:
+        places = [index.chunk_start_offset + _CHUNK_SIZE_OFFSET for index in summary.chunk_indexes]
+        heads = (file.read(_CHUNK_HEAD_BYTES) for place in places if file.seek(place))
+    else:  # chunks without an index are read from the first to the last
+        file.seek(0)
+        records = StreamReader(file, emit_chunks=True).records
+        heads = (
+            struct.pack("<QII", r.uncompressed_size, 0, len(r.compression)) + r.compression.encode() + bytes(8) + r.data
+            for r in records if isinstance(r, Chunk)
+        )  # fmt: skip
+    for head in heads:
+        size, _, name_length = struct.unpack_from("<QII", head)
+        size = max(size, _zstd_size(head[16 + name_length + 8 :]))
+        if size > _MAX_CHUNK_BYTES:
+            problem = f"a chunk of {size / 1e6:.0f} MB, more than {_MAX_CHUNK_BYTES / 1e6:.0f} MB"
+            raise FileError(problem, file=path, remedy="Record with smaller chunks; copy it again if it is damaged.")
+
+
+def _zstd_size(frame: bytes) -> int:
+    """Bytes that a Zstandard frame (RFC 8878, 3.1.1) states to unpack to; 0 where it states none or is no frame."""
+    if not frame.startswith(b"\x28\xb5\x2f\xfd") or len(frame) < 18:
+        return 0
+    code, alone, dictionary = frame[4] >> 6, frame[4] >> 5 & 1, frame[4] & 3
+    start, length = 6 - alone + (0, 1, 2, 4)[dictionary], (alone, 2, 4, 8)[code]
+    return int.from_bytes(frame[start : start + length], "little") + (256 if code == 1 else 0)
 
 
 class _Bounded(io.BufferedReader):

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.readers.ros.images import COLOURS, colours, is_colour, refuse_encoding
-from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, reading
+from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, median_rate, reading
 
 _GAP = 0.5  # [s] without an image, or three frames if that is longer, that a video cannot bridge
+
+_MAX_REPEATS = 100  # mean number of frames that show one image; a tenth of it where half of all images were dropped
 
 
 class McapVideo:
@@ -31,7 +33,7 @@ class McapVideo:
         The extra is not installed, or the file is damaged.
     ObservationError
         No such topic, one of another encoding, none or several that have images; more than half a second, and three
-        frames, without any.
+        frames, without any; times that give no rate.
     """
 
     def __init__(self, path: Path, topic: str | None) -> None:
@@ -42,11 +44,8 @@ class McapVideo:
             self.topic = topics.chosen(topic, fitting, "images in colour or grey")
             times, logged = topics.times(self.topic)
             first = colours(topics.first(self.topic), path)
-        steps = np.diff(times)
-        if not len(steps):
-            problem = f"one image alone on the topic {self.topic}"
-            raise ObservationError(problem, file=path, remedy="Record it for longer.")
-        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_GAP, 3.0 * float(np.median(steps))))
+        rate = median_rate(times, self.topic, path)
+        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_GAP, 3.0 / rate))
         if len(gaps):
             begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
             raise ObservationError(
@@ -54,7 +53,10 @@ class McapVideo:
                 remedy="Cut the recording to the time that all its cameras saw: `mcap filter`.",
             )  # fmt: skip
         self.path, self.size = path, (int(first.shape[1]), int(first.shape[0]))
-        self.rate = round(1.0 / float(np.median(steps)), 6)
+        self.rate = round(rate, 6)
+        if times[-1] * self.rate > _MAX_REPEATS * len(times):
+            problem = f"the images on the topic {self.topic} come in bursts at {self.rate:g} Hz, with gaps between"
+            raise ObservationError(problem, file=path, remedy="Record them with the times at which they were taken.")
         at = np.arange(round(times[-1] * self.rate) + 1) / self.rate
         after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
         self._shown = np.where(at - times[after - 1] <= times[after] - at + 1e-6, after - 1, after)

@@ -17,11 +17,12 @@ from kinefit.bodies.joint_names import FAMILIES, MORE, SEGMENTS
 from kinefit.errors import FileError, choices
 from kinefit.motion import rotation_between_up
 from kinefit.readers.skeletons.bvh import read_bvh
-from kinefit.readers.skeletons.gltf import Gltf, read_gltf
+from kinefit.readers.skeletons.gltf import MALFORMED, Gltf, read_gltf
 
 KINDS = {".glb": "glb", ".vrm": "glb", ".gltf": "glb", ".bvh": "bvh"}
 """What characters are read from, and in which format a motion on them is written."""
 
+_MAX_NODES, _MAX_VERTICES = 20_000, 2_000_000  # detailed characters have 2,000 and 500,000
 _UNEVEN = 1e-3  # of the scales along the axes: less is rounding
 
 
@@ -117,9 +118,11 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
 
 def _order(parents: NDArray, path: Path) -> NDArray:
     """Parents before their children."""
-    out = [int(node) for node in np.flatnonzero(parents < 0)]
+    out, children = list[int](), [list[int]() for _ in parents]
+    for node, parent in enumerate(parents.tolist()):
+        (out if parent < 0 else children[parent]).append(node)
     for node in out:
-        out += [int(child) for child in np.flatnonzero(parents == node)]
+        out += children[node]
     if len(out) != len(parents):
         raise FileError("its nodes form a circle", file=path)
     return np.array(out, int)
@@ -127,12 +130,13 @@ def _order(parents: NDArray, path: Path) -> NDArray:
 
 def _from_gltf(path: Path) -> Character:
     gltf = read_gltf(path)
-    parents = gltf.parents()
-    if not len(parents):
-        raise FileError("holds no nodes", file=path, remedy="Export the character with its skeleton.")
     try:
+        parents = gltf.parents()
+        if not 0 < len(parents) <= _MAX_NODES:
+            told = f"more than {_MAX_NODES}" if len(parents) else "no"
+            raise FileError(f"holds {told} nodes", file=path, remedy="Export the character alone, with its skeleton.")
         return _of_gltf(gltf, parents, _order(parents, path), path)
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+    except MALFORMED as error:
         problem = f"is no whole glTF file ({type(error).__name__}: {error})"
         raise FileError(problem, file=path, remedy="Export the character again, as GLB.") from error
 
@@ -143,6 +147,8 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
         if parents[node] >= 0:
             Ms[node] = Ms[parents[node]] @ Ms[node]
     names = tuple(node.get("name", f"node {n}") for n, node in enumerate(gltf.json["nodes"]))
+    if wrong := [name for name in names if not isinstance(name, str)]:
+        raise ValueError(f"a node's name is {wrong[0]!r}")
     in_skin = np.zeros(len(parents), bool)
     for skin in gltf.json.get("skins", []):
         in_skin[skin["joints"]] = True
@@ -154,7 +160,9 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
         if not np.allclose(R.T @ R, np.eye(3), atol=_UNEVEN):
             remedy = "Apply the scale in the program that it comes from (Blender: Ctrl-A, Scale)."
             raise FileError("is scaled unevenly", file=path, place=f"node '{names[node]}'", remedy=remedy)
-    points, owners = _vertices(gltf, Ms)
+    points, owners = _vertices(gltf, Ms, path)
+    if not (np.isfinite(Ms).all() and np.isfinite(points).all()):
+        raise ValueError("a place that is not finite")
     rotations = Ms[:, :3, :3] / np.maximum(scales, 1e-12)[:, None, None]
     return Character(
         path, names, parents, order, Ms[:, :3, 3], rotations, scales, np.eye(3), joints, _told(gltf.json), points,
@@ -162,7 +170,7 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
     )  # fmt: skip
 
 
-def _vertices(gltf: Gltf, Ms: NDArray) -> tuple[NDArray, NDArray]:
+def _vertices(gltf: Gltf, Ms: NDArray, path: Path) -> tuple[NDArray, NDArray]:
     """Vertices (P, 3) of all skinned meshes at rest, and the node (P,) that moves each most."""
     points, owners = [np.zeros((0, 3))], [np.zeros(0, int)]
     for node in gltf.json["nodes"]:
@@ -179,9 +187,14 @@ def _vertices(gltf: Gltf, Ms: NDArray) -> tuple[NDArray, NDArray]:
             x, which, weights = (gltf.array(has[name]) for name in ("POSITION", "JOINTS_0", "WEIGHTS_0"))
             if x is None or which is None or weights is None:
                 continue
-            which = which.astype(int)
-            placed = np.einsum("vkij,vj->vki", moves[which][..., :3, :3], x) + moves[which][..., :3, 3]
-            points.append(np.einsum("vk,vki->vi", weights, placed))
+            if sum(map(len, points)) + len(x) > _MAX_VERTICES:
+                remedy = "Export the character with a simpler mesh."
+                raise FileError(f"has more than {_MAX_VERTICES} vertices", file=path, remedy=remedy)
+            which, placed = which.astype(int), np.zeros_like(x)
+            for joint, weight in zip(which.T, weights.T):
+                M = moves[joint, :3]
+                placed += weight[:, None] * (np.einsum("vij,vj->vi", M[..., :3], x) + M[..., 3])
+            points.append(placed)
             owners.append(joints[which[np.arange(len(x)), np.argmax(weights, axis=1)]])
     return np.concatenate(points), np.concatenate(owners)
 

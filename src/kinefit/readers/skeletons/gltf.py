@@ -14,12 +14,19 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_bytes
 from kinefit.errors import FileError
 from kinefit.geometry import se3
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _IMAGES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
+MALFORMED = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, OSError, struct.error,
+)  # fmt: skip
+"""What glTF that is not as its specification says raises where it is read."""
+
+_LISTS = "nodes", "skins", "meshes", "animations", "accessors", "bufferViews", "buffers", "images"
 _AGAIN = "Export the character again, as GLB."
 
 
@@ -45,6 +52,8 @@ class Gltf:
         kind, width = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         step = view.get("byteStride", kind.itemsize * width)
+        if step < kind.itemsize * width:  # elements that lie on each other would be any number
+            raise ValueError(f"byteStride {step}")
         shape, strides = (accessor["count"], width), (step, kind.itemsize)
         out = np.ndarray(shape, kind, self.binary, start, strides).astype(float)
         return out / np.iinfo(kind).max if accessor.get("normalized") and kind.kind in "iu" else out
@@ -72,19 +81,18 @@ def read_gltf(path: str | PathLike[str]) -> Gltf:
     Raises
     ------
     FileError
-        Missing, truncated, not glTF 2.0, or a file that it names is missing.
+        Missing, truncated, not glTF 2.0, or a file that it names is missing or lies outside of its folder.
     """
     path = Path(path)
+    content = read_bytes(path)
     try:
-        content = path.read_bytes()
         told, binary = _chunks(content) if content[:4] == b"glTF" else (json.loads(content), b"")
         if not str(told["asset"]["version"]).startswith("2."):
             raise FileError(f"is glTF {told['asset']['version']}, not 2.0", file=path, remedy=_AGAIN)
+        if wrong := [name for name in _LISTS if not isinstance(told.get(name, []), list)]:
+            raise ValueError(f"{wrong[0]} is no list")
         return _in_one(told, binary, path)
-    except OSError as error:
-        name = error.filename or path
-        raise FileError(f"cannot be read ({error.strerror})", file=name, remedy="Give a GLB or glTF file.") from error
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+    except MALFORMED as error:
         problem = f"is no whole glTF file ({type(error).__name__}: {error})"
         raise FileError(problem, file=path, remedy=_AGAIN) from error
 
@@ -103,10 +111,21 @@ def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
 
 def _in_one(told: dict[str, Any], binary: bytes, path: Path) -> Gltf:
     """All buffers in one, the first one first, and images inside."""
-    data, starts = bytearray(), []
-    for buffer in told.get("buffers", []):
-        starts.append(_aligned(data))
-        data += (_content(buffer["uri"], path) if "uri" in buffer else binary)[: buffer["byteLength"]]
+    data, places = bytearray(), dict[str | None, tuple[int, int]]()
+
+    def place(uri: str | None) -> tuple[int, int]:
+        """Start and length of what a URI names; it is taken in once."""
+        if uri not in places:
+            content = binary if uri is None else _content(uri, path)
+            data.extend(bytes(-len(data) % 4))  # every piece begins at a multiple of four
+            places[uri] = len(data), len(content)
+            data.extend(content)
+        return places[uri]
+
+    buffers = told.get("buffers", [])
+    if any("uri" not in buffer for buffer in buffers[1:]):
+        raise ValueError("a buffer without a URI that is not the first")
+    starts = [place(buffer.get("uri"))[0] for buffer in buffers]
     for view in told.get("bufferViews", []):
         start = starts[view["buffer"]]
         if start:
@@ -118,25 +137,22 @@ def _in_one(told: dict[str, Any], binary: bytes, path: Path) -> Gltf:
         if "uri" in image:
             uri = image.pop("uri")
             image.setdefault("mimeType", _image_type(uri))
-            start, content = _aligned(data), _content(uri, path)
-            data += content
+            start, length = place(uri)
             image["bufferView"] = len(told.setdefault("bufferViews", []))
-            told["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": len(content)})
+            told["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": length})
     told["buffers"] = [{**(told.get("buffers") or [{}])[0], "byteLength": len(data)}]
     told["buffers"][0].pop("uri", None)
     return Gltf(told, bytes(data))
 
 
-def _aligned(data: bytearray) -> int:
-    """Where the next piece begins: at a multiple of four."""
-    data += bytes(-len(data) % 4)
-    return len(data)
-
-
 def _content(uri: str, path: Path) -> bytes:
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition(",")[2])
-    return (path.parent / unquote(uri)).read_bytes()
+    file, folder = (path.parent / unquote(uri)).resolve(), path.parent.resolve()
+    if not file.is_relative_to(folder):  # a stranger's character would carry off any file of the user's
+        problem = f"it names a file outside of its folder: {uri}"
+        raise FileError(problem, file=path, remedy="Move that file into the folder, or export the character as GLB.")
+    return read_bytes(file)
 
 
 def _image_type(uri: str) -> str:

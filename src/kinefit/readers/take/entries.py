@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry import se3
+from kinefit.observations import KEYPOINT_SIGMA
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -87,7 +88,7 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
     rate: float | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: float = 8.0  # [px] standard deviation, in the calibration's image
+    sigma: float = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
     frames: tuple[int, int] | None = None  # steps (start, stop) at which they count; default: all
     face: tuple[float, float, float, float] | None = None  # [px] of "skin": left, top, width, height in the video
 

@@ -9,22 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.calibration.check.bias import SHIFT, TURN, CameraBias, Disagreement
-from kinefit.calibration.check.findings import Finding, Severity, listed
-from kinefit.calibration.check.timing import TimeOffsets
-from kinefit.calibration.check.views import Views
+from kinefit.diagnostics.bias import SHIFT, TURN, CameraBias, Disagreement
+from kinefit.diagnostics.timing import TimeOffsets
+from kinefit.diagnostics.views import Views
 from kinefit.errors import command
+from kinefit.findings import SEVERITIES, Finding, Severity, listed
 
 _ACCURACY = 8.0  # [px] of keypoints of which nothing else is said, as in a take
 _SURE = 4.0  # standard errors from which a bias or an offset is there
-_TENTH, _FIFTH, _WRONG = (
-    0.1,
-    0.2,
-    0.75,
-)  # [frames] from which an offset is told, is a doubt, puts frames together wrongly
+_MIN_OFFSET_TOLD = 0.1  # [frames]
+_MIN_OFFSET_DOUBT = 0.2  # [frames]
+_MIN_OFFSET_FAULT = 2.0  # [frames] webcams that run freely and lag are up to 1.6 from the median in a real recording
+_MIN_OFFSET_FAULT_OF_TWO = 4.0  # [frames] the same of two cameras, which have nothing to be compared with: 3.4
+_MIN_SHARE_OF_LARGEST = 0.7  # of the largest offset: below, cameras seem late where the median camera is off
 _UNSURE = 0.5  # [frames] standard error beyond which an offset cannot be told
 _NEARLY_ALL = 0.9  # of the squared disagreement
 _CLEARLY = 0.5  # of what the second best explanation leaves of it, that the best one leaves at most
+_MAX_LEFT = 0.5  # of the keypoints' sigma, that the cameras which moved leave unexplained
+_MAX_LEFT_CLEAR = 0.75  # where no others explain it nearly as well: of right cameras 0.6 to 0.7 are left
 _OUTLIERS = 0.15  # share of a camera's points that agree with nobody: detectors stay well below
 
 
@@ -66,7 +68,8 @@ def _one_bias(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
     significance = float(np.max(np.abs(b.bias) / np.maximum(b.std, 1e-9)))
     if b.size < 0.5 * accuracy or significance < (_SURE if b.size < accuracy else 0.5 * _SURE):
         return []
-    severity: Severity = "fault" if b.size >= accuracy and significance >= _SURE else "doubt"
+    is_fault = b.size >= max(accuracy, b.spread) and significance >= _SURE  # else the points' scatter does more harm
+    severity: Severity = "fault" if is_fault else "doubt"
     way = " and ".join(
         f"{abs(v):.1f} px too far {names[int(v > 0)]}"
         for v, names in zip(b.bias, (("left", "right"), ("up", "down")), strict=True) if abs(v) >= 0.25 * b.size
@@ -82,9 +85,9 @@ def _one_bias(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
     )
     words = "Sure" if significance > 2 * _SURE else "Likely" if significance >= _SURE else "Not sure"
     sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
-    how = f"{sure}; more than the keypoints' deviation ({accuracy:g} px)." if severity == "fault" else f"{sure}."
+    more = f"; more than the keypoints' standard deviation ({accuracy:g} px) and scatter" if is_fault else ""
     remedy = f"Run: {command('check', take, '--refine')}"
-    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), how, remedy)]
+    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), f"{sure}{more}.", remedy)]
 
 
 def _who_moved(parts: Disagreement, accuracy: float, take: Path, noticed: bool) -> Finding | None:
@@ -107,11 +110,12 @@ def _who_moved(parts: Disagreement, accuracy: float, take: Path, noticed: bool) 
         alone = count == 1 and shares[best] > _NEARLY_ALL and shares[second] < 0.5 * shares[best]
         if not noticed and not (alone and whole > 0.25 * accuracy):
             return None
-        if whole * np.sqrt(max(1.0 - shares[best], 0.0)) > 0.5 * accuracy:
+        clear = 1.0 - shares[best] < _CLEARLY * (1.0 - shares[second])
+        left = whole * np.sqrt(max(1.0 - shares[best], 0.0))
+        if left > (_MAX_LEFT_CLEAR if clear else _MAX_LEFT) * accuracy:
             continue
         names = tuple(parts.cameras[c] for c in best)
         lines = "; ".join(_how(parts, c, values) for c, values in zip(best, parts.solve(*best), strict=True))
-        clear = 1.0 - shares[best] < _CLEARLY * (1.0 - shares[second])
         others = listed(parts.cameras[c] for c in second)
         sure = (
             f"{'Likely' if clear else 'A guess'}: it would explain {100 * shares[best]:.0f} % of the squared "
@@ -137,13 +141,16 @@ def _how(parts: Disagreement, c: int, values: np.ndarray) -> str:
     return ", ".join(told)
 
 
-def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: Mapping[str, float]) -> list[Finding]:
+def time_findings(
+    times: TimeOffsets, take_offsets: Mapping[str, float], whole: Mapping[str, float], *, confirmed: bool
+) -> list[Finding]:
     """Cameras out of step.
 
     Parameters
     ----------
     take_offsets : {camera: [s]} `time_offset` as the take has it.
     whole : {camera: [px]} how far the fast points of each camera's picture move in a frame.
+    confirmed : bool, whether the cameras agree better once they are moved so: one period of a motion fits like another.
     """
     out: list[Finding] = []
     known = np.isfinite(times.offsets) & (times.std * times.rate < _UNSURE)
@@ -155,9 +162,11 @@ def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: 
         verb = "is" if len(unsure) == 1 else "are"
         text = f"Whether {listed(unsure)} {verb} in step cannot be determined: too little motion."
         out.append(Finding("note", "time", text, tuple(unsure)))
+    largest = float(np.max(np.abs(times.frames[known])))
+    least = _MIN_OFFSET_FAULT if known.sum() > 2 else _MIN_OFFSET_FAULT_OF_TWO
     for c in np.flatnonzero(known):
         name, late, std = times.cameras[c], times.frames[c], times.std[c] * times.rate
-        if abs(late) < max(_TENTH, _SURE * std):
+        if abs(late) < max(_MIN_OFFSET_TOLD, _SURE * std):
             continue
         value = take_offsets.get(name, 0.0) + times.offsets[c]
         way = "later" if late > 0 else "earlier"
@@ -165,8 +174,9 @@ def time_findings(times: TimeOffsets, take_offsets: Mapping[str, float], whole: 
             f"{name} runs {abs(late):.2f} ± {std:.2f} frames ({1e3 * abs(times.offsets[c]):.0f} ms) {way} than the "
             f"take says: a fast point is {abs(late) * whole.get(name, np.nan):.0f} px off by that."
         )
-        severity: Severity = "fault" if abs(late) >= _WRONG else "doubt" if abs(late) >= _FIFTH else "note"
-        sure = "Sure" if abs(late) >= 2 * max(_TENTH, _SURE * std) else "Likely"
+        is_fault = confirmed and abs(late) >= max(least + 3.0 * std, _MIN_SHARE_OF_LARGEST * largest)
+        severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= _MIN_OFFSET_DOUBT else "note"
+        sure = "Sure" if abs(late) >= 2 * max(_MIN_OFFSET_TOLD, _SURE * std) else "Likely"
         if abs(late) < 1.0:
             sure += "; a detector that smooths over time, or a rolling shutter, can also delay by part of a frame"
         out.append(Finding(
@@ -200,16 +210,16 @@ def side_findings(views: Views) -> list[Finding]:
 
 
 def explained(findings: Sequence[Finding]) -> list[Finding]:
-    """Biases of cameras that did not move become notes where those that did explain them."""
+    """Where one or two cameras that moved explain the biases, these are the fault, and biases notes about it."""
     moved = next((found for found in findings if found.kind == "moved" and found.cameras), None)
     if moved is None or not moved.confidence.startswith("Likely"):
         return list(findings)
-    out = []
-    for found in findings:
-        if found.kind == "bias" and found.cameras and not set(found.cameras) & set(moved.cameras):
-            found = replace(found, severity="note", remedy=f"Nothing: it follows from {listed(moved.cameras)}.")
-        out.append(found)
-    return out
+    biases = [found for found in findings if found.kind == "bias" and found.cameras]
+    worst = min((found.severity for found in biases if set(found.cameras) <= set(moved.cameras)),
+                key=SEVERITIES.index, default=moved.severity)  # fmt: skip
+    follows = f"Nothing: it follows from {listed(moved.cameras)}."
+    out = [replace(f, severity="note", remedy=follows) if f in biases else f for f in findings if f is not moved]
+    return [*out, replace(moved, severity=worst)]
 
 
 def _ranges(frames: np.ndarray, most: int = 6) -> str:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.rigid_pairs import rigid_pairs
-from kinefit.calibration.check.findings import Finding
-from kinefit.calibration.check.views import Views
+from kinefit.diagnostics.views import Views
+from kinefit.findings import Finding
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.readers.guess.views import nearest_axis, up_of_cameras, up_of_person
@@ -18,9 +18,14 @@ from kinefit.readers.guess.views import nearest_axis, up_of_cameras, up_of_perso
 _WRONG = 45.0  # [deg] from which another axis is nearer
 _LEANING = 20.0  # [deg] people stand, but not like poles
 _FLOOR = 0.15  # [m] foot points lie above the sole, by up to this
-_TALL = (1.2, 2.2)  # [m] of people
+# [m] From the smallest boys of eight (CDC growth charts, Kuczmarski et al. 2002, Vital and Health Statistics 11(246):
+# 5th percentile 1.18 m) to the tallest men (2.03 m, 1 in 1,000), whose bones two noisy cameras see 13 % too long.
+_MIN_STATURE, _MAX_STATURE = 1.2, 2.3
 _LONG = 0.15  # [m] bones from here on are measured; shorter ones are mostly the detector's habits
-_OTHER = 0.08  # share by which a stated height and the bones may differ: detectors' points are off the joints
+_MAX_STATURE_ERROR = 0.08  # log ratio of a stated height and the bones: detectors' points are off the joints
+_MIN_SCALE_FAULT = 0.22  # the same, that no detector and no build explains: three times as much
+_MIN_BEND = np.radians(20.0)  # of a knee, from which it shows where forward is
+_UNIT_TOLERANCE = 0.4  # log ratio: people differ by 1.25 in size, and detectors add to it
 _UNITS = {"mm": 1e3, "cm": 1e2, "dm": 1e1, "inch": 39.37}
 _FEET = ("Ankle", "Heel", "BigToe", "SmallToe", "ankle", "heel", "foot_index")
 
@@ -31,15 +36,14 @@ def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> lis
     ways = {"the cameras' images": cameras} | ({} if person is None else {"the person's head and feet": person})
     angles = {why: float(np.degrees(np.arccos(np.clip(way @ axis, -1, 1)))) for why, way in ways.items()}
     wrong = [why for why, angle in angles.items() if angle > _WRONG]
-    if len(wrong) == len(angles):
-        right, off = nearest_axis(cameras if person is None else person)
+    if len(wrong) == len(angles) and person is not None:
+        right, off = nearest_axis(person)
         how = "the floor would be the ceiling" if min(angles.values()) > 180 - _WRONG else "the person would lie"
         told = " and ".join(f"{why} ({angle:.0f} degrees off)" for why, angle in angles.items())
-        sure = f"{'Sure' if len(angles) > 1 else 'Likely'}: by {told}."
         remedy = f'Write up = "{right}" into [take].'
         if off > _LEANING:
             remedy += f" It leans by {off:.0f} degrees."
-        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), sure, remedy)]
+        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Sure: by {told}.", remedy)]
         axis = np.array(UP_AXES[right])
     elif wrong:
         told = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
@@ -68,28 +72,46 @@ def _floor_findings(x: NDArray, names: Sequence[str], up: NDArray) -> list[Findi
 
 
 def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
-    """Whether the person's left is where it must be, seen from above and from behind."""
-    ears = [_index(names, side, "ear") for side in ("left", "right")]
-    hips = [_index(names, side, "hip") for side in ("left", "right")]
-    shoulders = [_index(names, side, "shoulder") for side in ("left", "right")]
-    toes = [(_index(names, s, "foot_index"), _index(names, s, "heel")) for s in ("left", "right")]
+    """Whether the person's left is where it must be, seen from above and from behind.
+
+    In front are the nose before the ears, toes before heels, and knees that bend.
+    """
+    sides = ("left", "right")
+    at = {joint: [_index(names, side, joint) for side in sides] for joint in ("ear", "hip", "shoulder")}
     nose = next((k for k, name in enumerate(names) if name.lower() == "nose"), None)
-    if None in hips or None in shoulders:
+    if None in at["hip"] or None in at["shoulder"]:
         return []
-    side = x[:, hips[0]] - x[:, hips[1]] + x[:, shoulders[0]] - x[:, shoulders[1]]
-    height = 0.5 * (x[:, shoulders[0]] + x[:, shoulders[1]] - x[:, hips[0]] - x[:, hips[1]])
-    ahead = [x[:, nose] - 0.5 * (x[:, ears[0]] + x[:, ears[1]])] if nose is not None and None not in ears else []
-    ahead += [x[:, toe] - x[:, heel] for toe, heel in toes if toe is not None and heel is not None]
+    (hip_l, hip_r), (shoulder_l, shoulder_r) = ([x[:, k] for k in at[joint]] for joint in ("hip", "shoulder"))
+    side = hip_l - hip_r + shoulder_l - shoulder_r
+    height = 0.5 * (shoulder_l + shoulder_r - hip_l - hip_r)
+    ahead = [x[:, nose] - 0.5 * sum(x[:, k] for k in at["ear"])] if nose is not None and None not in at["ear"] else []
+    for s in sides:
+        heel, toe, hip, knee, ankle = (_index(names, s, j) for j in ("heel", "foot_index", "hip", "knee", "ankle"))
+        ahead += [x[:, toe] - x[:, heel]] if None not in (toe, heel) else []
+        ahead += [_ahead_of_knee(x[:, hip], x[:, knee], x[:, ankle])] if None not in (knee, ankle) else []
     votes = (
         np.concatenate([np.sign(np.sum(side * np.cross(height, a), axis=-1)) for a in ahead]) if ahead else np.zeros(0)
     )
     votes = votes[np.isfinite(votes)]
     if len(votes) < 10 or votes.mean() > -0.5:
         return []
-    text = "Left and right are exchanged: the person's face and toes point backwards."
-    sure = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames."
-    remedy = "The world is mirrored (a left-handed calibration, mirrored images), or the detector's names are."
+    text = "Left and right are exchanged: the person's face, toes and knees point backwards."
+    sure = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
+    remedy = (
+        "Exchange the names of left and right in the keypoints of all cameras (is their format or set another?); or, "
+        "if images and calibration were mirrored together, mirror the videos back, calibrate and detect anew."
+    )
     return [Finding("fault", "mirrored", text, (), sure, remedy)]
+
+
+def _ahead_of_knee(hip: NDArray, knee: NDArray, ankle: NDArray) -> NDArray:
+    """(F, 3) [m] from the line of hip and ankle to the knee; NaN where it is hardly bent."""
+    thigh, shank = knee - hip, ankle - knee
+    cosine = np.sum(thigh * shank, axis=-1) / np.maximum(
+        np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shank, axis=-1), 1e-12
+    )
+    ahead = np.asarray(knee - 0.5 * (hip + ankle))
+    return np.where((cosine < np.cos(_MIN_BEND))[:, None], ahead, np.nan)
 
 
 def _index(names: Sequence[str], side: str, joint: str) -> int | None:
@@ -123,18 +145,29 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     """
     if height is None:
         return [Finding("note", "scale", "Too few bones are seen to estimate the person's size.")]
-    if not _TALL[0] <= height <= _TALL[1]:
-        unit = min(_UNITS, key=lambda u: abs(np.log(height / 1.75 / _UNITS[u])))
-        fits = abs(np.log(height / 1.75 / _UNITS[unit])) < 0.4
-        remedy = (
-            f'Write unit = "{unit}" into [calibration].' if fits
-            else "Check the unit, and the size of the board's squares that the calibration was made with."
-        )  # fmt: skip
-        text = f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong."
-        return [Finding("fault", "scale", text, (), "Sure, unless it is a child, a doll or an animal.", remedy)]
-    if stated and abs(np.log(height / stated)) > _OTHER:
-        text = f"The person measures {height:.2f} m by the long bones, and the take says {stated:.2f} m."
+    ratio = 0.0 if stated is None else abs(np.log(height / stated))
+    if ratio > _MAX_STATURE_ERROR:
+        text = f"The person measures {height:.3g} m by the long bones, and the take says {stated:.2f} m."
         sure = "Likely: a detector's points are a few per cent off the joints, not more."
-        remedy = "Check height in [take], and the scale of the calibration."
-        return [Finding("doubt", "scale", text, (), sure, remedy)]
+        remedy = f"Check height in [take], and the scale of the calibration{_unit_remedy(height / (stated or 1.0))}."
+        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), sure, remedy)]
+    if stated is None and not _MIN_STATURE <= height <= _MAX_STATURE:
+        text = (
+            f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong. People are "
+            f"{_MIN_STATURE} to {_MAX_STATURE} m tall."
+        )
+        remedy = (
+            "Check the unit of the calibration, and the size of the board's squares that it was made with"
+            f"{_unit_remedy(height / 1.75)}. Of a child, write height = ... into [take]."
+        )
+        return [Finding("fault", "scale", text, (), "Sure, unless it is a child, a doll or an animal.", remedy)]
     return [Finding("good", "scale", f"The person measures about {height:.2f} m by the long bones: the unit is right.")]
+
+
+def _unit_remedy(ratio: float) -> str:
+    """The line of the take that mends lengths so many times too large, or how many times they are."""
+    unit = min(_UNITS, key=lambda u: abs(abs(np.log(ratio)) - np.log(_UNITS[u])))
+    if abs(abs(np.log(ratio)) - np.log(_UNITS[unit])) < _UNIT_TOLERANCE:
+        right = f'unit = "{unit}"' if ratio > 1.0 else f'unit = "m", not "{unit}",'
+        return f": write {right} into [calibration]"
+    return f" (lengths are about {ratio:.2g} times what they should be)"

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.check.views import Views
+from kinefit.diagnostics.views import Views
 
 Curve = tuple[NDArray, NDArray]
 """Shifts (S,) [frames] and their costs (S,) [px]."""
@@ -16,6 +16,7 @@ _REACH = 2.0  # [s] farthest offset that is looked for; cameras started by hand 
 _POINTS = 12  # of the body, those that move most
 _ROWS = 400  # frames of the first camera that a shift is judged by
 _CLEAR = 0.9  # of the cost with no shift: a shift that fits no better than this is none
+_MAX_WEIGHT = 2.0  # of a pair's shift: one pair that is deceived by a periodic motion must not outvote the others
 VALLEY = 1.4
 """Times the least cost that the usual shift must cost: noise alone gives 1.1, a waving hand 1.8."""
 _PARALLEL = 0.15  # sine of the angle to the line of both cameras below which a ray tells nothing
@@ -61,8 +62,15 @@ def _miss(rays_a: NDArray, rays_b: NDArray, base: NDArray, frames: NDArray, shif
     if not enough.any():
         return np.nan
     angle = angle[:, enough]
-    apart = np.abs(angle - np.nanmedian(angle, axis=0))
+    apart = np.abs(angle - median_over_time(angle))
     return float(np.nanmean(np.minimum(apart, 3.0 * np.nanmedian(apart))))
+
+
+def median_over_time(values: NDArray) -> NDArray:
+    """Medians (...) over the first axis of what is finite of values (F, ...); NaN where nothing is."""
+    ranked, count = np.sort(values, axis=0), np.isfinite(values).sum(axis=0)
+    middle = [np.take_along_axis(ranked, np.maximum(at, 0)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2)]
+    return np.where(count > 0, 0.5 * (middle[0] + middle[1]), np.nan)
 
 
 def best_shift(shifts: NDArray, cost: NDArray) -> tuple[float, float]:
@@ -71,7 +79,7 @@ def best_shift(shifts: NDArray, cost: NDArray) -> tuple[float, float]:
     at, zero = int(np.argmin(cost)), int(np.flatnonzero(shifts == 0)[0])
     if cost[at] > _CLEAR * cost[zero]:  # a periodic motion fits as well a step later: the nearest wins
         at = zero
-    return float(shifts[at]), depth(cost) - 1.0
+    return float(shifts[at]), min(depth(cost) - 1.0, _MAX_WEIGHT)
 
 
 def depth(cost: NDArray) -> float:

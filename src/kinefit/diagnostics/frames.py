@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from kinefit.calibration.check.arrangement import disagreement_share, sample
-from kinefit.calibration.check.findings import Finding, listed
-from kinefit.calibration.check.views import Views
+from kinefit.diagnostics.arrangement import disagreement_share, sample
+from kinefit.diagnostics.views import Views
+from kinefit.findings import Finding, listed
 from kinefit.geometry.camera import ImageFrame
 
 _BETTER = 0.7  # of the cameras' mean error: a few pixels of difference are lost among those of a detector

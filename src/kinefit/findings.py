@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import msgspec
 
 Severity = Literal["fault", "doubt", "note", "good"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "doubt", "note", "good")
 """Worst first: a fault spoils results; a doubt may; a note is worth knowing; good was looked at and is in order."""
+
+FINDINGS = "findings"
+"""Key of `Motion.provenance`: the faults that `track` found in its inputs, as mappings of a `Finding`'s parts."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +43,27 @@ class Finding:
     remedy: str = ""
 
 
+def faults_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Those that spoil results, each said once."""
+    return tuple(dict.fromkeys(found for found in findings if found.severity == "fault"))
+
+
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Faults first, good news last; otherwise in the order given."""
     return tuple(sorted(findings, key=lambda found: SEVERITIES.index(found.severity)))
+
+
+def as_records(findings: Iterable[Finding]) -> list[dict[str, Any]]:
+    """Findings as `Motion.provenance` holds them."""
+    return [{**asdict(found), "cameras": list(found.cameras)} for found in findings]
+
+
+def of_provenance(provenance: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """The findings that a motion's `provenance` holds; none where nothing was looked at, or where they are damaged."""
+    try:
+        return msgspec.convert(provenance.get(FINDINGS, ()), tuple[Finding, ...])
+    except msgspec.ValidationError:
+        return ()
 
 
 def listed(names: Iterable[str]) -> str:

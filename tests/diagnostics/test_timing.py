@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.check import check_keypoints
-from kinefit.calibration.check.timing import _jackknife, _speed, fast_pixels, shifted, time_offsets
-from kinefit.calibration.check.views import make_views
+from kinefit.diagnostics.keypoints import check_keypoints
+from kinefit.diagnostics.timing import _jackknife, _speed, fast_pixels, shifted, time_offsets
+from kinefit.diagnostics.views import make_views
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 FINE = 10  # frames of the fine motion are one of the recording

@@ -76,8 +76,12 @@ class Views:
         return self.uv.reshape(-1, len(self.rig), 2)
 
 
-def make_views(rig: Rig, keypoints: Sequence[Keypoints]) -> Views:
+def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False) -> Views:
     """Views of the person whom most cameras agree on, as the detectors saw it.
+
+    Parameters
+    ----------
+    filled : bool, whether the tallest detection stands in where the cameras agree on nobody.
 
     Raises
     ------
@@ -95,7 +99,7 @@ def make_views(rig: Rig, keypoints: Sequence[Keypoints]) -> Views:
     begins = np.full(len(rig), np.nan)
     for record, chosen in zip(keypoints, people, strict=True):
         c, start = rig.index(record.camera), starts[record.keypoint_set]
-        points, begins[c] = _of_person(record, chosen[:frames]), record.time_offset
+        points, begins[c] = _of_person(record, chosen[:frames], filled), record.time_offset
         uv[:, start : start + len(record.names), c] = points
     partner = []
     for name, of_set in sets.items():
@@ -107,18 +111,22 @@ def make_views(rig: Rig, keypoints: Sequence[Keypoints]) -> Views:
     return Views(rig, names, np.array(partner), keypoints[0].rate, uv, np.zeros((frames, len(rig)), bool), begins)
 
 
-def _of_person(record: Keypoints, chosen: NDArray) -> NDArray:
-    """(F, K, 2) [px] of the chosen person; of the largest where the cameras agree on none in most frames."""
+def _of_person(record: Keypoints, chosen: NDArray, filled: bool) -> NDArray:
+    """(F, K, 2) [px] of the chosen person; of the tallest in all frames where the cameras agree on none in most.
+
+    With `filled`, of the tallest in single frames, too.
+    """
     frames = np.arange(len(chosen))
     points = np.where((record.confidence > _SURE)[..., None], record.points, np.nan)[: len(chosen)]
     if not points.shape[1]:
         return np.full((len(chosen), len(record.names), 2), np.nan)
     seen = np.isfinite(points).all(-1)
     anybody = np.any(seen, axis=(1, 2))
-    if np.sum(chosen >= 0) < 0.5 * anybody.sum():
+    disagree = np.sum(chosen >= 0) < 0.5 * anybody.sum()
+    if disagree or filled:
         low, high = (np.where(seen, points[..., 1], fill) for fill in (np.inf, -np.inf))
         tall = np.where(seen.any(-1), high.max(-1) - low.min(-1), -1.0)
-        chosen = np.where(anybody, np.argmax(tall, axis=1), -1)
+        chosen = np.where(anybody & (disagree | (chosen < 0)), np.argmax(tall, axis=1), chosen)
     return np.where((chosen >= 0)[:, None, None], points[frames, np.maximum(chosen, 0)], np.nan)
 
 

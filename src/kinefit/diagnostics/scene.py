@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.check.findings import Finding, Severity, listed
-from kinefit.calibration.check.views import Views
+from kinefit.diagnostics.views import Views
+from kinefit.findings import Finding, Severity, listed
 from kinefit.geometry.camera import Camera, Rig
 
 _VIEW = (15.0, 130.0)  # [deg] of the longer side: from a long tele lens to the widest that is not a fisheye

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.check.views import Views, from_others, meet
+from kinefit.diagnostics.views import Views, from_others, meet
 
 SHIFT, TURN, SCALE = slice(0, 2), slice(2, 3), slice(3, 4)
 PER_CAMERA = 4  # parameters of a camera's picture: shift along u and v [px], turn [rad], scale [1]

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.check.bias import without_points
-from kinefit.calibration.check.views import Views, meet
-from kinefit.calibration.check.whole_frames import MIN_FRAMES, VALLEY, best_shift, depth, from_pairs, pair_curves
+from kinefit.diagnostics.bias import without_points
+from kinefit.diagnostics.views import Views, meet
+from kinefit.diagnostics.whole_frames import MIN_FRAMES, VALLEY, best_shift, depth, from_pairs, pair_curves
 
 _LONGEST = 1500  # frames that fractions are found from
 _BLOCKS = 10  # of time, for the standard error: errors within a block are alike

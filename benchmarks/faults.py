@@ -1,0 +1,16 @@
+"""Every figure of faults of safety and truth: `python -m benchmarks.faults`; some parts: `... faults faults_live`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {
+    "faults_solver": "frames of a long take that a second call of the marker solver lowers",
+    "faults_live": "forbidden origins, hosts and wishes before `kinefit live`",
+    "faults_folder": "classes that an unfinished folder of results brings in, and kills that it survives",
+    "faults_readers": "images that claim much and files that take long: seconds and memory until the error",
+    "faults_inputs": "takes with wrong files that `kinefit track` names, and false alarms on right ones",
+}
+
+if __name__ == "__main__":
+    run_parts(PARTS)

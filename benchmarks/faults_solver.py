@@ -1,0 +1,99 @@
+"""The marker solver on long takes with limits active: a second call on its own result must win nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.figures import amount, data, figure
+from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.calibration.people.floor import centre_of_mass
+from kinefit.losses import SQUARED
+from kinefit.markers.poses import LOSS, POSTURE, columns, sequence_both_ways
+from kinefit.solvers.sequence import fit_sequence
+
+SETTINGS: dict[str, dict[str, Any]] = {"squared": {"loss": SQUARED}, "robust": {"loss": LOSS, "posture": POSTURE}}
+"""Losses of the simulated take; the second is what `fit_markers` takes."""
+
+MAX_GAIN = 1e-4
+"""Share of a frame's cost that a second call may win: a hundred times the tolerance at which a frame ends."""
+
+MAX_RESIDUAL = 0.01
+"""[m] mean over a frame's markers; the whole take has 5 mm."""
+
+GRAVITY = 9.81
+"""[m/s²]"""
+
+
+def run() -> None:
+    """Print the figures of the marker solver's faults."""
+    body, points, x = beyond_limits(amount(1200, 400))
+    count = 0
+    for name, settings in SETTINGS.items():
+        found = fit_sequence(body, body.usual_state(), points, x, **settings)
+        active = np.mean((found.angles <= body.tree.lower) | (found.angles >= body.tree.upper))
+        gain = second_call(body, points, x, found.Ts_world_root, found.angles, **settings)
+        count += int(np.sum(gain > MAX_GAIN))
+        print(
+            f"# simulated, {name} loss: {len(x)} frames, {100 * active:.0f} % of angles at a limit, "
+            f"{found.iterations.mean():.1f} steps a frame, a second call wins {gain.max():.1e} at most"
+        )
+    figure("faults_solver_second_call_simulated", count, "frames", "== 0")
+    squats()
+
+
+def squats() -> None:
+    """1,346 frames of squats without gaps: the subject from this trial and a static one, as `kinefit markers fit`."""
+    folder = data("forces_nimblephysics")
+    if folder is None:
+        for name, unit, goal in (
+            ("second_call", "frames", "== 0"),
+            ("over_10mm", "frames", "== 0"),
+            ("jump", "g", "<= 6"),
+        ):
+            figure(f"faults_solver_squats_{name}", None, unit, goal, "the recording is absent")
+        return
+    static, take = (read_markers(folder / "subject4" / f"{name}.trc") for name in ("static1", "squats1"))
+    subject = fit_marker_subject(load_body("humanoid"), [static, take])
+    x = columns(take, subject.points.names)[: amount(None, 300)]
+    roots, angles = sequence_both_ways(subject.body, subject.points, x, subject.sigma)
+    gain = second_call(subject.body, subject.points, x, roots, angles, sigma=subject.sigma, **SETTINGS["robust"])
+    figure("faults_solver_squats_second_call", int(np.sum(gain > MAX_GAIN)), "frames", "== 0")
+    motion = fit_markers(subject.body, take, subject.marker_set, sigma=subject.sigma)
+    left = np.nanmean(motion.residuals["markers"].norms, axis=1)
+    print(f"# squats: residual {1e3 * left.mean():.2f} mm on average, {1e3 * left.max():.1f} mm in the worst frame")
+    figure("faults_solver_squats_over_10mm", int(np.sum(left > MAX_RESIDUAL)), "frames", "== 0")
+    acceleration = np.diff(centre_of_mass(motion), 2, axis=0) * motion.rate**2
+    figure("faults_solver_squats_jump", float(np.linalg.norm(acceleration, axis=1).max()) / GRAVITY, "g", "<= 6")
+
+
+def beyond_limits(frames: int, seed: int = 0) -> tuple[Body, PointSet, NDArray]:
+    """A humanoid whose angles swing beyond both ends of their ranges, and its markers (F, K, 3) [m] with 3 mm noise."""
+    body, random = load_body("humanoid"), np.random.default_rng(seed)
+    tree = body.tree
+    middle = np.clip(tree.usual, tree.lower, tree.upper)
+    swing = 1.1 * np.minimum(0.5 * (tree.upper - tree.lower), 0.6) * ~tree.prismatic  # [rad]
+    phase, pace = random.uniform(0.0, 2.0 * np.pi, len(middle)), random.uniform(0.5, 1.5, len(middle))
+    turns = np.linspace(0.0, 8.0 * np.pi, frames)[:, None]
+    angles, points = middle + swing * np.sin(pace * turns + phase), body.markers("HANIM_45")
+    x = body.trajectories(np.broadcast_to(np.eye(4), (frames, 4, 4)), angles, points)
+    return body, points, x + random.normal(0.0, 0.003, x.shape)
+
+
+def second_call(body: Body, points: PointSet, x: NDArray, roots: NDArray, angles: NDArray, **settings: Any) -> NDArray:
+    """(F,) share of each frame's cost that the solver wins when it starts from its own result."""
+
+    def cost(frame: int, state: BodyState) -> float:  # a fit's own figure is a prediction after the last step
+        there = fit_sequence(body, state, points, x[frame : frame + 1], max_iterations=0, **settings)
+        return float(there.costs[0])
+
+    gain = np.empty(len(x))
+    for f in range(len(x)):
+        first = BodyState(roots[f], angles[f])
+        again = fit_sequence(body, first, points, x[f : f + 1], **settings)
+        before = cost(f, first)
+        gain[f] = (before - cost(f, BodyState(again.Ts_world_root[0], again.angles[0]))) / before
+    return gain

@@ -1,0 +1,108 @@
+"""What `track` always looks at: faults of its inputs that a second of work shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kinefit.bodies import Body
+from kinefit.diagnostics.images import fit_image
+from kinefit.diagnostics.keypoints import check_keypoints
+from kinefit.diagnostics.person import size_findings
+from kinefit.errors import KinefitError
+from kinefit.findings import FINDINGS, Finding, as_records, faults_of
+from kinefit.motion import UP_AXES, Motion
+from kinefit.observations import Keypoints
+from kinefit.readers.guess.views import nearest_axis
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+
+_MIN_QUALITY = 0.5  # of a frame that shows how the person is placed
+_MIN_FRAMES = 10
+_MIN_INVERTED = 135.0  # [deg] median angle between trunk and vertical
+_MIN_LYING = 60.0  # [deg] the same: who bends comes back
+_MIN_WALK = 0.5  # [m] across the trunk: nobody goes so far lying
+_STATED = ("scaled", "letterboxed")  # what the take may say of an image, and one image of the video can contradict
+
+
+def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
+    """The faults of a take's images, cameras and keypoints; doubts are for `kinefit check`.
+
+    Parameters
+    ----------
+    take : Take
+    seen : what its sensors saw.
+    keypoints : of the person who is tracked.
+    body : of the person, generic.
+    """
+    rig, findings = seen.rig, list[Finding]()
+    if rig is None or take.calibration is None:
+        return ()
+    for entry in take.cameras:
+        if entry.image in _STATED:
+            findings += fit_image(entry, rig[entry.name].size, take.rate, frames=1)[1]
+    sigma: dict[str, float] = {}
+    for source in take.keypoints:
+        sigma[source.camera] = min(source.sigma, sigma.get(source.camera, np.inf))
+    everybody, here = _with_somebody(seen.keypoints), _with_somebody(keypoints)
+    shown = [k for k in keypoints if k.camera in here or k.camera not in everybody]  # a camera may see others alone
+    cameras = tuple(name for name in rig.names if any(k.camera == name for k in shown))
+    if len(cameras) > 1:
+        findings += check_keypoints(
+            rig.select(cameras), shown, body=body, up=take.up, height=take.height, accuracy=sigma, name=take.name,
+            take=take, observations=seen, quick=True,
+        ).findings  # fmt: skip
+    return faults_of(findings)
+
+
+def _with_somebody(keypoints: Sequence[Keypoints]) -> set[str]:
+    """The cameras in which anybody was detected."""
+    return {k.camera for k in keypoints if np.any(k.confidence > 0.0)}
+
+
+def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]:
+    """The faults that a person's motion shows, where no two cameras do: who hangs upside down or walks lying, and size.
+
+    A person may lie still, or stand on the hands for a while.
+
+    Parameters
+    ----------
+    motion : Motion of a body whose root looks up along its y axis.
+    height : float [m] stature, where it is known: then the take's own.
+    """
+    if not motion.body.stature:
+        return ()
+    good = motion.quality >= _MIN_QUALITY
+    if good.sum() < _MIN_FRAMES:
+        return ()
+    trunk, up = motion.Ts_world_root[good, :3, 1], np.array(UP_AXES[motion.up])
+    middle = np.median(trunk, axis=0)
+    middle = middle / max(float(np.linalg.norm(middle)), 1e-9)
+    lean = float(np.degrees(np.median(np.arccos(np.clip(trunk @ up, -1.0, 1.0)))))
+    places = motion.Ts_world_root[good, :3, 3]
+    way = float(np.linalg.norm(np.ptp(places - (places @ middle)[:, None] * middle, axis=0)))
+    findings = list(size_findings(motion.body.stature, height))
+    if lean > _MIN_INVERTED or (lean > _MIN_LYING and way > _MIN_WALK):
+        how = "hangs head down" if lean > _MIN_INVERTED else f"moves {way:.1f} m lying"
+        text = f'up = "{motion.up}" is wrong: the person {how}, with the trunk {lean:.0f} degrees off it.'
+        remedy = f'Write up = "{nearest_axis(middle)[0]}" into [take].'
+        findings.append(Finding("fault", "up", text, (), "Sure, unless that is what the person does.", remedy))
+    return faults_of(findings)
+
+
+def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
+    """The motion with findings in its `provenance`, and with those of `motion_findings` where it has metric sensors."""
+    if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
+        findings = [*findings, *motion_findings(motion, height)]
+    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+
+
+def with_cause(error: KinefitError, findings: Sequence[Finding]) -> KinefitError:
+    """An error of tracking, with the worst fault of the inputs as its cause."""
+    if not findings:
+        return error
+    first = findings[0]
+    problem = f"{error.problem.rstrip('.')}; the inputs have a fault: {first.text.rstrip('.')}"
+    return type(error)(problem, file=error.file, place=error.place, remedy=first.remedy or error.remedy)

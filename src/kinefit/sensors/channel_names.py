@@ -1,0 +1,110 @@
+"""Which channel each row is of: the identity that lets a take know a sensor's errors from frame to frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.rows import AnyRows, DofRows, Rows
+from kinefit.sensors.base import Matched
+
+_MIN_FRAMES = 10  # named measurements of a sensor; in fewer it may be that no channel was seen twice
+
+Channel = tuple[str | int, ...]
+"""Which part of a match (of numbered channels), its name or measurement id, how many rows it has, and which of them."""
+
+
+class ChannelNames:
+    """The channels of every sensor of a take, and whether the sensors keep to them."""
+
+    def __init__(self) -> None:
+        self._named: dict[str, bool] = {}
+        self._numbered: dict[tuple[str, int], bytes] = {}
+        self._names: dict[str, tuple[set[str], int, int]] = {}
+
+    def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[list[Channel]]:
+        """Of every part of a match the channel of each row.
+
+        Parameters
+        ----------
+        matched : Matched; where its rows are no single points, their segments are the channels
+        parts : its rows
+
+        Raises
+        ------
+        ObservationError
+            Names that are no text, or not each a different one; a measurement id without a name; a sensor that names
+            its channels at some times only, or anew at every time; numbered channels that change.
+        """
+        sensor, names = matched.sensor, matched.channels
+        if not matched.of_points:
+            return [[(k,) for k in (r.segment if isinstance(r, Rows) else np.zeros(len(r), int))] for r in parts]
+        self.check_names(matched)
+        out, used = [], set[str]()
+        for k, rows in enumerate(parts):
+            ids, index, count = np.unique(_ids(rows), return_inverse=True, return_counts=True)
+            if names is None:
+                if len(ids) and self._numbered.setdefault((sensor, k), ids.tobytes()) != ids.tobytes():
+                    raise ObservationError(
+                        f"the channels of sensor '{sensor}' have no names, and their number changes",
+                        remedy="Name what each measurement id is of: RowsOf(rows, channels=names).",
+                    )
+            elif len(ids) and ids[-1] >= len(names):
+                problem = f"sensor '{sensor}' names {len(names)} channels and has rows of measurement id {ids[-1]}"
+                raise ObservationError(problem, remedy="Give one name for each measurement id, `Rows.group`.")
+            keys: list[tuple[str | int, ...]] = [(k, int(i)) if names is None else (names[i],) for i in ids]
+            used.update(() if names is None else (names[i] for i in ids))
+            first = np.cumsum(count) - count
+            rank = np.empty(len(index), np.int64)
+            rank[np.argsort(index, kind="stable")] = np.arange(len(index)) - np.repeat(first, count)
+            out.append([(*keys[i], int(count[i]), int(r)) for i, r in zip(index, rank)])
+        if used:
+            self._check_return(sensor, used)
+        return out
+
+    def check_names(self, matched: Matched) -> None:
+        """An error where a match's names are no names, or where its sensor has names at some times only."""
+        names, sensor = matched.channels, matched.sensor
+        if self._named.setdefault(sensor, names is not None) != (names is not None):
+            raise ObservationError(
+                f"measurements of sensor '{sensor}' name their channels at some times only",
+                remedy="Name them always. If two sensors use this name, give each its own.",
+            )
+        if names is not None and (isinstance(names, str) or not all(isinstance(n, str) for n in names)):
+            raise ObservationError(f"channels of sensor '{sensor}' are no names", remedy="Give a list of text.")
+        if names is not None and len(set(names)) < len(names):
+            twice = next(n for n in names if list(names).count(n) > 1)
+            raise ObservationError(f"sensor '{sensor}' has two channels '{twice}'", remedy="Name each differently.")
+
+    def check_step(self, matched: Sequence[Matched]) -> None:
+        """An error where two measurements of one time and sensor have a channel in common: two sensors use one name."""
+        seen = set[tuple[str, float, str]]()
+        for m in matched:
+            if m.of_points:
+                self.check_names(m)
+                keys = {(m.sensor, m.time, name) for name in (("",) if m.channels is None else m.channels)}
+                if both := seen & keys:
+                    problem = f"two measurements of sensor '{m.sensor}' at {m.time:g} s"
+                    problem += f" have a channel '{min(both)[2]}'" if m.channels is not None else ""
+                    raise ObservationError(problem, remedy="If two sensors use this name, give each its own.")
+                seen |= keys
+
+    def _check_return(self, sensor: str, used: set[str]) -> None:
+        known, frames, total = self._names.get(sensor, (set(), 0, 0))
+        known, frames, total = known | used if used - known else known, frames + 1, total + len(used)
+        if frames >= _MIN_FRAMES and len(known) == total:
+            raise ObservationError(
+                f"sensor '{sensor}' names its channels anew at every time: {', '.join(sorted(used)[:3])}",
+                remedy="Name what a channel is of, such as a marker, and not when it was seen.",
+            )
+        self._names[sensor] = known, frames, total
+
+
+def _ids(rows: AnyRows) -> NDArray:
+    """(N,) measurement id of each row; where rows have none, each is its own measurement."""
+    if not isinstance(rows, Rows | DofRows):
+        return np.arange(len(rows))
+    return np.where(rows.group < 0, np.arange(len(rows)), rows.group) if rows.group.min(initial=0) < 0 else rows.group

@@ -1,0 +1,128 @@
+"""Decide who may connect to a server that kinefit opens; docs/live.md, "Who may connect", says it to users."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import re
+import secrets
+import socket
+from http import HTTPStatus
+from typing import NamedTuple
+
+from websockets.datastructures import Headers
+
+from kinefit.errors import ExportError
+from kinefit.serving import TOKEN_VARIABLE
+
+_TOKEN_BYTES = 18  # 144 random bits: 24 characters of the address
+_TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")  # stands in an address as it is; a shorter one can be tried out
+_LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+_ALL_ADDRESSES = ("", "0.0.0.0", "::")
+_HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::(\d{1,5}))?")
+_HTTP_PORT = 80  # of a Host without one
+
+
+class Admission(NamedTuple):
+    """A request that may go on: the path behind the token, and whether the token was there."""
+
+    path: str
+    has_token: bool
+
+
+class Refusal(NamedTuple):
+    """A request that ends here: its HTTP status, and the reason in one sentence."""
+
+    status: HTTPStatus
+    reason: str
+
+
+class Access:
+    """The rules of one server.
+
+    A request is refused if its `Host` is no address of the server (a foreign name that resolves to this computer), if
+    its `Origin` is another page's, or if its path does not begin with the token.
+
+    Parameters
+    ----------
+    host : address or name that the server is bound to; "0.0.0.0" for all networks
+    token : 16 to 128 letters, digits, "-" and "_"; a random one where it is None
+    readers : whether programs of this computer may open a WebSocket without the token, to read; browsers may not, nor
+        anybody where the server is open to a network
+
+    Raises
+    ------
+    ExportError
+        A token of another form.
+    """
+
+    def __init__(self, host: str = "127.0.0.1", token: str | None = None, *, readers: bool = False) -> None:
+        self.host = host
+        self.token = secrets.token_urlsafe(_TOKEN_BYTES) if token is None else token
+        if not _TOKEN.fullmatch(self.token):
+            remedy = f"Give 16 to 128 letters, digits, - and _, by --token or {TOKEN_VARIABLE}; or leave it out."
+            raise ExportError(f"a token of {len(self.token)} characters that cannot be used", remedy=remedy)
+        self.is_local = host == "localhost" or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
+        self._readers = readers and self.is_local
+
+    @property
+    def warning(self) -> str | None:
+        """What to tell the user of a server that a network reaches; None for one of this computer alone."""
+        if self.is_local:
+            return None
+        return (
+            f"The server at {self.host or 'all addresses'} is open to the network: whoever has its token sees and "
+            "changes what you see, and as it is not encrypted, the network's other computers can read the token."
+        )
+
+    def url(self, port: int) -> str:
+        """Address of the page at a port, with the token."""
+        host = "localhost" if self.host in (*_ALL_ADDRESSES, "127.0.0.1") else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{port}/{self.token}/"
+
+    def check(self, path: str, headers: Headers, address: str, port: int) -> Admission | Refusal:
+        """Whether a request may go on.
+
+        Parameters
+        ----------
+        path : of the request
+        headers : of the request
+        address, port : of this computer, at which the request arrived
+        """
+        hosts = [host.lower() for host in headers.get_all("Host")]
+        if len(hosts) != 1 or not self._is_own(hosts[0], address, port):
+            return Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"This host is not served here; the port is {port}.")
+        origins = [origin.lower() for origin in headers.get_all("Origin")]
+        if origins and origins != [f"http://{hosts[0]}"]:
+            return Refusal(HTTPStatus.FORBIDDEN, "Pages of other servers may not connect.")
+        given, _, rest = path.partition("?")[0].removeprefix("/").partition("/")
+        if hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode()):
+            return Admission(f"/{rest}", True)
+        if given:
+            return Refusal(HTTPStatus.FORBIDDEN, "The address has another token than this server.")
+        if self._readers and not origins and "Upgrade" in headers:
+            return Admission("/", False)
+        return Refusal(HTTPStatus.FORBIDDEN, "Open the address that the command printed: it ends with the token.")
+
+    def _is_own(self, host: str, address: str, port: int) -> bool:
+        """Whether a `Host` is an address of this server.
+
+        At all addresses, every number passes: only a name can be made to resolve to another computer.
+        """
+        found = _HOST.fullmatch(host)
+        if found is None or int(found[2] or _HTTP_PORT) != port:
+            return False
+        name = found[1].strip("[]")
+        if name in (*_LOOPBACK_NAMES, self.host.lower(), address):
+            return True
+        own = socket.gethostname().lower()
+        return not self.is_local and (_is_number(name) or name in (own, f"{own}.local"))
+
+
+def _is_number(host: str) -> bool:
+    """Whether a host is an IP address, and no name."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True

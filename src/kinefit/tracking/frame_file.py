@@ -1,0 +1,135 @@
+"""The file of a checkpoint: what is kept of every frame done, and after every few hundred the state of the tracker.
+
+The next run reads it up to the last whole state. What comes after that is dropped, and so is all of a file that is
+damaged before its first state, or of another take.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from array import array
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from kinefit._records import RecordFile
+from kinefit.errors import ExportError, FileError, ObservationError
+from kinefit.sensors.base import Sensor
+from kinefit.smoothing.record_classes import CODEC
+from kinefit.smoothing.spool import Store
+
+FORMAT = b"kinefit frames 2\n"
+"""First line of the file. The second is a digest of all that the result depends on."""
+
+KINDS = RESULTS, MEASUREMENTS, LEFTOVERS = range(3)
+"""Tags of the records of a frame."""
+
+_STATE = len(KINDS)  # tag of a state
+
+
+class FrameFile(Store):
+    """Records of frames in a file that outlives the process.
+
+    Parameters
+    ----------
+    path : Path; what another run left there is overwritten where it is of no use
+    key : of all that the result depends on
+
+    Attributes
+    ----------
+    at : int, step before which the last state was kept; None where there is none
+    state : of the tracker then
+    steps : numbers of the steps done until then, in their order
+    places : of each of `KINDS` the bytes at which the records of these steps begin
+    problem : what is wrong with what an earlier run left, "" for nothing
+    """
+
+    def __init__(self, path: Path, key: str) -> None:
+        head = FORMAT + hashlib.sha256(key.encode()).hexdigest().encode() + b"\n"
+        self._file = open(path, "r+b" if path.exists() else "w+b")
+        seal = hashlib.sha256(head).digest()
+        super().__init__(records=RecordFile(self._file, seal, start=len(head), name=path))
+        self._path, self._known = path, dict[str, Any]()
+        self.at: int | None = None
+        self.state: Any = None
+        self.steps: list[int] = []
+        self.places = [array("q") for _ in KINDS]
+        self.problem = self._read(head)
+
+    def _read(self, head: bytes) -> str:
+        """Find the frames up to the last whole state and cut off what comes after; what is wrong with that, or ""."""
+        found = self._file.read(len(head))
+        if found != head:
+            self._file.seek(0)
+            self._file.truncate()
+            self._file.write(head)
+            if re.fullmatch(FORMAT + rb"[0-9a-f]{64}\n", found):
+                return "is of another take, changed files, other options or another kinefit"
+            return "is damaged, or in another format" if found else ""
+        records, whole, last = self._records, self._records.start, b""
+        at, count, steps, places = 0, 0, list[int](), [array("q") for _ in KINDS]
+        for place, tag, number, data in records.scan():
+            if tag == _STATE and any(len(there) != len(steps) for there in places):
+                break
+            if tag == _STATE:
+                at, count, whole, last = number, len(steps), records.end, data
+            elif tag in KINDS:
+                places[tag].append(place)
+                steps += [number] if tag == RESULTS else []
+        end, size = records.end, self._path.stat().st_size
+        try:
+            self.state = CODEC.decode(last) if last else None
+        except FileError:
+            whole, last = records.start, b""
+        records.cut(whole)
+        if not last:
+            return "is damaged, or ends before its first state" if size > whole else ""
+        self.at, self.steps, self.places = at, steps[:count], [there[:count] for there in places]
+        return f"is damaged or cut off at byte {end}" if size > end else ""
+
+    def keep(self, at: int, state: Any) -> Any:
+        """Write the state before a step, and have it and all frames on the disk; returns it as it will be read back.
+
+        Raises
+        ------
+        ExportError
+            It cannot be written.
+        """
+        data = CODEC.encode(state)
+        try:
+            self._records.append(data, _STATE, at)
+            self._records.flush()
+        except OSError as error:
+            raise self._full(error) from error
+        self.at = at
+        return CODEC.decode(data)
+
+    def name(self, **objects: Any) -> None:
+        """Names by which records refer to objects that every run has of its own."""
+        self._known |= objects
+
+    def name_sensors(self, sensors: Iterable[Sensor]) -> None:
+        """The same of sensors, by their own names."""
+        self._known |= {f"sensor {sensor.name}": sensor for sensor in sensors}
+
+    def close(self) -> None:
+        """Close the file; its records cannot be read any more."""
+        self._file.close()
+
+    def _full(self, error: OSError) -> ExportError:
+        remedy = "Free some space, or name another place by --out."
+        return ExportError(f"cannot be written ({error.strerror})", file=self._path, remedy=remedy)
+
+    def _refer(self, thing: Any) -> str:
+        if isinstance(thing, Sensor):
+            self._known.setdefault(f"sensor {thing.name}", thing)
+            return f"sensor {thing.name}"
+        for name, known in self._known.items():
+            if known is thing:
+                return name
+        problem = f"a checkpoint of frames with a {type(thing).__name__} of one's own, which nobody can keep"
+        raise ObservationError(problem, remedy="Leave the checkpoint out.")
+
+    def _resolve(self, reference: int | str) -> Any:
+        return self._known[str(reference)]
