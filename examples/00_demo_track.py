@@ -9,14 +9,12 @@ import sys
 import numpy as np
 
 import kinefit
-from kinefit.assets import write_sample_take
-from kinefit.exporters import write_bvh, write_csv
 
 COORDINATES = ("hip_flexion_r", "knee_angle_r", "hip_flexion_l", "knee_angle_l", "arm_flex_r", "elbow_flex_r")
 
 
 def main(take_file=None, out="kinefit-example"):
-    motion, _ = kinefit.track_take(take_file or write_sample_take(f"{out}/take"))
+    motion, _ = kinefit.track_take(take_file or kinefit.assets.write_sample_take(f"{out}/take"))
 
     print(f"{motion.name}: {len(motion)} frames at {motion.rate:g} Hz, quality {motion.quality.mean():.2f}")
     for camera, residuals in motion.residuals.items():
@@ -37,8 +35,8 @@ def main(take_file=None, out="kinefit-example"):
     knee = motion.segment_poses()[:, motion.body.tree.segment("shank_r"), :3, 3]
     print(f"the right knee moved within {np.ptp(knee, axis=0).round(2)} m (x, y, z; {motion.up} is up)")
 
-    write_bvh(motion, f"{out}/motion.bvh")
-    write_csv(motion, f"{out}/tables")
+    kinefit.write_bvh(motion, f"{out}/motion.bvh")
+    kinefit.write_csv(motion, f"{out}/tables")
     print(f"written: {out}/motion.bvh, {out}/tables")
     return motion
 

@@ -5,10 +5,7 @@
 
 import numpy as np
 
-from kinefit import levenberg_marquardt
-from kinefit.bodies import BodyState, parse_body
-from kinefit.correspondences import point_rows, prior_rows
-from kinefit.solvers.equations import covariance
+import kinefit
 
 LAMP = """
 [body]
@@ -51,8 +48,8 @@ bulb = { segment = "shade", at = [0.0, 0.12, 0.0] }
 
 
 def main(seed=0, noise=0.002):
-    lamp = parse_body(LAMP, "the lamp of this example")
-    truth = BodyState(np.eye(4), np.radians([40.0, -20.0, 75.0, 30.0]))
+    lamp = kinefit.parse_body(LAMP, "the lamp of this example")
+    truth = kinefit.BodyState(np.eye(4), np.radians([40.0, -20.0, 75.0, 30.0]))
 
     measured = lamp.positions(truth, lamp.landmarks)  # (5, 3) [m]
     measured += np.random.default_rng(seed).normal(0.0, noise, measured.shape)
@@ -60,13 +57,13 @@ def main(seed=0, noise=0.002):
 
     def make_rows(state):  # called at every state that is tried
         return (
-            point_rows(lamp, state, lamp.landmarks, measured, sigma=noise),
-            prior_rows(lamp, state),  # a whisper, from the width of the ranges, for what nothing observes
+            kinefit.correspondences.point_rows(lamp, state, lamp.landmarks, measured, sigma=noise),
+            kinefit.correspondences.prior_rows(lamp, state),  # a weak prior for what nothing observes
         )
 
-    fit = levenberg_marquardt(lamp, lamp.rest_state(), make_rows)
+    fit = kinefit.levenberg_marquardt(lamp, lamp.rest_state(), make_rows)
     # The normal matrix has six rows for the root in front; this root is fixed.
-    std = np.degrees(covariance(fit.equations).std[6:])
+    std = np.degrees(kinefit.covariance(fit.equations).std[6:])
     found = np.degrees(fit.state.angles)
     print(f"{lamp.name}: fitted in {fit.iterations} iterations")
     for name, a, s, t in zip(lamp.tree.coordinates, found, std, np.degrees(truth.angles)):

@@ -7,12 +7,7 @@ One camera does not tell how far away a hand is. The rope does: its end is somew
 
 import numpy as np
 
-from kinefit import levenberg_marquardt, load_body
-from kinefit.bodies import BodyState
-from kinefit.correspondences import pixel_rows, prior_rows
-from kinefit.rows import Rows
-from kinefit.simulation import studio_rig
-from kinefit.solvers.equations import covariance, joint_std
+import kinefit
 
 
 def sphere_rows(body, state, points, centre, radius, *, sigma=0.005):
@@ -24,18 +19,18 @@ def sphere_rows(body, state, points, centre, radius, *, sigma=0.005):
     away = x - centre
     distance = np.linalg.norm(away, axis=1)
     weight = np.full(len(points), 1.0 / sigma**2)
-    return Rows.of(points.segments, x, away / distance[:, None], radius - distance, weight)
+    return kinefit.Rows.of(points.segments, x, away / distance[:, None], radius - distance, weight)
 
 
 def main(seed=0, noise_px=1.0):
-    arm, rig = load_body("arm"), studio_rig(cameras=1)
+    arm, rig = kinefit.load_body("arm"), kinefit.simulation.studio_rig(cameras=1)
     degrees = {"arm_flex_r": 20.0, "arm_add_r": -60.0, "elbow_flex_r": 40.0, "pro_sup_r": 45.0}
     angles = np.zeros(len(arm.tree.coordinates))
     for name, value in degrees.items():
         angles[arm.tree.coordinate(name)] = np.radians(value)
     shoulder = np.eye(4)
     shoulder[:3, 3] = [0.0, 1.4, 0.0]
-    truth = BodyState(shoulder, angles)
+    truth = kinefit.BodyState(shoulder, angles)
 
     seen = arm.keypoints("MEDIAPIPE_33")
     camera = np.zeros(len(seen), int)  # every point was seen by camera 0
@@ -49,14 +44,15 @@ def main(seed=0, noise_px=1.0):
     for name, with_rope in (("camera alone", False), ("camera and rope", True)):
 
         def make_rows(state, with_rope=with_rope):
-            rows = [pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px), prior_rows(arm, state)]
+            pixels = kinefit.correspondences.pixel_rows(arm, state, seen, rig, camera, uv, sigma=noise_px)
+            rows = [pixels, kinefit.correspondences.prior_rows(arm, state)]
             return rows + [sphere_rows(arm, state, grip, anchor, length)] * with_rope
 
-        fit = levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)
+        fit = kinefit.levenberg_marquardt(arm, arm.rest_state(shoulder), make_rows)
         wrist = arm.landmarks.select(("r_wrist",))
         error = np.linalg.norm(arm.positions(fit.state, wrist) - arm.positions(truth, wrist))
-        spread = covariance(fit.equations)
-        std = np.linalg.norm(joint_std(arm, fit.state, spread)[arm.tree.segment("hand_r")])
+        spread = kinefit.covariance(fit.equations)
+        std = np.linalg.norm(kinefit.joint_std(arm, fit.state, spread)[arm.tree.segment("hand_r")])
         errors[name] = (error, std)
         print(f"{name:<16} wrist off by {1000 * error:5.1f} mm, one standard deviation {1000 * std:5.1f} mm")
     return errors

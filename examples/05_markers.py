@@ -11,15 +11,12 @@ from pathlib import Path
 import numpy as np
 
 import kinefit
-from kinefit.bodies.marker_sets import placement
-from kinefit.exporters import write_markers, write_mot, write_osim
-from kinefit.simulation import squat_and_wave
 
 
 def simulated(frames=120, seed=0):
     """Markers of squats and waves with 1 mm noise, and the same without names, in another order, with ghosts."""
-    truth, rng = squat_and_wave(rate=60), np.random.default_rng(seed)
-    points = placement(truth.body, "CMU_41").points
+    truth, rng = kinefit.simulation.squat_and_wave(rate=60), np.random.default_rng(seed)
+    points = kinefit.bodies.placement(truth.body, "CMU_41").points
     points = replace(points, points=points.points + 0.01 * rng.standard_normal((len(points), 3)))  # no two sides alike
     x = truth.positions(points) + 0.001 * rng.standard_normal((len(truth), len(points), 3))
     labelled = kinefit.Markers(points.names, truth.rate, x, up=truth.up)
@@ -58,9 +55,9 @@ def main(labelled=None, points=None, out="kinefit-example"):
         print(f"{name}: {angle.min():.0f} to {angle.max():.0f} deg")
 
     Path(out).mkdir(parents=True, exist_ok=True)
-    write_markers(named, Path(out) / "labelled.c3d")
-    write_osim(subject.body, Path(out) / "body.osim")
-    write_mot(motion, Path(out) / "motion.mot")
+    kinefit.write_markers(named, Path(out) / "labelled.c3d")
+    kinefit.write_osim(subject.body, Path(out) / "body.osim")
+    kinefit.write_mot(motion, Path(out) / "motion.mot")
     print(f"written: {out}/labelled.c3d, body.osim, motion.mot")
     return found, motion
 

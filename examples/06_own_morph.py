@@ -9,12 +9,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from kinefit.bodies import BodyState, parse_body
-from kinefit.bodies.morphing import Morphing
-from kinefit.correspondences import morphed_rows, prior_rows
-from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas
-from kinefit.solvers.least_squares import gauss_newton
+import kinefit
+from kinefit import correspondences
 
 ARM = """
 [body]
@@ -43,10 +39,10 @@ end = 120"""
 
 
 def main(picture=None, seed=0):
-    arm = parse_body(ARM, "the arm of this example")
-    model, rigid = Morphing(arm), Morphing(replace(arm, morphs=()))
+    arm = kinefit.parse_body(ARM, "the arm of this example")
+    model, rigid = kinefit.bodies.Morphing(arm), kinefit.bodies.Morphing(replace(arm, morphs=()))
     angles = dict.fromkeys(arm.tree.coordinates, 0.0) | {"arm_flex_r": 30.0, "elbow_flex_r": 100.0, "pro_sup_r": 80.0}
-    truth = BodyState(np.eye(4), np.radians(list(angles.values())))
+    truth = kinefit.BodyState(np.eye(4), np.radians(list(angles.values())))
 
     random = np.random.default_rng(seed)
     nodes, axes = np.repeat(random.choice(len(model.mesh.vertices), 150), 3), np.tile(np.eye(3), (150, 1))
@@ -58,8 +54,8 @@ def main(picture=None, seed=0):
         for _ in range(20):
             pose = body.pose(state)
             gap = np.sum(axes * (seen - pose.vertices[nodes]), axis=1)
-            rows = morphed_rows(pose, nodes, axes, gap, sigma=0.002)
-            state = gauss_newton(arm, state, [rows, prior_rows(arm, state)]).state
+            rows = correspondences.morphed_rows(pose, nodes, axes, gap, sigma=0.002)
+            state = kinefit.gauss_newton(arm, state, [rows, correspondences.prior_rows(arm, state)]).state
         errors[name] = np.degrees(np.abs(state.angles - truth.angles).max())
         print(f"{name:>9} model: angles off by at most {errors[name]:.2f} deg")
     if picture:
@@ -70,8 +66,8 @@ def main(picture=None, seed=0):
 def drawn(model, state):
     """An image (H, W, 3) of a body from its right side, darker where it is further away."""
     T = np.array([[1.0, 0, 0, -0.15], [0, -1, 0, -0.2], [0, 0, -1, 1.2], [0, 0, 0, 1]])
-    camera = Camera("side", (480, 480), [[700, 0, 240], [0, 700, 240], [0, 0, 1]], (), "radtan", T)
-    depth = Canvas(camera.size).draw_for(camera, model.pose(state).vertices, model.mesh.faces).depth
+    camera = kinefit.Camera("side", (480, 480), [[700, 0, 240], [0, 700, 240], [0, 0, 1]], (), "radtan", T)
+    depth = kinefit.rendering.Canvas(camera.size).draw_for(camera, model.pose(state).vertices, model.mesh.faces).depth
     grey = np.where(np.isfinite(depth), 220 - 1500 * (np.minimum(depth, 9) - 1.12), 255).clip(0, 255)
     return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
 

@@ -2,6 +2,8 @@
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import catalogue, load_body, parse_body
+from kinefit.bodies.marker_sets import placement
+from kinefit.bodies.morphing import Morphing
 from kinefit.bodies.serial import save_body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
@@ -12,10 +14,12 @@ __all__ = [
     "BodyState",
     "KinematicTree",
     "MeshSurface",
+    "Morphing",
     "PointSet",
     "TaperedCylinder",
     "catalogue",
     "load_body",
     "parse_body",
+    "placement",
     "save_body",
 ]

@@ -30,6 +30,11 @@ class PointSet:
     names : (K,)
     segments : (K,) int, index of each point's segment.
     points : (K, 3) [m] in the segment's frame.
+
+    Raises
+    ------
+    BodyError
+        Arrays of other shapes, or no numbers.
     """
 
     names: tuple[str, ...]
@@ -37,7 +42,14 @@ class PointSet:
     points: NDArray
 
     def __post_init__(self) -> None:
-        segments, points = np.array(self.segments, np.int64), np.array(self.points, float).reshape(-1, 3)
+        try:
+            segments, points = np.array(self.segments, np.int64), np.array(self.points, float).reshape(-1, 3)
+            fits = len(self.names) == len(points) and segments.shape == (len(points),)
+        except (TypeError, ValueError, OverflowError):
+            fits = False
+        if not fits:
+            problem = "names, segments and points of a point set do not belong together"
+            raise BodyError(problem, remedy="Give K names, (K,) indices of segments and (K, 3) places [m].")
         segments.flags.writeable = points.flags.writeable = False
         object.__setattr__(self, "segments", segments)
         object.__setattr__(self, "points", points)

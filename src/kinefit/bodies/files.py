@@ -89,6 +89,7 @@ def catalogue_text(name: str) -> str:
     return _text(name)[0]
 
 
+@checked
 def parse_body(text: str, source: str = "body") -> Body:
     """Body from TOML text; `source` names it in messages."""
     record = _record(text, source)

@@ -38,6 +38,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
@@ -132,6 +133,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
     return _check_closures(body)
 
 
+@checked
 def save_body(body: Body, path: str | PathLike[str]) -> None:
     """Write a body, skin and morphs included, to an `.npz` file that `load_body` and takes read.
 

@@ -6,6 +6,7 @@ from os import PathLike
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
@@ -14,6 +15,7 @@ from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, le
 from kinefit.motion import Motion
 
 
+@checked
 def write_c3d(
     motion: Motion, path: str | PathLike[str], *, unit: str = "mm", up: str | None = None, names: str = "kinefit"
 ) -> None:

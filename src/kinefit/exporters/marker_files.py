@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.exporters.c3d_file import MOST, Value, c3d_bytes, label_groups, screens
@@ -22,6 +23,7 @@ _MOST_RESIDUAL = 255  # what a byte counts to
 _OURS = ("POINT", "TRIAL", "EVENT")  # groups that are written anew
 
 
+@checked
 def write_markers(
     markers: Markers, path: str | PathLike[str], *, unit: str | None = None, like: str | PathLike[str] | None = None
 ) -> None:

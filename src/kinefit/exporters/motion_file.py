@@ -12,6 +12,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies.serial import body_to_arrays, text_array
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
@@ -19,6 +20,7 @@ from kinefit.motion import Motion
 from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, SURFACE_ARRAYS, VERSION
 
 
+@checked
 def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     """Write everything of a motion into one `.npz`; `read_motion` gives it back exactly.
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
@@ -34,6 +35,7 @@ Table = dict[str, NDArray]  # column -> (rows,)
 _ROWS, _FRAMES = 2000, 200  # of a piece that is written at once; the latter of the long form, some 100 rows each
 
 
+@checked
 def write_csv(
     motion: Motion, folder: str | PathLike[str], *, unit: str = "m", up: str | None = None, names: str | None = None
 ) -> tuple[Path, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.observations.arrays import check_seen, numbers
 from kinefit.observations.depth import _Recording, checked_times
 
 
@@ -35,7 +36,8 @@ class SurfacePointFrame:
     covariance: NDArray
 
     def __post_init__(self) -> None:
-        ids, x, c = np.asarray(self.ids), np.asarray(self.x_world, float), np.asarray(self.covariance, float)
+        check_seen(self.sensor, self.time)
+        ids, x, c = numbers(self.ids, None), numbers(self.x_world), numbers(self.covariance)
         if ids.ndim != 1 or x.shape != (len(ids), 3) or c.shape != (len(ids), 3, 3) or ids.dtype.kind not in "iu":
             problem = f"{ids.dtype} ids {ids.shape}, points {x.shape}, covariances {c.shape} of {self.sensor}"
             raise ObservationError(problem, remedy="Give whole numbers (N,), (N, 3) and (N, 3, 3).")

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
@@ -254,6 +255,7 @@ class Covariance:
         return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
+@checked
 def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covariance:
     """Inverse of the undamped normal matrix.
 
@@ -282,6 +284,7 @@ def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covari
     return Covariance(held @ held.T, np.concatenate([loose, np.eye(n)[:, ~some & ~known]], axis=1))
 
 
+@checked
 def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:
     """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is free."""
     return cov.of(joint_moves(body, state))

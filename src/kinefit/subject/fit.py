@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
@@ -35,6 +36,7 @@ _ITERATIONS = 15  # of the solver, in the last rounds
 _DONE = 0.01  # posterior standard deviations of a change between rounds that is none
 
 
+@checked
 def fit_subject(
     body: Body,
     rig: Rig,

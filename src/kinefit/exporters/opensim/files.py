@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body, PointSet
 from kinefit.exporters.atomic import write_lines, write_text
 from kinefit.exporters.opensim.model import model
@@ -21,6 +22,7 @@ from kinefit.exporters.skeletons.common import UNITS, check_up, euler_zxy, lengt
 from kinefit.motion import Motion
 
 
+@checked
 def write_trc(
     motion: Motion, path: str | PathLike[str], points: PointSet | None = None, *, unit: str = "m", up: str = "y"
 ) -> None:
@@ -65,6 +67,7 @@ def write_trc(
     write_lines(path, chain(lines, rows()))
 
 
+@checked
 def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
     """Write the angles [deg] and the root's way [m] as MOT: the coordinates of the model that `write_osim` writes."""
     tree = motion.body.tree
@@ -87,6 +90,7 @@ def write_mot(motion: Motion, path: str | PathLike[str]) -> None:
     write_lines(path, chain(lines, rows()))
 
 
+@checked
 def write_osim(body: Body, path: str | PathLike[str]) -> None:
     """Write a body as an OpenSim 4 model: joints, coordinates with limits, masses, landmarks as markers, cylinders.
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.curves import curves
@@ -53,6 +54,7 @@ SESSION = {
 """Entries of a take's `[session]`, as the page heads them."""
 
 
+@checked
 def write_report(
     motion: Motion,
     path: str | PathLike[str],

@@ -8,6 +8,7 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.exporters.atomic import write_lines
 from kinefit.exporters.skeletons.common import UNITS, bone_names, check_up, euler_zxy, length_factor, slides
@@ -18,6 +19,7 @@ _ROTATIONS = "Zrotation Xrotation Yrotation"
 _POSITIONS = "Xposition Yposition Zposition"
 
 
+@checked
 def write_bvh(
     motion: Motion, path: str | PathLike[str], *, unit: str = "cm", up: str = "y", names: str = "bvh",
     rest: str | None = None,

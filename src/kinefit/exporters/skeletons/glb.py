@@ -9,6 +9,7 @@ import numpy as np
 import pygltflib as gl
 from numpy.typing import NDArray
 
+from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
@@ -20,6 +21,7 @@ _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}
 
 
+@checked
 def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None) -> None:
     """Write a motion as GLB, in metres and y up, as the format prescribes; time starts at 0.
 

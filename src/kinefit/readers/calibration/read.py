@@ -115,6 +115,7 @@ def read_opencv_stereo(
     return _rig_of([(name, table, path) for name, table in tables], path, _chosen_unit(tree, unit), image_size)
 
 
+@checked
 def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
     """Write a rig as Pose2Sim TOML, in metres; the file appears whole or not at all.
 

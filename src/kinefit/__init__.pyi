@@ -1,0 +1,82 @@
+"""The public names of kinefit and where each is defined: `__init__.py` reads this list, and so do type checkers."""
+
+# Bodies and cameras
+from kinefit.bodies import Body as Body, BodyState as BodyState, PointSet as PointSet, catalogue as catalogue
+from kinefit.bodies import load_body as load_body, parse_body as parse_body, save_body as save_body
+from kinefit.geometry.camera import Camera as Camera, ImageFrame as ImageFrame, Rig as Rig
+
+# What sensors saw: whole takes, and frames of one time
+from kinefit.observations import Keypoints as Keypoints, Markers as Markers
+from kinefit.observations import ColourFrame as ColourFrame, DepthFrame as DepthFrame, KeypointFrame as KeypointFrame
+from kinefit.observations import LineFrame as LineFrame, MarkerFrame as MarkerFrame, PointCloud as PointCloud
+from kinefit.observations import SilhouetteFrame as SilhouetteFrame, SurfacePointFrame as SurfacePointFrame
+
+# A sensor of one's own
+from kinefit.losses import geman_mcclure as geman_mcclure, huber as huber, tukey as tukey
+from kinefit.rows import Rows as Rows
+from kinefit.sensors.base import Measurement as Measurement, RowsOf as RowsOf, Sensor as Sensor, Unknown as Unknown
+from kinefit.sensors.scene import Scene as Scene
+
+# From a recording to a motion
+from kinefit.batch.many import track_takes as track_takes
+from kinefit.frame.results import FrameResult as FrameResult
+from kinefit.motion import Motion as Motion
+from kinefit.readers.take.file import read_take as read_take
+from kinefit.readers.take.load import load_observations as load_observations
+from kinefit.sensors.settings import TrackSettings as TrackSettings
+from kinefit.smoothing.fixed_lag import FixedLag as FixedLag
+from kinefit.smoothing.known_noise import KnownNoise as KnownNoise
+from kinefit.subject.fit import fit_subject as fit_subject
+from kinefit.tracking.recording import Recording as Recording
+from kinefit.tracking.take import track_take as track_take
+from kinefit.tracking.tracker import Tracker as Tracker
+from kinefit.tracking.video import track as track
+
+# Markers, with and without names
+from kinefit.identification.audit.audit import audit_take as audit_take
+from kinefit.identification.frame.identify import identify as identify
+from kinefit.identification.model.from_frame import model_from_frame as model_from_frame
+from kinefit.identification.model.gate import training_gate as training_gate
+from kinefit.identification.model.learn import learn_model as learn_model
+from kinefit.identification.take.people import identify_people as identify_people
+from kinefit.identification.take.takes import identify_take as identify_take
+from kinefit.markers.fit import fit_markers as fit_markers
+from kinefit.markers.people import split_people as split_people
+from kinefit.markers.subject import fit_marker_subject as fit_marker_subject
+
+# Calibration, and checks of a recording
+from kinefit.calibration.board.calibrate import calibrate_board as calibrate_board
+from kinefit.calibration.check.check import check_take as check_take
+from kinefit.calibration.people.calibrate import calibrate_people as calibrate_people
+from kinefit.calibration.refine.refine import refine as refine
+
+# Solvers
+from kinefit.solvers.equations import covariance as covariance, joint_std as joint_std
+from kinefit.solvers.functional_joints import functional_axis as functional_axis
+from kinefit.solvers.functional_joints import functional_centre as functional_centre
+from kinefit.solvers.least_squares import gauss_newton as gauss_newton, levenberg_marquardt as levenberg_marquardt
+
+# Files
+from kinefit.exporters import write_bvh as write_bvh, write_c3d as write_c3d, write_csv as write_csv
+from kinefit.exporters import write_glb as write_glb, write_markers as write_markers, write_mot as write_mot
+from kinefit.exporters import write_motion as write_motion, write_osim as write_osim, write_report as write_report
+from kinefit.exporters import write_trc as write_trc
+from kinefit.readers.calibration.read import read_calibration as read_calibration
+from kinefit.readers.calibration.read import write_calibration as write_calibration
+from kinefit.readers.calibration.write import write_calibration_like as write_calibration_like
+from kinefit.readers.depth.recordings import read_clouds as read_clouds, read_depth as read_depth
+from kinefit.readers.detections import read_detections as read_detections
+from kinefit.readers.keypoints import read_caliscope_csv as read_caliscope_csv, read_keypoints as read_keypoints
+from kinefit.readers.markers import read_markers as read_markers
+from kinefit.readers.motion import read_motion as read_motion
+from kinefit.readers.skeletons.amc import read_amc as read_amc
+from kinefit.readers.skeletons.bvh import read_bvh as read_bvh
+from kinefit.simulation.retarget import retarget as retarget
+
+# Errors, and rooms that `kinefit.` reaches without an import of their own
+from kinefit import assets as assets, bodies as bodies, correspondences as correspondences, evaluation as evaluation
+from kinefit import exporters as exporters, observations as observations, recipes as recipes, rendering as rendering
+from kinefit import simulation as simulation
+from kinefit.errors import KinefitError as KinefitError
+
+__version__: str
