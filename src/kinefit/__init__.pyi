@@ -14,7 +14,8 @@ from kinefit.observations import SilhouetteFrame as SilhouetteFrame, SurfacePoin
 # A sensor of one's own
 from kinefit.losses import geman_mcclure as geman_mcclure, huber as huber, tukey as tukey
 from kinefit.rows import Rows as Rows
-from kinefit.sensors.base import Measurement as Measurement, RowsOf as RowsOf, Sensor as Sensor, Unknown as Unknown
+from kinefit.sensors.base import Hints as Hints, Measurement as Measurement, RowsOf as RowsOf, Sensor as Sensor
+from kinefit.sensors.base import Unknown as Unknown
 from kinefit.sensors.scene import Scene as Scene
 
 # From a recording to a motion

@@ -15,6 +15,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.initialization.depth_search import Search
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
+from kinefit.initialization.from_rays import starts_from_rays
 from kinefit.losses import SQUARED
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, LiftedFrame, MarkerFrame, PointCloud
 from kinefit.sensors.base import Measurement
@@ -30,19 +31,24 @@ LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is a
 
 
 def starts_from_points(
-    body: Body, frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
-) -> list[BodyState]:
+    body: Body, frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor,
+    up: NDArray,
+) -> list[BodyState]:  # fmt: skip
     """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
+
+    Where fewer are known, from the rays of one camera's keypoints, if another sensor measures something beside them.
 
     Parameters
     ----------
     frames, measurements : what was seen, and the measurements made of it where there are any
     scene : of the body, in any state
     keypoints : makes one measurement of the keypoints of all cameras
+    up : (3,) unit, upwards in the world
     """
-    points, x = known_points(frames, measurements, scene, keypoints)
+    given = [m for m in measurements or _measurements(frames, scene, keypoints) if m.settled]
+    points, x, rays = known_points(given, scene)
     if np.isfinite(x).all(axis=1).sum() < 6:
-        return []
+        return starts_from_rays(scene, points, rays, given, up) if len(given) > 1 else []
     try:
         return [pose_from_points(body, points, x)[0]]
     except TrackingError:
@@ -67,7 +73,7 @@ def starts_from_views(
                 starts = start_from_points(body, *view, background=empty, up=up, count=count, forward=forward)
             except KinefitError:
                 continue
-    points, x = known_points(frames, (), scene, keypoints)
+    points, x, _ = known_points(_measurements(frames, scene, keypoints), scene)
     known = np.isfinite(x).all(axis=1)
     if known.any():
         starts.sort(
@@ -78,27 +84,29 @@ def starts_from_views(
     return [start.state for start in starts]
 
 
-def known_points(
-    frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
-) -> tuple[PointSet, NDArray]:
-    """Points of the body with their places (K, 3) [m] in the world, as all measurements show them; NaN where not."""
-    told = list(measurements)
-    if not told:
-        pixels = [f for f in frames if isinstance(f, KeypointFrame)]
-        told = [f for f in frames if isinstance(f, Measurement)]
-        told += [keypoints.prepare(pixels, scene)] if pixels else []
-        marked = [f for f in frames if isinstance(f, MarkerFrame)]
-        told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
-        told += [LiftedSensor(f.sensor, 1.0).prepare(f, scene) for f in frames if isinstance(f, LiftedFrame)]
-    sets, places = [], [np.zeros((0, 3))]
-    for m in (m for m in told if m.settled):  # surfaces give views alone
+def _measurements(frames: Sequence[Any], scene: Scene, keypoints: KeypointSensor) -> list[Measurement]:
+    """Measurements of the frames that show points."""
+    pixels = [f for f in frames if isinstance(f, KeypointFrame)]
+    out = [f for f in frames if isinstance(f, Measurement)]
+    out += [keypoints.prepare(pixels, scene)] if pixels else []
+    marked = [f for f in frames if isinstance(f, MarkerFrame)]
+    out += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
+    return out + [LiftedSensor(f.sensor, 1.0).prepare(f, scene) for f in frames if isinstance(f, LiftedFrame)]
+
+
+def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[PointSet, NDArray, NDArray]:
+    """Points of the body as all measurements show them: places (K, 3) [m] and rays (K, 2, 3), NaN where unknown."""
+    sets, places, rays = [], [np.zeros((0, 3))], [np.zeros((0, 2, 3))]
+    for m in (m for m in measurements if m.settled):  # surfaces give views alone
         hints = m.hints(scene)
-        if hints.points is not None and hints.x_world is not None:
-            names = tuple(f"{m.sensor}/{name}" for name in hints.points.names)
-            sets.append(PointSet(names, hints.points.segments, hints.points.points))
-            places.append(hints.x_world)
+        if hints.points is None:
+            continue
+        names = tuple(f"{m.sensor}/{name}" for name in hints.points.names)
+        sets.append(PointSet(names, hints.points.segments, hints.points.points))
+        places.append(np.full((len(names), 3), np.nan) if hints.x_world is None else hints.x_world)
+        rays.append(np.full((len(names), 2, 3), np.nan) if hints.rays is None else hints.rays)
     empty = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
-    return (joined(sets) if sets else empty), np.concatenate(places)
+    return (joined(sets) if sets else empty), np.concatenate(places), np.concatenate(rays)
 
 
 def find_limbs(search: Search, state: BodyState, seek: NDArray, tries: int = 200) -> list[tuple[BodyState, float]]:

@@ -53,12 +53,14 @@ class Hints:
 
     Parameters
     ----------
-    points, x_world : PointSet of K points of the body, and where they are (K, 3) [m].
+    points, x_world : PointSet of K points of the body, and where they are (K, 3) [m]; NaN where that is unknown.
+    rays : (K, 2, 3) origin [m] and unit direction in the world of the ray on which each point lies; NaN where unknown.
     view : what a limb, or a person, can be sought in.
     """
 
     points: PointSet | None = None
     x_world: NDArray | None = None
+    rays: NDArray | None = None
     view: DepthView | None = None
 
 

@@ -211,10 +211,14 @@ class KeypointMeasurement(Measurement):
         return KeypointMatched(self, uv, weight, swapped, loss, hidden, beside)
 
     def hints(self, scene: Scene) -> Hints:
-        """Points on which two cameras agree."""
+        """Points on which two cameras agree, and a ray of each point from a camera that sees it."""
         channels = self.layout.channels.with_points(scene.body)
         x, _ = triangulated_frame(channels, self.uv, self.confidence)
-        return Hints(channels.points, x)
+        rays = np.full((len(channels.points), 2, 3), np.nan)
+        for number in np.unique(channels.camera[self.weight > 0]):
+            camera, own = channels.rig.cameras[number], (channels.camera == number) & (self.weight > 0)
+            rays[channels.column[own], 0], rays[channels.column[own], 1] = camera.centre_world, camera.ray(self.uv[own])
+        return Hints(channels.points, x, rays)
 
 
 @dataclass(frozen=True, eq=False)

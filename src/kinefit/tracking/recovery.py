@@ -108,7 +108,7 @@ class Recovery:
     ) -> FrameResult | None:  # fmt: skip
         """A start from points that are known in space, which costs little."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
-        for state in starts_from_points(self.body, frames, measurements, scene, tracker.sensors.keypoints):
+        for state in starts_from_points(self.body, frames, measurements, scene, tracker.sensors.keypoints, self.up):
             found = tracker.fitted(time, frames, state).result
             if result is None or found.support > result.support + _GAIN:
                 result, self._lost_since = found, time
