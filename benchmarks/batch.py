@@ -23,7 +23,8 @@ from benchmarks.long import write_long_take
 from kinefit.batch.cluster import run_there
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices
-from kinefit.batch.work import Job, Row
+from kinefit.batch.outcome import Row
+from kinefit.batch.work import Job
 
 TAKES = 10_000
 """Takes that the scheduler of Dask gets."""

@@ -9,9 +9,10 @@ from pathlib import Path
 from kinefit._arguments import checked
 from kinefit.batch.find import Found, find_takes
 from kinefit.batch.one import Choices
+from kinefit.batch.outcome import Row, failed
 from kinefit.batch.processes import Failure, run_here
 from kinefit.batch.summary import write_summary
-from kinefit.batch.work import Job, Row, failed, work
+from kinefit.batch.work import Job, work
 from kinefit.errors import ExportError
 
 Told = Callable[[int, int, tuple[Row, ...]], None]

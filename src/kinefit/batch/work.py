@@ -13,72 +13,14 @@ import msgspec
 
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
+from kinefit.batch.outcome import DONE, Range, Row, failed
+from kinefit.batch.people_report import write_people_report
 from kinefit.errors import KinefitError
-from kinefit.findings import Finding, of_provenance
+from kinefit.findings import of_provenance
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.readers.take.file import Take
-
-DONE, FAILED = "done", "failed"
-
-
-class Range(msgspec.Struct, frozen=True):
-    """How far one angle moved [deg], as the report tells it.
-
-    Parameters
-    ----------
-    coordinate : name without its side
-    side : "left", "right" or "" for the body's middle
-    lowest, highest, span : float; None where it was observed in no two frames
-    twice : float, two standard deviations of the span
-    share : of the frames in which it was observed
-    """
-
-    coordinate: str
-    side: str
-    lowest: float | None = None
-    highest: float | None = None
-    span: float | None = None
-    twice: float | None = None
-    share: float = 0.0
-
-
-class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One person of one take in the summary.
-
-    Parameters
-    ----------
-    take : path of the take file from the folder of all takes on
-    person : int, which of several; 0 where the take was not parted by people
-    subject, visit, date, movement : as `[session]` states them
-    folder : of the results, from the summary on; "" where there are none
-    frames : int
-    seconds, quality, lost : float; mean quality, and the share of segments and frames that are lost; None if failed
-    status : "done" or "failed"
-    error : what went wrong
-    notes : what the command says besides
-    findings : faults of the inputs
-    ranges : tuple of Range
-    """
-
-    take: str
-    person: int = 0
-    subject: str = ""
-    visit: str = ""
-    date: str = ""
-    movement: str = ""
-    folder: str = ""
-    frames: int = 0
-    seconds: float | None = None
-    quality: float | None = None
-    lost: float | None = None
-    status: str = DONE
-    error: str = ""
-    notes: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    ranges: tuple[Range, ...] = ()
-
 
 class _Record(msgspec.Struct, frozen=True):
     take: str
@@ -134,11 +76,6 @@ def work(job: Job) -> tuple[Row, ...]:
     return rows
 
 
-def failed(row: Row, error: str) -> Row:
-    """A row of what went wrong."""
-    return msgspec.structs.replace(row, status=FAILED, error=error)
-
-
 @contextmanager
 def _warnings_in(said: list[str]) -> Iterator[None]:
     """Enter what is warned of in between: old keys of a take."""
@@ -173,8 +110,6 @@ def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[R
         made += [path.relative_to(job.out).as_posix() for path in files.values()]
         rows.append(of_motion(row, done.motion, (*said, *done.notes)))
     if len(rows) > 1 and job.choices.report:
-        from kinefit.batch.people_report import write_people_report
-
         own = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
         made.append(write_people_report(own, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
-from kinefit.bodies.files import load_body
+from kinefit.bodies.toml_files import read_toml_body
 from kinefit.errors import BodyError, ObservationError, choices
 
 SIDES = {
@@ -152,7 +152,7 @@ FAMILIES = (
 def conventions() -> tuple[Family, ...]:
     """`FAMILIES`, and the conventions under which motions are exported ("mixamo", "hanim", ...)."""
     out = list(FAMILIES)
-    body = load_body("humanoid")
+    body = read_toml_body("humanoid")
     for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
         out.append(_Told(name, names))
     return tuple(out)

@@ -135,8 +135,9 @@ def track(
 def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wanted: bool = False) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.batch.one import asked_take, check_drawable, people_of
+    from kinefit.batch.outcome import Row, failed
     from kinefit.batch.people_report import write_people_report
-    from kinefit.batch.work import Row, failed, of_motion
+    from kinefit.batch.work import of_motion
     from kinefit.errors import KinefitError
 
     take = asked_take(path, choices)
