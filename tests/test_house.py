@@ -177,6 +177,16 @@ def test_no_modules_import_each_other_in_a_circle():
         pytest.fail(f"{circle}: move what they share into a module below both; no import inside a function helps")
 
 
+def test_a_class_name_means_one_thing():
+    homes: dict[str, list[str]] = {}
+    for path in SOURCES:
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    wrong = [f"class {name} is in {', '.join(places)}" for name, places in homes.items() if len(places) > 1]
+    assert not wrong, "\n".join([*wrong, "Name each by what it is, or make them one."])
+
+
 def test_files_are_short():
     wrong = []
     for folder in ("src", "examples"):

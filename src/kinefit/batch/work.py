@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.readers.take.file import Take
 
-class _Record(msgspec.Struct, frozen=True):
+class _TakeRecord(msgspec.Struct, frozen=True):
     take: str
     key: str
     files: tuple[str, ...]
@@ -30,7 +30,7 @@ class _Record(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Job:
+class TakeJob:
     """One take to be tracked.
 
     Parameters
@@ -49,7 +49,7 @@ class Job:
     choices: Choices
 
 
-def work(job: Job) -> tuple[Row, ...]:
+def work(job: TakeJob) -> tuple[Row, ...]:
     """Track a take and everybody in it, or take over what an earlier run made of the same; a row for each person.
 
     What is wrong with the take stands in its rows. Other errors are raised, as they may not come again.
@@ -72,7 +72,7 @@ def work(job: Job) -> tuple[Row, ...]:
         return known.rows
     rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):
-        _write(job.out / RECORD, _Record(str(job.take), key, tuple(made), rows))
+        _write(job.out / RECORD, _TakeRecord(str(job.take), key, tuple(made), rows))
     return rows
 
 
@@ -87,7 +87,7 @@ def _warnings_in(said: list[str]) -> Iterator[None]:
             said += [str(one.message) for one in warned if issubclass(one.category, FutureWarning)]
 
 
-def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
+def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
     """A row for each person, and the files that were made, from the folder of results on."""
     try:
         view, people = people_of(take, job.out, _silent, said.append)
@@ -142,15 +142,15 @@ def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
     )  # fmt: skip
 
 
-def _read(path: Path) -> _Record | None:
+def _read(path: Path) -> _TakeRecord | None:
     """What an earlier run noted; None where there is nothing that can be read."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=_Record)
+        return msgspec.json.decode(path.read_bytes(), type=_TakeRecord)
     except (OSError, msgspec.MsgspecError):
         return None
 
 
-def _write(path: Path, record: _Record) -> None:
+def _write(path: Path, record: _TakeRecord) -> None:
     from kinefit.exporters.atomic import write_bytes
 
     write_bytes(path, msgspec.json.encode(record))

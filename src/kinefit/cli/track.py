@@ -13,7 +13,7 @@ from kinefit.batch import results
 from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
-    from kinefit.batch.one import Choices, Tracked
+    from kinefit.batch.one import Choices, TrackedPerson
     from kinefit.readers.take.file import Take
     from kinefit.tracking.in_view import InView
 
@@ -171,7 +171,7 @@ def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wante
 
 def _track_one(
     take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool
-) -> tuple[int, Tracked]:  # fmt: skip
+) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
     from kinefit.cli._agreement import print_agreement
