@@ -23,7 +23,8 @@ from benchmarks.long import write_long_take
 from kinefit.batch.cluster import run_there
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices
-from kinefit.batch.work import Job, Row
+from kinefit.batch.outcome import Row
+from kinefit.batch.work import TakeJob
 
 TAKES = 10_000
 """Takes that the scheduler of Dask gets."""
@@ -100,7 +101,7 @@ def overhead(takes: int) -> None:
     except ImportError:
         figure("batch_dask_overhead_ms", None, *goal, "the extra cluster is not installed")
         return
-    jobs = [Job(Path(f"s{k}/take.toml"), f"s{k}", Path(f"out/s{k}"), f"s{k}", Choices()) for k in range(takes)]
+    jobs = [TakeJob(Path(f"s{k}/take.toml"), f"s{k}", Path(f"out/s{k}"), f"s{k}", Choices()) for k in range(takes)]
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", protocol="tcp://") as cluster:
         began = time.monotonic()
         rows = dict(run_there(nothing, jobs, address=cluster.scheduler_address, retries=2))
@@ -111,7 +112,7 @@ def overhead(takes: int) -> None:
     figure("batch_dask_overhead_ms", 1e3 * seconds / takes, *goal)
 
 
-def nothing(job: Job) -> tuple[Row, ...]:
+def nothing(job: TakeJob) -> tuple[Row, ...]:
     """A take that is done at once."""
     return (Row(take=job.label, folder=job.folder, frames=1, seconds=0.1, quality=1.0, lost=0.0),)
 

@@ -129,7 +129,7 @@ def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
     """Body, state, camera and depth image of people of all sizes in movements, every fourth at its beginning."""
     from kinefit.simulation.movements import MOVEMENTS, movement, people
     from kinefit.simulation.placing import in_front
-    from kinefit.simulation.scenes import Scene
+    from kinefit.simulation.scenes import SimulatedScene
     from kinefit.simulation.sensors import DEPTH_SENSORS, measured_depth
 
     kind, names = DEPTH_SENSORS[sensor], tuple(MOVEMENTS)
@@ -139,7 +139,7 @@ def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
         truth = movement(names[k % len(names)], person.body, rate=10.0, speed=person.speed)
         frame = int(np.random.default_rng(1000 + k).integers(len(truth))) if k % 4 else 0
         camera = in_front(truth, kind.camera(), azimuth=person.azimuth, near=kind.near, far=kind.far)
-        depth = measured_depth(Scene.of(truth, camera), frame, camera, kind, np.random.default_rng([k, frame]))
+        depth = measured_depth(SimulatedScene.of(truth, camera), frame, camera, kind, np.random.default_rng([k, frame]))
         yield person.body, truth.state(frame), camera, depth
 
 

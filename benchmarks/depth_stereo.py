@@ -97,7 +97,7 @@ def _head() -> None:
     from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation.pictures import STEREO, picture
     from kinefit.simulation.retarget import retarget
-    from kinefit.simulation.scenes import Scene
+    from kinefit.simulation.scenes import SimulatedScene
 
     motion = retarget(read_bvh(sorted(folder.glob("*.bvh"))[0]), rate=2)
     off, found, spent = [], [], 0.0
@@ -108,7 +108,7 @@ def _head() -> None:
         x = np.cross(z, (0.0, 1.0, 0.0)) / np.linalg.norm(np.cross(z, (0.0, 1.0, 0.0)))
         R = np.stack([x, np.cross(z, x), z])
         left, right = STEREO.pair(STEREO.camera(se3.transform(R, -R @ place)))
-        scene = Scene.of(motion, left)
+        scene = SimulatedScene.of(motion, left)
         images = [picture(scene, frame, c, STEREO, grey=True) for c in (left, right)]
         pair = StereoRectifier(left, right, near=1.0, far=8.0)
         start = time.process_time()

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, BodyState, TaperedCylinder
-from kinefit.evaluation.sequences import Inputs, Sequence, sequences
+from kinefit.evaluation.sequences import Inputs, TruthSequence, sequences
 from kinefit.evaluation.voodoo import METHODS, Summary, conclusions, evaluate, voodoo_method
 from kinefit.motion import Motion
 from kinefit.recipes.voodoo import Settings
@@ -65,7 +65,7 @@ def _variant(name: str) -> Summary:
     """The fusion of one set of settings on the sequences for settings."""
     near, thin = "3 cm" in name, name == "one cylinder a part"
 
-    def method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
+    def method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
         return voodoo_method(run, inputs, start, VARIANTS[name], one_cylinder(run.truth.body) if thin else None)
 
     runs = sequences(amount(30, 1), seed=TUNED, sensor=_NEAR if near else TOF)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import body_mesh
-from kinefit.evaluation.sequences import INPUTS, Sequence, sequence
+from kinefit.evaluation.sequences import INPUTS, TruthSequence, sequence
 from kinefit.evaluation.voodoo import voodoo_method
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import people
 from kinefit.simulation.pictures import ColourSensor, picture
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "voodoo.jpg"
 SHOWN = {"wave": (0.46, 0.5), "bow": (0.45, 0.6), "arms_at_sensor": (0.4, 0.5)}  # movement: shares of its time
@@ -48,7 +48,7 @@ def drawn(body: Body, state: BodyState, camera: Camera, back: NDArray) -> NDArra
     return np.where(raster.seen[..., None], painted, back).astype(np.uint8)
 
 
-def row(run: Sequence, share: float, fitted: list) -> NDArray:
+def row(run: TruthSequence, share: float, fitted: list) -> NDArray:
     """One frame of a sequence, cell beside cell."""
     frame, camera = round(share * (len(run.truth) - 1)), run.rig["depth"]
     depth = np.asarray(run.depth[frame].depth)
@@ -56,7 +56,7 @@ def row(run: Sequence, share: float, fitted: list) -> NDArray:
     back = np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
     colour = run.rig["colour"]
     sensor = ColourSensor("colour", colour.size, colour.matrix[0, 0])
-    seen = picture(Scene.of(run.truth, camera), frame, colour, sensor)
+    seen = picture(SimulatedScene.of(run.truth, camera), frame, colour, sensor)
     for uv in run.features[frame].uv[np.isfinite(run.features[frame].uv[:, 0])]:
         cv2.circle(seen, (round(uv[0]), round(uv[1])), 7, _FOUND, 2, cv2.LINE_AA)
     seen = cv2.resize(seen, camera.size, interpolation=cv2.INTER_AREA)

@@ -52,7 +52,7 @@ def run() -> None:
 
 
 def _detect(videos: dict[str, Path], folder: Path) -> dict[str, Detections]:
-    jobs = [detecting.Job(name, video, folder / f"{name}.npz") for name, video in videos.items()]
+    jobs = [detecting.DetectionJob(name, video, folder / f"{name}.npz") for name, video in videos.items()]
     detecting.detect(jobs, masks=True, force=True, tell=print)
     return {job.camera: read_detections(job.file) for job in jobs}
 

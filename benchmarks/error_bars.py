@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.figures import amount, figure
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, Recording, load_body, track
-from kinefit.evaluation import Coverage, coverage_of_groups
+from kinefit.evaluation import ErrorBarCoverage, coverage_of_groups
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.solvers.shape import mirror_points
 
@@ -46,7 +46,7 @@ def without(keypoints: list[Keypoints], camera: int, start: int, stop: int) -> l
     return out
 
 
-def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str, Coverage]:
+def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str, ErrorBarCoverage]:
     """Coverage of each group of joints over all motions."""
     told: dict[str, list[tuple[float, float]]] = {}
     for number, truth in enumerate(motions.values()):
@@ -63,7 +63,7 @@ def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str,
         motion = track(recording, load_body("humanoid"))
         for group, share in coverage_of_groups(truth, motion).items():
             told.setdefault(group, []).append((share.joints, share.angles))
-    return {group: Coverage(*(mean(column) for column in zip(*shares))) for group, shares in told.items()}
+    return {group: ErrorBarCoverage(*(mean(column) for column in zip(*shares))) for group, shares in told.items()}
 
 
 def mean(shares: tuple[float, ...]) -> float:

@@ -40,7 +40,7 @@ from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
-from kinefit.simulation import Scene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
+from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
 from kinefit.simulation.room import room
 from kinefit.solvers.shape import mirror_points
 
@@ -112,7 +112,7 @@ def record(draw: int, shape: str, seconds: float = SECONDS) -> Walk:
     )
     rig = Rig((*(c for c in studio_rig(truth) if c.name in CAMERAS[:2]), front))
     told = Rig(tuple(c.with_pose(takes._error(random) @ c.T_camera_world) for c in rig.cameras[:2]) + (front,))
-    bare = Scene(truth, body_mesh(body) if body.skin is None else body.skin)  # type: ignore[arg-type]
+    bare = SimulatedScene(truth, body_mesh(body) if body.skin is None else body.skin)  # type: ignore[arg-type]
     around = replace(bare, room=room(truth, front))
     depth = takes._counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
     T = np.array(truth.Ts_world_root)

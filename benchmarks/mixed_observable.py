@@ -20,7 +20,7 @@ from kinefit import Motion
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.rendering import scaled
-from kinefit.simulation import Scene
+from kinefit.simulation import SimulatedScene
 
 EVERY, STEP = 10, 1e-4  # frames; [m], [rad]
 PIXELS, MARKER, SURFACE = 8.0, 0.01, 0.03  # [px], [m], [m]
@@ -32,7 +32,7 @@ def observable(truth: Motion, rig: Rig, parts: Sequence[str]) -> tuple[NDArray, 
     """Shares (S, 3) and (D,) of the frames in which joint centres and angles are observable; `parts` as of takes."""
     body = truth.body
     assert body.skin is not None
-    scene = Scene(truth, body.skin)  # type: ignore[arg-type]
+    scene = SimulatedScene(truth, body.skin)  # type: ignore[arg-type]
     prior = 1.0 / np.square(np.concatenate([np.full(6, _ROOT), body.tree.spread]))
     joints, angles = [], []
     for i in range(0, len(truth), EVERY):
@@ -75,7 +75,7 @@ def _pixels(body: Body, state: BodyState, camera: Camera) -> NDArray:
     return rows[np.isfinite(rows).all(axis=1)]
 
 
-def _surface(scene: Scene, frame: int, camera: Camera, *, outline: bool) -> NDArray:
+def _surface(scene: SimulatedScene, frame: int, camera: Camera, *, outline: bool) -> NDArray:
     """Rows (N, 6 + D) of the skin's nodes that a depth camera sees, or of those on the outline."""
     body, state = scene.motion.body, scene.motion.state(frame)
     skin = scene.mesh

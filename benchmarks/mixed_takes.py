@@ -35,7 +35,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import scaled
 from kinefit.simulation import (
     DepthSensor,
-    Scene,
+    SimulatedScene,
     cut,
     in_front,
     retarget,
@@ -159,7 +159,7 @@ def record(draw: int, frames: int = round(RATE * SECONDS)) -> Recording:
     front = in_front(truth, SENSOR.camera(), azimuth=float(random.uniform(-0.6, 0.6)), near=SENSOR.near, far=SENSOR.far)
     both = Rig((*rig, front))
     told = Rig(tuple(camera.with_pose(_error(random) @ camera.T_camera_world) for camera in both))
-    bare = Scene(truth, truth.body.skin)  # type: ignore[arg-type]
+    bare = SimulatedScene(truth, truth.body.skin)  # type: ignore[arg-type]
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
     around = replace(bare, room=room(truth, front))
     depth = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
@@ -237,7 +237,7 @@ def _counts(video: DepthVideo, count: int) -> NDArray:
     return np.array([np.round(video.frame(i).depth * 1000.0) for i in range(count)], np.uint16)
 
 
-def _mask(scene: Scene, frame: int, camera: Camera, random: np.random.Generator) -> NDArray:
+def _mask(scene: SimulatedScene, frame: int, camera: Camera, random: np.random.Generator) -> NDArray:
     """(h, w) uint8 as a network finds it: its outline wanders."""
     seen = scene.view(frame, scaled(camera, MASK_SCALE)).raster.seen.astype(np.uint8)
     inside = cv2.distanceTransform(seen, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - seen, cv2.DIST_L2, 5)

@@ -19,7 +19,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.motion import Motion
 from kinefit.multiview.likeness import Pictures, joints_of
-from kinefit.multiview.people import Person, people_of
+from kinefit.multiview.people import PersonTrack, people_of
 from kinefit.observations import Keypoints
 from kinefit.preparing import detecting
 from kinefit.preparing.take import prepared
@@ -159,7 +159,7 @@ def _drawn(motions: list[Motion], rig: Rig, there: NDArray, worn: list[tuple], s
 KINDS = ("elsewhere", "exchanged", "stranger", "twins")
 
 
-def judged(seen: Scene, people: list[Person]) -> tuple[int, int, int]:
+def judged(seen: Scene, people: list[PersonTrack]) -> tuple[int, int, int]:
     """How many of those who left are known again, left open, and taken for another."""
     after = np.arange(len(seen.there)) >= seen.back
     of = []
@@ -215,7 +215,7 @@ def _cut(record: Keypoints, half: int, gap: int) -> Keypoints:
     return replace(record, points=points, confidence=confidence, lifted=None)
 
 
-def _is_same(whole: Person, cut: Person, records: list[Keypoints], half: int, gap: int) -> bool:
+def _is_same(whole: PersonTrack, cut: PersonTrack, records: list[Keypoints], half: int, gap: int) -> bool:
     """Whether somebody of the cut record has the detections of one of the whole record."""
     same = []
     for record, own, other in zip(records, whole.chosen, cut.chosen):

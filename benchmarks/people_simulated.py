@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.figures import amount, figure, quick
 from benchmarks.people_crowds import KINDS, Crowd, crowd
 from kinefit import load_body
-from kinefit.multiview.followed import Followed, follow
+from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.multiview.people import people_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
@@ -98,7 +98,7 @@ def _speed() -> None:
     figure("people_cost_power", float(np.log(spent[5] / spent[2]) / np.log(2.5)), "power of people", "<= 1.15")
 
 
-def _alone(seen: Crowd, one: Followed, k: int) -> Recording:
+def _alone(seen: Crowd, one: PersonKeypoints, k: int) -> Recording:
     """One person's recording, with nobody sought anew."""
     records = [r.of_one(chosen) for r, chosen in zip(seen.keypoints, one.people[k].chosen)]
     return Recording.of_keypoints(seen.rig, records, sigma=4.0, up="y")

@@ -24,7 +24,7 @@ from kinefit.correspondences import point_rows
 from kinefit.initialization.from_points import aligned_root
 from kinefit.losses import geman_mcclure
 from kinefit.rows import Rows
-from kinefit.solvers.sequence import Planes, Sequence, fit_sequence
+from kinefit.solvers.sequence import Planes, SequenceFit, fit_sequence
 
 FRAMES, NOISE, PLANES, PLANE_FRAMES = amount(500, 60), 0.002, 5000, amount(100, 10)
 MOTION = "wash 02_10"
@@ -52,13 +52,13 @@ def run() -> None:
             beside[peer] = run_peer(peer, Path(folder)) if peers() else {"reason": reason}
             print(f"# {peer}: {beside[peer]}", flush=True)
 
-    def markers_fit(tolerance: float) -> Sequence:
+    def markers_fit(tolerance: float) -> SequenceFit:
         return fit_sequence(body, start, markers, x_world, sigma=1.0, limits=False, tolerance=tolerance)
 
-    def robust_fit(tolerance: float) -> Sequence:
+    def robust_fit(tolerance: float) -> SequenceFit:
         return fit_sequence(body, start, markers, x_world, loss=geman_mcclure(), tolerance=tolerance)
 
-    def planes_fit(tolerance: float) -> Sequence:
+    def planes_fit(tolerance: float) -> SequenceFit:
         return fit_sequence(body, start, planes=planes, limits=False, tolerance=tolerance)
 
     plain, robust, planar = least(markers_fit), least(robust_fit), least(planes_fit)
@@ -101,7 +101,7 @@ GOALS = (
 )
 
 
-def least(fit: Callable[[float], Sequence]) -> tuple[float, float, float]:
+def least(fit: Callable[[float], SequenceFit]) -> tuple[float, float, float]:
     """CPU seconds (least of several) at the loosest tolerance within EXCESS of the tightest cost; cost; iterations."""
     best = fit(1e-12).costs.sum()
     tolerance = next(t for t in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-12) if cost_of(fit, t) <= best * (1 + EXCESS))
@@ -113,7 +113,7 @@ def least(fit: Callable[[float], Sequence]) -> tuple[float, float, float]:
     return seconds, float(result.costs.sum()), float(result.iterations.mean())
 
 
-def cost_of(fit: Callable[[float], Sequence], tolerance: float) -> float:
+def cost_of(fit: Callable[[float], SequenceFit], tolerance: float) -> float:
     """Cost at the end, evaluated (a fit's own last figure is a prediction)."""
     result = fit(tolerance)
     return float(result.costs.sum())

@@ -23,7 +23,7 @@ from kinefit.photogrammetry.region_growing import Grid, grow
 from kinefit.photogrammetry.seeds import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.states import measure_states, rigid_motion
-from kinefit.photogrammetry.surface import Surface, measure
+from kinefit.photogrammetry.surface import MeasuredSurface, measure
 
 CAMERAS, SIZE = ("201", "202"), (2464, 3280)
 SPECKLE = slice(430, 2180), slice(720, 1620)  # of the first photograph
@@ -82,7 +82,7 @@ def _photograph(file: Path) -> NDArray:
     return cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
 
 
-def _length(surface: Surface) -> float:
+def _length(surface: MeasuredSurface) -> float:
     return float(np.median(np.linalg.norm(surface.std[surface.measured], axis=1)))
 
 

@@ -24,7 +24,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.textured import textured_picture
 
 OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -4.0, "pro_sup_r": 5.0}  # [deg]
@@ -76,7 +76,7 @@ def cameras(size: int) -> Rig:
 
 def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     """Videos of the arm, the calibration, and a take that names what `kinefit surface` will write."""
-    scene = Scene(motion, body_mesh(motion.body, around=64))
+    scene = SimulatedScene(motion, body_mesh(motion.body, around=64))
     write_calibration(rig, folder / "calib.toml")
     for camera in rig:
         code = cv2.VideoWriter_fourcc(*"MJPG")

@@ -32,7 +32,7 @@ from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.bar import draw_bar, wave_bar
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.textured import textured_picture
 from kinefit.subject.parameters import World
 from kinefit.subject.surfaces import CylinderShape
@@ -165,7 +165,7 @@ def record_bar(folder: Path, rig: Rig, setup: Setup, places: int, seed: int) -> 
 def record(folder: Path, motion: Motion, rig: Rig, seed: int) -> None:
     """Videos of the arm."""
     folder.mkdir(parents=True)
-    scene = Scene(motion, body_mesh(motion.body, around=64))
+    scene = SimulatedScene(motion, body_mesh(motion.body, around=64))
     away = rig.cameras[1].centre_world - motion.positions().reshape(-1, 3).mean(axis=0)
     grain = 2.0 * float(np.linalg.norm(away)) / rig.cameras[1].matrix[0, 0]  # of the middle camera's pixels
     for camera in rig:

@@ -4,7 +4,9 @@ import ast
 import re
 import sys
 import tomllib
+from collections.abc import Iterable, Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -61,26 +63,55 @@ def part_of(path: Path) -> str:
     return "" if first == "__init__.py" else first.removesuffix(".py")
 
 
-def imported_parts(tree: ast.AST, path: Path) -> set[tuple[str, int]]:
-    """Parts of kinefit that a module imports anywhere in it, with the line; "" is kinefit/__init__.py itself."""
+def imported_names(nodes: Iterable[ast.AST], path: Path) -> list[tuple[str, int]]:
+    """Dotted names of kinefit that statements of a module import, with the line."""
     package = ["kinefit", *path.relative_to(PACKAGE).parts[:-1]]
-    found = set()
-    for node in ast.walk(tree):
+    found = []
+    for node in nodes:
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             module = ".".join([*base, *([node.module] if node.module else [])])
-            names = [f"{module}.{alias.name}" for alias in node.names] if module == "kinefit" else [module]
+            names = [f"{module}.{alias.name}" for alias in node.names]
         else:
             continue
-        for name in names:
-            first, *rest = name.split(".")
-            if first == "kinefit":
-                known = rest and (rest[0] in LEVEL or rest[0] in OUTPUTS or rest[0] in SEEN_ONLY_BY)
-                is_module = rest and ((PACKAGE / rest[0]).is_dir() or (PACKAGE / f"{rest[0]}.py").is_file())
-                found.add((rest[0] if known or is_module else "", node.lineno))
+        found += [(name, node.lineno) for name in names if name.split(".")[0] == "kinefit"]
     return found
+
+
+def imported_parts(tree: ast.AST, path: Path) -> set[tuple[str, int]]:
+    """Parts of kinefit that a module imports anywhere in it, with the line; "" is kinefit/__init__.py itself."""
+    found = set()
+    for name, line in imported_names(ast.walk(tree), path):
+        part = [*name.split("."), ""][1]
+        is_module = (PACKAGE / part).is_dir() or (PACKAGE / f"{part}.py").is_file()
+        found.add((part if is_module or part in LEVEL else "", line))
+    return found
+
+
+def statements_that_run(tree: ast.AST) -> Iterator[ast.AST]:
+    """All nodes of a syntax tree but those below `if TYPE_CHECKING`."""
+    yield tree
+    for node in ast.iter_child_nodes(tree):
+        if not (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
+            yield from statements_that_run(node)
+
+
+def module_name(path: Path) -> str:
+    """Dotted name of a module or package by its file."""
+    return ".".join(["kinefit", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__")
+
+
+def imported_modules(path: Path, modules: set[str]) -> set[str]:
+    """Modules that run before a module can: those it imports, in functions too, and the packages these are in."""
+    own, found = module_name(path), set()
+    for name, _ in imported_names(statements_that_run(parsed(path)), path):
+        while name not in modules:
+            name = name.rpartition(".")[0]
+        parts = name.split(".")
+        found |= {".".join(parts[:k]) for k in range(2, len(parts))} | {name}
+    return {name for name in found if name != own and not own.startswith(f"{name}.")}
 
 
 def may_import(importer: str, imported: str) -> bool:
@@ -134,6 +165,26 @@ def test_imports_run_downwards():
         if not may_import(part_of(path), imported)
     ]
     assert not wrong, "\n".join(wrong)
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    modules = {module_name(path) for path in SOURCES}
+    order = TopologicalSorter({module_name(path): imported_modules(path, modules) for path in SOURCES})
+    try:
+        order.prepare()
+    except CycleError as error:
+        circle = " <- ".join(error.args[1])
+        pytest.fail(f"{circle}: move what they share into a module below both; no import inside a function helps")
+
+
+def test_a_class_name_means_one_thing():
+    homes: dict[str, list[str]] = {}
+    for path in SOURCES:
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    wrong = [f"class {name} is in {', '.join(places)}" for name, places in homes.items() if len(places) > 1]
+    assert not wrong, "\n".join([*wrong, "Name each by what it is, or make them one."])
 
 
 def test_files_are_short():

@@ -15,7 +15,7 @@ from kinefit._image_headers import MAX_IMAGE_PIXELS, image_sizes
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry.camera import Camera
-from kinefit.live.cameras import Clock
+from kinefit.live.cameras import SessionClock
 from kinefit.live.folders import ImageFolderStream
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.take.silhouettes import read_silhouettes
@@ -107,7 +107,7 @@ def test_no_reader_decodes_an_image_that_is_too_large(tmp_path, no_decoder, name
             read()
         assert error.value.file == path and error.value.remedy
     if name.endswith((".png", ".jpg")):
-        stream = ImageFolderStream("a", tmp_path, (64, 48), Clock())
+        stream = ImageFolderStream("a", tmp_path, (64, 48), SessionClock())
         assert stream.read(path, 0.0) is None  # dropped, as every image of a live folder that cannot be read
 
 

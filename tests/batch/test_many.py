@@ -14,7 +14,7 @@ import pytest
 from kinefit import track_takes
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices
-from kinefit.batch.work import Job, work
+from kinefit.batch.work import TakeJob, work
 from kinefit.errors import ExportError, FileError
 from kinefit.tracking import run as running
 from kinefit.tracking.tracker import Tracker
@@ -101,7 +101,7 @@ def test_what_is_wrong_with_takes_stands_in_their_rows(sessions, tmp_path):
 
 
 def job(take, out, choices=CHOICES):
-    return Job(take, "a/take.toml", out, out.name, choices)
+    return TakeJob(take, "a/take.toml", out, out.name, choices)
 
 
 def test_done_takes_are_done_again_only_where_something_changed(sessions, tmp_path, monkeypatch):

@@ -13,8 +13,8 @@ from kinefit.cli import main
 from kinefit.cli.detect import detect
 from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.exporters.pictures.detections import write_detections
-from kinefit.images.person_detector import Person
-from kinefit.images.pose_model import SIZE, Pose
+from kinefit.images.person_detector import DetectedPerson
+from kinefit.images.pose_model import SIZE, PersonLandmarks
 from kinefit.observations import Detections
 from kinefit.preparing import detecting
 from kinefit.preparing.take import ensure_detections, with_detections
@@ -40,7 +40,7 @@ class Networks:
         height, width = image.shape[:2]
         middle = np.array([width / 2, height / 2])
         painted = (image == 128).all(axis=2).any()
-        return [] if painted or not image.any() else [Person(np.array([middle, middle - (0, height / 4)]), 0.9)]
+        return [] if painted or not image.any() else [DetectedPerson(np.array([middle, middle - (0, height / 4)]), 0.9)]
 
     def search(self, image):
         return []
@@ -53,7 +53,7 @@ class Networks:
         middle = np.array([128.0, 128.0])
         one, lifted = np.ones(33), np.zeros((33, 3))
         seen = inside if mask else None
-        return Pose(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, seen, lifted)
+        return PersonLandmarks(np.full((33, 2), 128.0), one, one, middle, middle - (0, 102.4), 1.0, seen, lifted)
 
 
 def write_video(path, frames):

@@ -9,7 +9,7 @@ import pytest
 
 from kinefit.batch.results import NAMES
 from kinefit.bodies import catalogue, load_body, records
-from kinefit.bodies.files import JOINT_TYPES
+from kinefit.bodies.toml_files import JOINT_TYPES
 from kinefit.exporters import tables
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.take import file as takes

@@ -5,7 +5,7 @@ import pytest
 from click.testing import CliRunner
 
 import kinefit
-from kinefit.bodies.files import load_body
+from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.exporters import write_motion
 from kinefit.motion import rotation_between_up

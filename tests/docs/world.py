@@ -13,7 +13,7 @@ from kinefit.observations import KeypointFrame
 from kinefit.simulation import (
     KINECT,
     TOF,
-    Scene,
+    SimulatedScene,
     cut,
     in_front,
     picture,
@@ -77,7 +77,7 @@ class World:
 
     def image(self, step):
         """(240, 320, 3) RGB."""
-        return picture(Scene(self.motion), step, self.colour)[..., ::-1].copy()
+        return picture(SimulatedScene(self.motion), step, self.colour)[..., ::-1].copy()
 
     def markers(self, frames=None):
         """Markers of the set CMU_41 with 1 mm noise."""

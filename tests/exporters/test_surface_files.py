@@ -17,7 +17,7 @@ from kinefit.exporters.surface_files import (
 )
 from kinefit.photogrammetry.region_growing import Grid
 from kinefit.photogrammetry.strain import strain
-from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.trajectories import Trajectories
 
 
@@ -31,7 +31,7 @@ def surfaces():
 
     def made(x):
         uv = np.repeat(grid.points[:, None], 2, axis=1)
-        return Surface(
+        return MeasuredSurface(
             grid, ("a", "b"), x, np.tile(1e-8 * np.eye(3), (n, 1, 1)), uv, np.full(n, 0.99), np.full(n, 0.1),
             np.tile(np.eye(2), (n, 1, 1, 1)),
         )  # fmt: skip

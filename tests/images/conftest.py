@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.images.person_detector import Person
-from kinefit.images.pose_model import SIZE, Pose
+from kinefit.images.person_detector import DetectedPerson
+from kinefit.images.pose_model import SIZE, PersonLandmarks
 
 
 class DiscModels:
@@ -17,7 +17,7 @@ class DiscModels:
 
     def find_people(self, image):
         self.looks += 1
-        people = [Person(np.array([c, c - (0, 1.2 * r)]), 0.9) for c, r in discs(image)]
+        people = [DetectedPerson(np.array([c, c - (0, 1.2 * r)]), 0.9) for c, r in discs(image)]
         return people[:1] if self.only_one else people
 
     def search(self, image):
@@ -27,14 +27,16 @@ class DiscModels:
         near = sorted(discs(crop), key=lambda disc: np.linalg.norm(disc[0] - SIZE / 2))
         if not near or np.linalg.norm(near[0][0] - SIZE / 2) > SIZE / 4:
             nobody = np.zeros((33, 2)), np.zeros(33), np.zeros(33), *np.zeros((2, 2))
-            return Pose(*nobody, 0.0, np.zeros((SIZE, SIZE)) if mask else None, np.zeros((33, 3)))
+            return PersonLandmarks(*nobody, 0.0, np.zeros((SIZE, SIZE)) if mask else None, np.zeros((33, 3)))
         centre, radius = near[0]
         turn = np.linspace(0, 2 * np.pi, 33, endpoint=False)
         points = centre + radius * np.column_stack([np.cos(turn), np.sin(turn)])
         v, u = np.mgrid[:SIZE, :SIZE]
         inside = (np.hypot(u - centre[0], v - centre[1]) <= radius).astype(np.float32) if mask else None
         lifted = np.tile([0.1, 0.2, 0.3], (33, 1))
-        return Pose(points, np.full(33, 0.9), np.ones(33), centre, centre - (0, 1.2 * radius), 0.99, inside, lifted)
+        return PersonLandmarks(
+            points, np.full(33, 0.9), np.ones(33), centre, centre - (0, 1.2 * radius), 0.99, inside, lifted
+        )
 
 
 def discs(image):

@@ -13,7 +13,7 @@ from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import KINECT, TOF, measured_depth
 
 CAMERA = Camera("kinect", (320, 240), [[287.5, 0, 159.5], [0, 287.5, 119.5], [0, 0, 1]])
@@ -131,7 +131,7 @@ def test_clusters_join_what_is_near_and_part_what_is_far():
 def test_a_person_in_a_room_is_found_whatever_the_sensors_noise(name, sensor):
     motion = movement(name, rate=1.0)
     camera = in_front(motion, sensor.camera(), near=sensor.near, far=sensor.far)
-    room = Scene.of(motion, camera)
+    room = SimulatedScene.of(motion, camera)
     for frame in (0, 2):
         depth = measured_depth(room, frame, camera, sensor, np.random.default_rng(frame))
         clear = denoised(depth, camera)

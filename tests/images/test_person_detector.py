@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.images.models import squares
-from kinefit.images.person_detector import SIZE, Person, PersonDetector, anchors, decode
+from kinefit.images.person_detector import SIZE, DetectedPerson, PersonDetector, anchors, decode
 
 
 def test_anchors_are_those_of_the_network():
@@ -85,7 +85,7 @@ def test_whoever_is_found_in_the_turned_picture_is_turned_back(quarters):
     image[7, 11], image[20, 40] = 1, 2
     turned = np.rot90(image, quarters)
     points = np.array([np.argwhere(turned == value)[0][::-1] for value in (1, 2)], float)
-    assert np.allclose(Person(points, 1.0).turned_back(quarters, image.shape).points, [[11, 7], [40, 20]])
+    assert np.allclose(DetectedPerson(points, 1.0).turned_back(quarters, image.shape).points, [[11, 7], [40, 20]])
 
 
 @pytest.mark.parametrize("size", [(1920, 1080), (1080, 1920), (640, 480), (500, 500)])

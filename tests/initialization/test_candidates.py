@@ -18,7 +18,7 @@ from kinefit.initialization.candidates import (
     starts_from_points,
     starts_from_views,
 )
-from kinefit.initialization.depth_search import Search
+from kinefit.initialization.depth_search import PostureSearch
 from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, PointCloud
 from kinefit.rendering import render_body
@@ -98,7 +98,7 @@ def search():
     camera = a_rig()["depth"]
     depth = render_body(BODY, TRUTH, camera).depth
     person = np.isfinite(depth)
-    return Search(BODY, view_of(np.where(person, depth, 0.0), person, camera), UP, np.random.default_rng(0))
+    return PostureSearch(BODY, view_of(np.where(person, depth, 0.0), person, camera), UP, np.random.default_rng(0))
 
 
 def segments(*names):
@@ -125,7 +125,8 @@ def test_a_limb_that_is_somewhere_else_is_found(search):
 def test_the_same_is_found_again(search):
     wrong, seek = turned(TRUTH, arm_add_l=-80), segments("forearm_l")
     one, other = (
-        find_limbs(Search(BODY, search.view, UP, np.random.default_rng(0)), wrong, seek, tries=40) for _ in range(2)
+        find_limbs(PostureSearch(BODY, search.view, UP, np.random.default_rng(0)), wrong, seek, tries=40)
+        for _ in range(2)
     )
     assert [s.angles.tolist() for s, _ in one] == [s.angles.tolist() for s, _ in other]
 

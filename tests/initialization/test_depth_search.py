@@ -3,7 +3,7 @@
 import numpy as np
 from tests.tracking.depth_oracle import BODY, UP, camera, depth_of, facing
 
-from kinefit.initialization.depth_search import Search
+from kinefit.initialization.depth_search import PostureSearch
 from kinefit.sensors.depth_view import view_of
 
 
@@ -14,7 +14,7 @@ def test_one_who_faced_away_a_moment_ago_rather_still_does():
     about = np.array(state.T_world_root)
     about[:3, [0, 2]] *= -1.0  # turned about the vertical
     roots = np.stack([state.T_world_root, about])
-    unknown = Search(BODY, view, UP, random).stance(roots)
-    known = Search(BODY, view, UP, random, state.T_world_root[:3, 0]).stance(roots)
+    unknown = PostureSearch(BODY, view, UP, random).stance(roots)
+    known = PostureSearch(BODY, view, UP, random, state.T_world_root[:3, 0]).stance(roots)
     assert unknown[0] > unknown[1], "of two that look alike, the one that faces the sensor"
     assert known[0] < 0.01 < 0.15 < known[1]

@@ -12,7 +12,7 @@ from kinefit.initialization.from_depth import start_from_points
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import TOF, measured_depth
 
 CAMERA = camera()
@@ -47,7 +47,7 @@ def noisy():
     """A standing person in a room by a table, from a time-of-flight camera: 4 cm of noise, flying pixels, holes."""
     motion = movement("point", BODY, rate=1.0)
     camera_tof = in_front(motion, TOF.camera(), near=TOF.near, far=TOF.far)
-    depth = measured_depth(Scene.of(motion, camera_tof), 0, camera_tof, TOF, np.random.default_rng(0))
+    depth = measured_depth(SimulatedScene.of(motion, camera_tof), 0, camera_tof, TOF, np.random.default_rng(0))
     return camera_tof, motion.state(0), depth
 
 

@@ -9,7 +9,7 @@ from tests.live.taking import image, taken
 
 from kinefit.errors import FileError
 from kinefit.live import cameras
-from kinefit.live.cameras import CameraStream, Clock, VideoReplay
+from kinefit.live.cameras import CameraStream, SessionClock, VideoReplay
 from kinefit.live.inbox import Inbox
 
 
@@ -43,7 +43,7 @@ def test_a_webcam_that_goes_away_is_opened_again(monkeypatch):
     monkeypatch.setattr(cameras.cv2, "VideoCapture", Webcam)
     monkeypatch.setattr(cameras, "_AGAIN", 0.01)
     inbox = Inbox(["cam"], patience=0.0)
-    stream = CameraStream("cam", "0", (64, 48), Clock())
+    stream = CameraStream("cam", "0", (64, 48), SessionClock())
     stream.start(inbox)
     values, until = set(), time.monotonic() + 20.0
     while not {101, 103} <= values and time.monotonic() < until:
@@ -54,7 +54,7 @@ def test_a_webcam_that_goes_away_is_opened_again(monkeypatch):
 
 def test_a_stream_that_is_not_there_is_told(tmp_path):
     with pytest.raises(FileError, match="cannot be opened"):
-        CameraStream("cam", str(tmp_path / "nothing.sdp"), (64, 48), Clock())
+        CameraStream("cam", str(tmp_path / "nothing.sdp"), (64, 48), SessionClock())
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def video(tmp_path):
 
 def test_a_patient_replay_brings_all_images_with_their_times(video):
     inbox = Inbox(["cam"], patience=0.0)
-    replay = VideoReplay("cam", video, Clock(), rate=20.0, offset=0.5, speed=0.0)
+    replay = VideoReplay("cam", video, SessionClock(), rate=20.0, offset=0.5, speed=0.0)
     replay.start(inbox)
     seen = taken(inbox, 6)
     assert [int(one.seen[0, 0, 0]) for one in seen] == [0, 10, 20, 30, 40, 50]
@@ -76,7 +76,7 @@ def test_a_patient_replay_brings_all_images_with_their_times(video):
 
 def test_a_replay_keeps_its_own_speed(video):
     inbox, begin = Inbox(["cam"], patience=0.0), time.monotonic()
-    replay = VideoReplay("cam", video, Clock(), rate=20.0)
+    replay = VideoReplay("cam", video, SessionClock(), rate=20.0)
     replay.start(inbox)
     while not inbox.over:
         inbox.take(0.1)

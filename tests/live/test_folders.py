@@ -13,7 +13,7 @@ from tests.live.taking import image, taken
 
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import Rig
-from kinefit.live.cameras import Clock
+from kinefit.live.cameras import SessionClock
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
 from kinefit.live.inbox import Inbox
 from kinefit.live.take import live_session
@@ -26,7 +26,7 @@ from kinefit.simulation import TOF, cut, in_front, simulate_depth, squat_and_wav
 def test_new_images_of_a_folder_are_taken_once_and_in_order(tmp_path):
     cv2.imwrite(str(tmp_path / "old_1.png"), image(1))
     inbox = Inbox(["cam"], patience=0.0)
-    stream = ImageFolderStream("cam", tmp_path, (64, 48), Clock())
+    stream = ImageFolderStream("cam", tmp_path, (64, 48), SessionClock())
     stream.start(inbox)
     seen = []
     for k in (9, 10, 11):
@@ -40,12 +40,12 @@ def test_new_images_of_a_folder_are_taken_once_and_in_order(tmp_path):
 
 def test_a_folder_that_is_not_there_is_told(tmp_path):
     with pytest.raises(FileError, match="no such folder"):
-        ImageFolderStream("cam", tmp_path / "nowhere", (64, 48), Clock())
+        ImageFolderStream("cam", tmp_path / "nowhere", (64, 48), SessionClock())
 
 
 def test_of_many_new_files_the_last_is_read_and_the_others_are_counted(tmp_path):
     inbox = Inbox(["tof"], patience=0.0)
-    stream = DepthFolderStream("tof", tmp_path, (64, 48), Clock(), near=0.5, far=3.0)
+    stream = DepthFolderStream("tof", tmp_path, (64, 48), SessionClock(), near=0.5, far=3.0)
     for k in range(5):  # before it looks for the first time
         cv2.imwrite(str(tmp_path / f"depth_{8 + k}.png"), np.full((48, 64), 1000 + k, np.uint16))
     time.sleep(0.1)
@@ -57,7 +57,7 @@ def test_of_many_new_files_the_last_is_read_and_the_others_are_counted(tmp_path)
 
 
 def test_units_ranges_and_damage_of_depth_images(tmp_path):
-    stream = DepthFolderStream("tof", tmp_path, (64, 48), Clock(), near=0.5, far=3.0)
+    stream = DepthFolderStream("tof", tmp_path, (64, 48), SessionClock(), near=0.5, far=3.0)
     counts = np.full((48, 64), 2000, np.uint16)
     counts[0], counts[1] = 4000, 65535
     cv2.imwrite(str(tmp_path / "a.png"), counts)
@@ -76,7 +76,7 @@ def test_units_ranges_and_damage_of_depth_images(tmp_path):
 
 
 def test_keypoints_of_nobody_damaged_and_of_another_set(tmp_path):
-    stream = KeypointFolderStream("cam", tmp_path, Clock(), keypoint_set="BODY_25B", rate=30.0)
+    stream = KeypointFolderStream("cam", tmp_path, SessionClock(), keypoint_set="BODY_25B", rate=30.0)
     (tmp_path / "a_000.json").write_text(json.dumps({"people": []}))
     (nobody,) = stream.read(tmp_path / "a_000.json", 2.0)
     assert nobody.points.shape == (1, 0, 25, 2) and nobody.times[0] == 2.0
@@ -90,7 +90,7 @@ def test_keypoints_of_nobody_damaged_and_of_another_set(tmp_path):
 def test_a_folder_that_is_taken_away_ends_the_session_with_its_name(tmp_path):
     (tmp_path / "gone").mkdir()
     inbox = Inbox(["tof"], patience=0.0)
-    stream = DepthFolderStream("tof", tmp_path / "gone", (64, 48), Clock())
+    stream = DepthFolderStream("tof", tmp_path / "gone", (64, 48), SessionClock())
     (tmp_path / "gone").rmdir()
     stream.start(inbox)
     with pytest.raises(FileError, match="gone.*cannot be listed any more"):

@@ -7,7 +7,7 @@ from tests.multiview.test_people import BODY, RATE, RIG, SET, owners, records
 from tests.oracle import posture
 
 from kinefit.bodies import BodyState
-from kinefit.multiview.followed import Followed, sentences
+from kinefit.multiview.followed import PersonKeypoints, sentences
 from kinefit.multiview.people import people_of
 
 BEFORE, GAP, AFTER = 50, 125, 50
@@ -108,20 +108,20 @@ def test_nobody_walks_faster_than_people_do():
 def test_what_is_said_of_those_who_come_back():
     _, keypoints, _ = exchanged(sized(0.92), sized(1.06))
     found = people_of(RIG, keypoints)
-    said = sentences(Followed(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
+    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
     assert any("leaves at 2.0 s, and who comes at 7.0 s is taken for the same, by size, way (odds " in s for s in said)
     _, keypoints, _ = exchanged(BODY, BODY)
     found = people_of(RIG, keypoints)
-    said = sentences(Followed(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
+    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
     assert sum("leaves it open" in s for s in said) == 2
 
 
 def test_what_few_views_took_for_somebody_beside_who_follows_is_left_out():
-    from kinefit.multiview.returns import Span, chains_of
+    from kinefit.multiview.returns import PresenceSpan, chains_of
 
     def span(views, x=0.0):
         nodes = {f: [(c, 0) for c in range(n)] for f, n in enumerate(views) if n}
-        return Span(nodes, {f: np.tile([x, 0.0, 0.0], (3, 1)) + 0.01 * f for f in nodes})
+        return PresenceSpan(nodes, {f: np.tile([x, 0.0, 0.0], (3, 1)) + 0.01 * f for f in nodes})
 
     def views(spans):
         keypoints, _ = records([stay([AT[0]] * 2, 7)])

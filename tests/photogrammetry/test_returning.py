@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.textured import textured_picture
 
 RIG = cameras(320)
@@ -31,7 +31,7 @@ MOTION = turning()
 
 @pytest.fixture(scope="module")
 def images():
-    scene = Scene(MOTION, body_mesh(MOTION.body, around=64))
+    scene = SimulatedScene(MOTION, body_mesh(MOTION.body, around=64))
     return [
         [SplineImage.of(textured_picture(scene, k, camera, grain=0.005, seed=3)) for camera in RIG]
         for k in range(len(MOTION))

@@ -24,7 +24,7 @@ from kinefit.bodies.surfaces import Metaballs
 from kinefit.cli._surface_files import read_seeds
 from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.depth.clouds import Cloud, camera_of, read_cloud
+from kinefit.readers.depth.clouds import FileCloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess.names import camera_number, natural
@@ -169,7 +169,7 @@ def test_packed_points_that_claim_gigabytes_are_told(tmp_path):
 def test_points_at_the_end_of_the_world_are_told(tmp_path):
     points = np.random.default_rng(0).random((400, 3)) + 0.1
     points[:, 0] *= 1e300
-    cloud = Cloud(points, (20, 20), np.eye(4))
+    cloud = FileCloud(points, (20, 20), np.eye(4))
     with pytest.raises(CalibrationError, match="no camera sees"):
         camera_of(cloud, "a", tmp_path / "a.pcd")
 

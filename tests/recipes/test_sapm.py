@@ -17,7 +17,7 @@ from kinefit.recipes._sapm_steps import (
     nearest,
     triples,
 )
-from kinefit.recipes.sapm import Subject, identify_below, sapm, segment_matches
+from kinefit.recipes.sapm import SapmProblem, identify_below, sapm, segment_matches
 
 
 def test_candidates_hold_equation_4_and_come_best_first():
@@ -78,7 +78,7 @@ def lost(pose, labels):
 def trunk(points, epsilon, beta):
     """Matches of the trunk alone in a set of points."""
     model = only(synthetic_body(44), [0])
-    return list(segment_matches(Subject(model, points, epsilon, beta), 0, -1, np.full(len(model), -1)))
+    return list(segment_matches(SapmProblem(model, points, epsilon, beta), 0, -1, np.full(len(model), -1)))
 
 
 def test_a_match_holds_equation_2():
@@ -147,9 +147,9 @@ def test_a_wrong_match_is_corrected_where_its_child_cannot_be_found():
     pose = random_pose(model, np.random.default_rng(7))
     head = model.segments[1]
     false = pose.points[pose.truth[list(head)]] + [3.0, 0.0, 0.0]  # a second head, that no trunk carries
-    subject = Subject(model, np.vstack([pose.points, false]), 0.02, 0.8)
+    subject = SapmProblem(model, np.vstack([pose.points, false]), 0.02, 0.8)
     begun = only(model, [1])
-    alone = list(segment_matches(Subject(begun, subject.points, 0.02, 0.8), 0, -1, np.full(5, -1)))
+    alone = list(segment_matches(SapmProblem(begun, subject.points, 0.02, 0.8), 0, -1, np.full(5, -1)))
     assert len(alone) >= 2  # the head by itself is found twice
     found, broken = identify_below(subject, 1, -1, np.full(len(model), -1))
     assert not broken and (found == pose.truth).all()

@@ -18,7 +18,7 @@ from kinefit.simulation import (
     TOF,
     ColourSensor,
     DepthSensor,
-    Scene,
+    SimulatedScene,
     cut,
     in_front,
     known_motion,
@@ -74,7 +74,7 @@ def test_without_errors_every_point_of_the_body_lies_on_its_surface(motion, sens
 def test_noise_is_as_large_as_stated(motion, sensor):
     """On the wall, away from edges, seen almost straight on."""
     camera = placed(motion, sensor)
-    scene = Scene.of(motion, camera)
+    scene = SimulatedScene.of(motion, camera)
     truth = simulate_depth(motion, camera, sensor.without_errors(), scene=scene).frame(0).depth
     view = scene.view(0, camera)
     wall = view.raster.segment == len(motion.body.tree.segments) + 1
@@ -89,7 +89,7 @@ def test_noise_is_as_large_as_stated(motion, sensor):
 
 def test_a_pixel_on_an_edge_tells_a_depth_between_both_surfaces(motion):
     camera = placed(motion, TOF)
-    scene = Scene.of(motion, camera)
+    scene = SimulatedScene.of(motion, camera)
     quiet = replace(TOF.without_errors(), samples=3)
     truth = simulate_depth(motion, camera, TOF.without_errors(), scene=scene).frame(0).depth
     mixed = simulate_depth(motion, camera, quiet, scene=scene).frame(0).depth
@@ -105,7 +105,7 @@ def test_a_pixel_on_an_edge_tells_a_depth_between_both_surfaces(motion):
 def test_the_projector_casts_a_shadow_on_one_side(motion):
     sensor = small(KINECT, 0.5)
     camera = placed(motion, sensor)
-    scene, bare = Scene.of(motion, camera), sensor.without_errors()
+    scene, bare = SimulatedScene.of(motion, camera), sensor.without_errors()
     truth = simulate_depth(motion, camera, bare, scene=scene).frame(0).depth
     lit = simulate_depth(motion, camera, replace(bare, baseline=0.075), scene=scene).frame(0).depth
     right = (lit == 0) & (truth > 0)
@@ -148,7 +148,7 @@ def test_nothing_outside_the_range_is_measured_and_a_seed_is_a_seed(motion, sens
 
 def test_the_grain_sticks_to_the_surface_in_both_pictures_of_a_stereo_head(motion):
     left, right = STEREO.pair(in_front(motion, STEREO.camera(name="stereo_left")))
-    scene, quiet = Scene.of(motion, left), replace(STEREO, noise=0.0)
+    scene, quiet = SimulatedScene.of(motion, left), replace(STEREO, noise=0.0)
     depth = scene.view(1, left).raster.depth
     pictures = [picture(scene, 1, c, quiet, grey=True).astype(np.float32) for c in (left, right)]
     u = np.arange(left.size[0], dtype=np.float32) - STEREO.focal * STEREO.baseline / depth
@@ -166,7 +166,7 @@ def test_the_grain_sticks_to_the_surface_in_both_pictures_of_a_stereo_head(motio
 
 def test_the_grain_moves_with_the_body(motion):
     """A point of the body has one place at rest, whatever the frame and the camera."""
-    scene = Scene.of(motion)
+    scene = SimulatedScene.of(motion)
     for frame, azimuth in ((0, 0.0), (3, 1.0)):
         camera = in_front(motion, small(KINECT).camera(), azimuth=azimuth)
         view = scene.view(frame, camera)
@@ -180,7 +180,7 @@ def test_the_grain_moves_with_the_body(motion):
 
 def test_pictures_show_skin_and_clothes(motion):
     camera = in_front(motion, COLOUR.camera())
-    scene = Scene.of(motion, camera)
+    scene = SimulatedScene.of(motion, camera)
     image = picture(scene, 0, camera, seed=1)
     assert image.shape == (480, 640, 3)
     assert image.dtype == np.uint8
@@ -199,7 +199,7 @@ def test_the_room_is_closed_wherever_the_camera_looks_and_the_body_stands_in_it(
     turned = motion.turned(up)
     camera = placed(turned, small(TOF, 0.5), azimuth=azimuth)
     around = room(turned, camera)
-    scene = Scene(turned, Scene.of(turned).mesh, around)
+    scene = SimulatedScene(turned, SimulatedScene.of(turned).mesh, around)
     raster = scene.view(0, camera).raster
     assert raster.seen.all()
     count = len(turned.body.tree.segments)
@@ -237,7 +237,7 @@ def test_looking_down_still_has_a_room(motion):
     middle = motion.positions().reshape(-1, 3).mean(axis=0)
     T = look_at(middle + 2.4 * up + 1e-9, middle, np.roll(up, 1))
     camera = Camera("top", (40, 30), np.array([[30.0, 0, 19.5], [0, 30, 14.5], [0, 0, 1]]), (), "radtan", T)
-    assert Scene.of(motion, camera).view(0, camera).raster.seen.all()
+    assert SimulatedScene.of(motion, camera).view(0, camera).raster.seen.all()
 
 
 def test_another_body_does_the_same(motion):
@@ -261,7 +261,7 @@ def test_a_body_that_shares_nothing_is_refused(motion):
 def test_a_body_without_surfaces_cannot_be_seen(motion):
     bare = known_motion(replace(motion.body, surfaces=()), 30.0, motion.Ts_world_root, motion.angles, up=motion.up)
     with pytest.raises(BodyError, match="surface"):
-        Scene.of(bare)
+        SimulatedScene.of(bare)
 
 
 def test_a_body_without_landmarks_is_placed_by_its_joints(motion):
@@ -269,7 +269,7 @@ def test_a_body_without_landmarks_is_placed_by_its_joints(motion):
     body = replace(motion.body, landmarks=motion.body.landmarks.select(names))
     bare = known_motion(body, motion.rate, motion.Ts_world_root, motion.angles, up=motion.up)
     camera = placed(bare, TOF)
-    assert Scene.of(bare, camera).view(0, camera).raster.seen.all()
+    assert SimulatedScene.of(bare, camera).view(0, camera).raster.seen.all()
 
 
 @pytest.mark.parametrize("change", [{"near": 0.0}, {"far": 0.1}, {"samples": 0}, {"noise": (-0.1, 0.0, 0.0)}])

@@ -14,7 +14,7 @@ from kinefit.losses import SQUARED, huber
 from kinefit.rows import PairRows, ParameterRows
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.border import Prior, solve
-from kinefit.solvers.whitened import Pose, columns, residuals
+from kinefit.solvers.whitened import PoseScrews, columns, residuals
 
 ARM = load_body("arm")
 HUMANOID = load_body("humanoid")
@@ -126,7 +126,7 @@ def test_a_share_leaves_the_prior_more_to_say():
 
 def test_rows_of_every_kind_have_their_columns():
     state = posture(HUMANOID, 1, 0.3)
-    pose, n, random = Pose.of(HUMANOID, state), HUMANOID.tree.n_dofs, np.random.default_rng(0)
+    pose, n, random = PoseScrews.of(HUMANOID, state), HUMANOID.tree.n_dofs, np.random.default_rng(0)
     W = np.cov(random.normal(size=(3, 9)))
     joint = ParameterRows(np.array([7, 9, 11]), np.array([0.1, 0.2, -0.3]), W)
     J, r = columns(joint, pose), residuals(joint)

@@ -12,7 +12,7 @@ from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import KINECT, measured_depth
 from kinefit.tracking.tracker import Tracker
 
@@ -43,7 +43,7 @@ def a_rig(name="wave"):
 def images(name="wave", count=24):
     """Depth images of the first frames, in a room."""
     camera = a_rig(name)["depth"]
-    scene = Scene.of(a_motion(name), camera)
+    scene = SimulatedScene.of(a_motion(name), camera)
     random = [np.random.default_rng(i) for i in range(count)]
     return [measured_depth(scene, i, camera, SENSOR, r) for i, r in enumerate(random)]
 

@@ -9,7 +9,7 @@ from tests.tracking.movements import BODY, RATE, SENSOR, a_motion, a_rig, images
 
 from kinefit import track
 from kinefit.observations import DepthFrame
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import measured_depth
 from kinefit.tracking.recording import Recording
 
@@ -20,10 +20,10 @@ FRAMES, WRONG = 10, 0.2
 def empty():
     """(H, W) [m] the room without the person."""
     motion, camera = a_motion(), a_rig()["depth"]
-    room = Scene.of(motion, camera).room
+    room = SimulatedScene.of(motion, camera).room
     T = np.array(motion.Ts_world_root)
     T[:, 1, 3] -= 50.0  # far below
-    scene = replace(Scene.of(replace(motion, Ts_world_root=T)), room=room)
+    scene = replace(SimulatedScene.of(replace(motion, Ts_world_root=T)), room=room)
     return measured_depth(scene, 0, camera, SENSOR, np.random.default_rng(0))
 
 

@@ -12,7 +12,7 @@ from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.video import Video
-from kinefit.viewers.pictures import Pictures, flat_view, flatten, undistortion
+from kinefit.viewers.pictures import CameraImages, flat_view, flatten, undistortion
 from kinefit.viewers.stage import first_look, fitting_fov
 
 SIZE = (320, 480)
@@ -102,7 +102,7 @@ def test_pictures_are_the_videos_at_their_time_and_are_kept(tmp_path, monkeypatc
     with Video(path) as video:
         w, h = video.size
         K = np.array([[150.0, 0, (w - 1) / 2], [0, 150.0, (h - 1) / 2], [0, 0, 1]])
-        pictures = Pictures({"a": Camera("a", (w, h), K)}, {"a": path}, time_offsets={"a": 0.5})
+        pictures = CameraImages({"a": Camera("a", (w, h), K)}, {"a": path}, time_offsets={"a": 0.5})
         assert "a" in pictures and "b" not in pictures
         found = pictures.read("a", 0.5 + 7 / video.rate, 128)
         assert found.shape == (h, w, 3)
@@ -119,7 +119,7 @@ def test_pictures_are_the_videos_at_their_time_and_are_kept(tmp_path, monkeypatc
 
 def test_a_missing_video_is_told(tmp_path):
     with pytest.raises(FileError, match="no such video"):
-        Pictures({"a": a_camera("a", 0)}, {"a": tmp_path / "none.mp4"})
+        CameraImages({"a": a_camera("a", 0)}, {"a": tmp_path / "none.mp4"})
 
 
 def test_points_of_a_real_person_are_on_the_person_in_every_flat_picture(data_dir):

@@ -141,7 +141,7 @@ def test_a_frame_is_told(motion):
 
 
 def test_the_clock_runs_in_a_loop():
-    clock = player.Clock(count=10, rate=50.0, speed=0.5)
+    clock = player.PlaybackClock(count=10, rate=50.0, speed=0.5)
     clock.tick(1.0)
     assert clock.frame == 0  # it does not play yet
     clock.playing = True

@@ -22,7 +22,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
 from kinefit.serving.access import Access
-from kinefit.viewers import Choice, Pictures, Player, Recording, View, page
+from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
 from kinefit.viewers.page import MOST_FRAMES, chosen_frames
 from kinefit.viewers.show import ALL, Show
 from kinefit.viewers.stage import free_port, open_server, quiet
@@ -53,7 +53,7 @@ def node(server, name):
 
 
 def test_the_page_is_served(server, motion):
-    Player(server, Recording((motion,))).tick(0.0)
+    Player(server, ViewerContent((motion,))).tick(0.0)
     address = ACCESS.url(server.get_port())
     with urllib.request.urlopen(address, timeout=10) as answer:
         assert answer.status == 200 and b"<html" in answer.read()[:1000].lower()
@@ -107,7 +107,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch):
 
 
 def test_segments_stand_where_the_motion_says(server, motion):
-    show = Show(server, Recording((motion,)))
+    show = Show(server, ViewerContent((motion,)))
     for f in (3, 0):
         show.frame(f)
         for name, T in zip(motion.body.tree.segments, motion.segment_poses()[f], strict=True):
@@ -118,13 +118,13 @@ def test_segments_stand_where_the_motion_says(server, motion):
 
 
 def test_ellipsoids_are_two_sigmas_to_a_tenth(server, motion):
-    Show(server, Recording((motion,))).frame(2)
+    Show(server, ViewerContent((motion,))).frame(2)
     for name, std in zip(motion.body.tree.segments, motion.joint_std[2], strict=True):
         assert np.allclose(node(server, f"body0/at_{name}/uncertainty").scale, 2 * std, rtol=0.06)
 
 
 def test_layers_are_shown_and_hidden(server, motion, rig):
-    show = Show(server, Recording((motion,), rig=rig))
+    show = Show(server, ViewerContent((motion,), rig=rig))
     show.frame(0, Choice(frozenset({"bones", "cameras"})))
     assert node(server, "body0/thigh_l/bones").visible and not node(server, "body0/thigh_l/surface").visible
     assert node(server, "cameras/cam 0").visible and not node(server, "floor").visible
@@ -135,7 +135,7 @@ def test_layers_are_shown_and_hidden(server, motion, rig):
 
 
 def test_a_camera_stands_and_looks_as_it_was_calibrated(server, motion, rig):
-    Show(server, Recording((motion,), rig=rig)).frame(0)
+    Show(server, ViewerContent((motion,), rig=rig)).frame(0)
     for camera in rig:
         frustum = node(server, f"cameras/{camera.name}")
         assert np.allclose(frustum.position, camera.centre_world, atol=1e-6)
@@ -144,8 +144,8 @@ def test_a_camera_stands_and_looks_as_it_was_calibrated(server, motion, rig):
 
 def test_the_backdrop_is_where_its_pixels_are_seen(server, motion, rig, tmp_path):
     video = write_video(tmp_path / "a.mkv", 90, size=(64, 96))
-    pictures = Pictures({c.name: c for c in rig}, {"cam 0": video})
-    show = Show(server, Recording((motion,), rig=rig, pictures=pictures))
+    pictures = CameraImages({c.name: c for c in rig}, {"cam 0": video})
+    show = Show(server, ViewerContent((motion,), rig=rig, pictures=pictures))
     show.frame(1, Choice(through="cam 0"))
     back, camera = node(server, "backdrop/cam 0"), rig["cam 0"]
     side = se3.rotation_from_quaternion(back.wxyz)
@@ -160,7 +160,7 @@ def test_the_backdrop_is_where_its_pixels_are_seen(server, motion, rig, tmp_path
 
 
 def test_rays_of_one_camera_or_of_all(server, motion, rig):
-    show = Show(server, Recording((motion,), rig=rig))
+    show = Show(server, ViewerContent((motion,), rig=rig))
     one, other = show.rays(2, "cam 0"), show.rays(2, "cam 1")
     assert len(show.rays(2, ALL).points) == len(one.points) + len(other.points)
     show.frame(2, Choice(rays="cam 1"))
@@ -172,7 +172,7 @@ def test_rays_of_one_camera_or_of_all(server, motion, rig):
 def test_a_second_motion_goes_by_time_and_is_turned(server, motion):
     late = smooth_motion(8, rate=RATE, up="z")
     object.__setattr__(late, "times", late.times + 2 / RATE)
-    show = Show(server, Recording((motion, late)))
+    show = Show(server, ViewerContent((motion, late)))
     show.frame(5)
     assert np.allclose(node(server, "body1/pelvis").position, motion.Ts_world_root[3, :3, 3], atol=1e-5)
     show.frame(0)
@@ -183,7 +183,7 @@ def test_markers_and_points_where_they_are_known(server):
     x = np.random.default_rng(0).normal(size=(4, 3, 3))
     x[2, 1] = np.nan
     markers = Markers(("a", "b", "c"), 10.0, x, up="z")
-    show = Show(server, Recording(markers=(markers,), marker_offsets=(0.5,), steps=np.arange(10) / 10))
+    show = Show(server, ViewerContent(markers=(markers,), marker_offsets=(0.5,), steps=np.arange(10) / 10))
     show.frame(7)
     assert np.allclose(node(server, "markers0/0").position, x[2, 0]) and not node(server, "markers0/1").visible
     show.frame(8)
@@ -193,12 +193,12 @@ def test_markers_and_points_where_they_are_known(server):
 
 
 def test_measured_markers_of_a_motion(server, motion):
-    Show(server, Recording((motion,))).frame(1)
+    Show(server, ViewerContent((motion,))).frame(1)
     assert np.allclose(node(server, "markers0/4").position, motion.residuals["markers/1"].measured[1, 4], atol=1e-6)
 
 
 def test_following_keeps_the_body_in_place(server, motion):
-    show = Show(server, Recording((motion,)))
+    show = Show(server, ViewerContent((motion,)))
     show.frame(6, Choice(follow=True))
     way = motion.Ts_world_root[0, :3, 3] - motion.Ts_world_root[6, :3, 3]
     shift = server.scene.get_handle_by_name("/world").position
@@ -209,7 +209,7 @@ def test_following_keeps_the_body_in_place(server, motion):
 
 def test_a_long_way_is_followed_from_nearby(server):
     walk = smooth_motion(300, rate=RATE)  # 8 m
-    show = Show(server, Recording((walk,)))
+    show = Show(server, ViewerContent((walk,)))
     assert show.stage.goes_far
     look = server.initial_camera
     assert np.allclose(look.look_at, walk.Ts_world_root[0, :3, 3])
@@ -219,14 +219,14 @@ def test_a_long_way_is_followed_from_nearby(server):
 def test_markers_are_followed_by_their_middle():
     x = np.random.default_rng(1).normal(size=(5, 7, 3))
     x[2], x[1, 3] = np.nan, np.nan
-    recording = Recording(markers=(Markers(tuple("abcdefg"), 10.0, x),), marker_offsets=(0.0,))
+    recording = ViewerContent(markers=(Markers(tuple("abcdefg"), 10.0, x),), marker_offsets=(0.0,))
     way = recording.way()
     assert np.allclose(way[[0, 4]], np.median(x[[0, 4]], axis=1)) and np.allclose(way[2], (way[1] + way[3]) / 2)
     assert np.allclose(way[1], np.nanmedian(x[1], axis=0))
 
 
 def test_a_short_one_is_seen_whole(server, motion, rig):
-    show = Show(server, Recording((motion,), rig=rig))
+    show = Show(server, ViewerContent((motion,), rig=rig))
     places, look = show.recording.places, server.initial_camera
     assert not show.stage.goes_far and np.allclose(look.look_at, 0.5 * (places.min(0) + places.max(0)))
     away = (places - look.position) @ (look.look_at - look.position)
@@ -235,7 +235,7 @@ def test_a_short_one_is_seen_whole(server, motion, rig):
 
 
 def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
-    player = Player(server, Recording((motion,), rig=rig))
+    player = Player(server, ViewerContent((motion,), rig=rig))
     player.tick(0.0)
     player.clock.playing = True
     player.tick(3.2 / RATE)
@@ -260,7 +260,7 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
 
 def test_nothing_to_show_is_told():
     with pytest.raises(ObservationError, match="no frame"):
-        Recording()
+        ViewerContent()
 
 
 def test_a_port_in_use_gives_the_next():
@@ -284,7 +284,7 @@ def test_without_viser_the_remedy_is_told(monkeypatch):
 
 
 def test_a_page_is_one_file_with_all_in_it(motion, rig):
-    text, frames = page(Recording((motion,), rig=rig))
+    text, frames = page(ViewerContent((motion,), rig=rig))
     assert frames == len(motion)
     assert len(base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)[1])) > 10_000
     assert not re.search(r'(?:src|href)="https?://', text)

@@ -9,9 +9,10 @@ from pathlib import Path
 from kinefit._arguments import checked
 from kinefit.batch.find import Found, find_takes
 from kinefit.batch.one import Choices
+from kinefit.batch.outcome import Row, failed
 from kinefit.batch.processes import Failure, run_here
 from kinefit.batch.summary import write_summary
-from kinefit.batch.work import Job, Row, failed, work
+from kinefit.batch.work import TakeJob, work
 from kinefit.errors import ExportError
 
 Told = Callable[[int, int, tuple[Row, ...]], None]
@@ -74,13 +75,13 @@ def track_takes(
     return table
 
 
-def _job(found: Found, take: Path, out: Path, choices: Choices) -> Job:
+def _job(found: Found, take: Path, out: Path, choices: Choices) -> TakeJob:
     folder = found.folder(take, out)
-    return Job(take, found.label(take), folder, folder.relative_to(out).as_posix(), choices)
+    return TakeJob(take, found.label(take), folder, folder.relative_to(out).as_posix(), choices)
 
 
 def _results(
-    jobs: Sequence[Job], workers: int, cluster: str | None, retries: int
+    jobs: Sequence[TakeJob], workers: int, cluster: str | None, retries: int
 ) -> Iterator[tuple[int, tuple[Row, ...] | Failure]]:
     if cluster is None:
         return run_here(work, jobs, workers=min(workers, len(jobs)), retries=retries)

@@ -51,7 +51,7 @@ class Choices:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackedPerson:
     """What came of one person of a take.
 
     Parameters
@@ -118,7 +118,7 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
 
 def track_person(
     take: Take, out: Path, choices: Choices, *, view: InView | None, step: Step, tell: Tell, files: dict[str, Path],
-) -> Tracked:  # fmt: skip
+) -> TrackedPerson:  # fmt: skip
     """Track one person of a take and write what comes of it; enter into `files` what is there, one after the other.
 
     A run that was stopped is gone on with (`out/unfinished`), unless the choices say to restart.
@@ -166,4 +166,4 @@ def track_person(
             write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
         if not total:
             unfinished.remove()
-    return Tracked(motion, tuple(notes), total)
+    return TrackedPerson(motion, tuple(notes), total)

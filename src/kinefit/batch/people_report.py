@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kinefit.batch.outcome import DONE, Row
 from kinefit.batch.summary import OUTCOME, by_joint, fault_boxes, outcome
-from kinefit.batch.work import DONE, Row
 
 if TYPE_CHECKING:
     from kinefit.exporters.report.page import Html

@@ -10,11 +10,11 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
-from kinefit.batch.work import DONE, Row
+from kinefit.batch.outcome import DONE, Row
 from kinefit.errors import ExportError
 
 if TYPE_CHECKING:
-    from kinefit.batch.work import Range
+    from kinefit.batch.outcome import Range
     from kinefit.exporters.report.page import Html
 
 _WHO = ("take", "person", "subject", "visit", "date", "movement")

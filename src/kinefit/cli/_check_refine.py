@@ -11,7 +11,7 @@ from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, mov
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
 from kinefit.diagnostics.keypoints import Check
-from kinefit.diagnostics.sensor_fit import SensorFit, marker_index
+from kinefit.diagnostics.sensor_fit import SensorAlignment, marker_index
 from kinefit.errors import TakeError, command
 from kinefit.geometry.camera import Rig
 
@@ -30,10 +30,10 @@ class Refined:
     """
 
     cameras: Refinement | None
-    sensors: tuple[SensorFit, ...]
+    sensors: tuple[SensorAlignment, ...]
 
     @property
-    def moved(self) -> tuple[SensorFit, ...]:
+    def moved(self) -> tuple[SensorAlignment, ...]:
         """Sensors of which it is sure where they belong: they alone are moved."""
         return tuple(fit for fit in self.sensors if not fit.doubts)
 

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 import click
 
 
-class Group(click.Group):
+class CommandGroup(click.Group):
     """A group whose commands are named where none is of the name given."""
 
     def resolve_command(

@@ -17,7 +17,7 @@ from kinefit.cli._screen import Step
 from kinefit.errors import ObservationError
 from kinefit.identification.model.files import load_model
 from kinefit.identification.model.from_frame import model_from_frame
-from kinefit.identification.model.gate import Finding, training_gate
+from kinefit.identification.model.gate import TrainingFinding, training_gate
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.people import identify_people, one_after_the_other
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 def learn_files(
     paths: Sequence[str | PathLike[str]], *, name: str | None = None, marker_set: str | None = None,
     frame: int | None = None, unit: str | None = None,
-) -> tuple[MarkerModel, list[Finding]]:
+) -> tuple[MarkerModel, list[TrainingFinding]]:
     """A subject's model from labelled files, or from one frame of the first; and what the training leaves open.
 
     Parameters

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.cli._surface_files import PHOTOGRAPHS, Views, read_seeds
+from kinefit.cli._surface_files import PHOTOGRAPHS, StateImages, read_seeds
 from kinefit.errors import FileError, ObservationError, TrackingError
 from kinefit.exporters.surface_files import (
     point_columns,
@@ -31,7 +31,7 @@ from kinefit.photogrammetry.least_squares_matching import windows_by_texture
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
-from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, uniform
 from kinefit.readers.motion import read_motion
@@ -89,7 +89,7 @@ def mask_of(path: Path | None, field: str | None) -> NDArray | None:
     return mask if field is None else field_of(mask, field)  # type: ignore[arg-type]
 
 
-def measure_photographs(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -> list[str]:
+def measure_photographs(rig: Rig, views: StateImages, wanted: Wanted, progress: Progress) -> list[str]:
     """Measure all states and write them; what to say about them."""
     rig = with_field(rig, wanted.field)
     count = len(views.photographs[0])
@@ -129,7 +129,9 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
     return _write_all(surfaces, photographs, wanted, int(np.max(window)))
 
 
-def _write_all(surfaces: Sequence[Surface], photographs: Sequence[Path], wanted: Wanted, window: int) -> list[str]:
+def _write_all(
+    surfaces: Sequence[MeasuredSurface], photographs: Sequence[Path], wanted: Wanted, window: int
+) -> list[str]:
     """Write all states; lines about them."""
     told = []
     for k, surface in enumerate(surfaces):
@@ -162,7 +164,7 @@ def _grey(path: Path, field: str | None) -> NDArray:
 
 
 def _write(
-    surface: Surface, reference: Surface | None, grey: NDArray, wanted: Wanted, k: int, window: int
+    surface: MeasuredSurface, reference: MeasuredSurface | None, grey: NDArray, wanted: Wanted, k: int, window: int
 ) -> list[str]:
     """Write one state; lines about it."""
     out, told = wanted.out, [_about(surface, k)]
@@ -201,7 +203,7 @@ def _write(
     return told
 
 
-def _about(surface: Surface, k: int) -> str:
+def _about(surface: MeasuredSurface, k: int) -> str:
     inside, seen = surface.grid.inside.sum(), surface.measured
     if not seen.any():
         return f"state {k}: none of {inside} points found"
@@ -214,7 +216,7 @@ def _about(surface: Surface, k: int) -> str:
     )
 
 
-def measure_videos(rig: Rig, views: Views, wanted: Wanted, progress: Progress) -> list[str]:
+def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progress) -> list[str]:
     """Track the surface through videos and write its paths; what to say about them.
 
     Raises

@@ -21,7 +21,7 @@ PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 
 
 @dataclass(frozen=True)
-class Views:
+class StateImages:
     """Photographs of each camera, one a state; or a video of each."""
 
     names: tuple[str, ...]
@@ -29,7 +29,7 @@ class Views:
     videos: tuple[Path, ...]
 
 
-def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig, Views]:
+def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig, StateImages]:
     """Cameras that are named, and their files; a calibration that states no image size has that of the first view.
 
     Raises
@@ -66,7 +66,7 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
             size = video.size
     metres = float(unit) if _is_number(unit) else unit
     rig = read_calibration(calibration, unit=metres, image_size=size)
-    return rig.select(tuple(names)), Views(tuple(names), tuple(photographs), tuple(videos))
+    return rig.select(tuple(names)), StateImages(tuple(names), tuple(photographs), tuple(videos))
 
 
 def read_seeds(path: Path, views: int) -> list[Seeds]:

@@ -12,7 +12,7 @@ from kinefit.cli.track import choices_options
 
 if TYPE_CHECKING:
     from kinefit.batch.one import Choices
-    from kinefit.batch.work import Row
+    from kinefit.batch.outcome import Row
 
 _EXAMPLES = """\b
 Examples:

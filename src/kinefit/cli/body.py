@@ -8,13 +8,13 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import Group
+from kinefit.cli._group import CommandGroup
 
 _FILE = click.Path(path_type=Path)
 
 
-@click.group(cls=Group, short_help="List, copy and draw bodies; check closed chains.", invoke_without_command=True,
-             epilog="""\b
+@click.group(cls=CommandGroup, short_help="List, copy and draw bodies; check closed chains.",
+             invoke_without_command=True, epilog="""\b
 Examples:
   kinefit body                                   what comes along: people, and people with gear
   kinefit body copy snowboarder                  snowboarder.toml, to change and to name in a take
@@ -42,7 +42,7 @@ def body(ctx: click.Context) -> None:
 @click.argument("file", type=_FILE, required=False)
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file of your own."""
-    from kinefit.bodies.files import catalogue_text
+    from kinefit.bodies.toml_files import catalogue_text
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
 

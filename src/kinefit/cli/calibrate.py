@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import Group
+from kinefit.cli._group import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.calibration.board.calibrate import BoardCalibration
@@ -28,7 +28,7 @@ Examples:
 """
 
 
-class _Ways(Group):
+class _Ways(CommandGroup):
     """Subcommands that are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

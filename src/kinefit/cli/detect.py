@@ -48,7 +48,7 @@ def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out:
     somebody(jobs, _screen.note)
 
 
-def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Job]:
+def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.DetectionJob]:
     from kinefit.readers.take.file import read_take
 
     takes = [path for path in inputs if path.suffix.lower() == ".toml" or path.is_dir()]
@@ -60,12 +60,12 @@ def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Job]:
     if out is not None and len(set(names)) < len(names):
         raise click.UsageError("two videos of one name cannot go into one folder: leave --out away")
     return [
-        detecting.Job(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
+        detecting.DetectionJob(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
         for path in inputs
     ]
 
 
-def _show(jobs: list[detecting.Job], done: list[detecting.Job]) -> None:
+def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]) -> None:
     """One line for each video, one picture for all."""
     from kinefit.readers.detections import read_detections
 

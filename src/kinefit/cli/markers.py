@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _results, _screen
-from kinefit.cli._group import Group
+from kinefit.cli._group import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.identification.take.takes import TakeIdentification
@@ -30,7 +30,9 @@ _FILE = click.Path(path_type=Path)
 _unit = click.option("--unit", metavar="UNIT", help="Of files that state none, or a wrong one: mm, cm, m ...")
 
 
-@click.group(cls=Group, short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES)
+@click.group(
+    cls=CommandGroup, short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES
+)
 def markers() -> None:
     """Name the markers of a take (C3D, TRC), fit a body to them, check labels."""
 

@@ -13,7 +13,7 @@ from kinefit.batch import results
 from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
-    from kinefit.batch.one import Choices, Tracked
+    from kinefit.batch.one import Choices, TrackedPerson
     from kinefit.readers.take.file import Take
     from kinefit.tracking.in_view import InView
 
@@ -135,8 +135,9 @@ def track(
 def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wanted: bool = False) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.batch.one import asked_take, check_drawable, people_of
+    from kinefit.batch.outcome import Row, failed
     from kinefit.batch.people_report import write_people_report
-    from kinefit.batch.work import Row, failed, of_motion
+    from kinefit.batch.work import of_motion
     from kinefit.errors import KinefitError
 
     take = asked_take(path, choices)
@@ -170,7 +171,7 @@ def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wante
 
 def _track_one(
     take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool
-) -> tuple[int, Tracked]:  # fmt: skip
+) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
     from kinefit.cli._agreement import print_agreement

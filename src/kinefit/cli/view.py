@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
     from kinefit.serving.access import Access
-    from kinefit.viewers.show import Recording
+    from kinefit.viewers.show import ViewerContent
 
 _EXAMPLES = """\b
 Examples:
@@ -58,7 +58,7 @@ def view(
         _serve(recording, port, Access(host, token), browser)
 
 
-def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
+def gather(sources: tuple[Path, ...], take_file: Path | None) -> ViewerContent:
     """Read everything that is to be shown."""
     import numpy as np
 
@@ -66,8 +66,8 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import takes_in
     from kinefit.readers.take.load import load_observations
-    from kinefit.viewers.pictures import Pictures
-    from kinefit.viewers.show import Recording
+    from kinefit.viewers.pictures import CameraImages
+    from kinefit.viewers.show import ViewerContent
 
     motions: list[Motion] = []
     beside: Path | None = None
@@ -90,16 +90,16 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> Recording:
     elif found := _fitting(beside, motions[0].name):
         take, seen = found
     else:
-        return Recording(tuple(motions), name=motions[0].name)
+        return ViewerContent(tuple(motions), name=motions[0].name)
     cameras = {camera.name: camera for camera in seen.rig or ()}
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
         if motion.up != take.up:
             _screen.note(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
-    return Recording(
+    return ViewerContent(
         tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
         points=None if motions else _triangulated(take, seen),
-        pictures=Pictures(cameras, seen.videos, seen.images, offsets, rate=seen.rate) if seen.videos else None,
+        pictures=CameraImages(cameras, seen.videos, seen.images, offsets, rate=seen.rate) if seen.videos else None,
         markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
     )  # fmt: skip
 
@@ -164,7 +164,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     return triangulated(channels, np.arange(len(channels.uv)))
 
 
-def _serve(recording: Recording, port: int, access: Access, browser: bool) -> None:
+def _serve(recording: ViewerContent, port: int, access: Access, browser: bool) -> None:
     from kinefit.viewers.player import Player
     from kinefit.viewers.stage import open_server, quiet
 
@@ -188,7 +188,7 @@ def _serve(recording: Recording, port: int, access: Access, browser: bool) -> No
             server.stop()
 
 
-def _write(recording: Recording, html: Path) -> None:
+def _write(recording: ViewerContent, html: Path) -> None:
     from kinefit.exporters.atomic import write_text
     from kinefit.viewers.page import page
 

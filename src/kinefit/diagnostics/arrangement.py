@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.views import AGREE, Views
+from kinefit.diagnostics.views import AGREE, KeypointViews
 from kinefit.findings import Finding
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate, triangulate_robust
@@ -34,14 +34,14 @@ def disagreement_share(rig: Rig, uv: NDArray) -> float:
     return float(np.minimum(error, limit)[seen].mean() / limit)
 
 
-def sample(views: Views) -> NDArray:
+def sample(views: KeypointViews) -> NDArray:
     """(N, C, 2) [px] some points of some frames."""
     frames = np.unique(np.linspace(0, len(views) - 1, min(_FRAMES, len(views))).astype(int))
     points = np.unique(np.linspace(0, len(views.names) - 1, _POINTS).astype(int))
     return views.uv[np.ix_(frames, points)].reshape(-1, len(views.rig), 2)
 
 
-def points_of_others(views: Views, c: int) -> NDArray:
+def points_of_others(views: KeypointViews, c: int) -> NDArray:
     """(N, 3) [m] the points of `sample` as all cameras but c make them; NaN where no two of these agree."""
     others = [k for k in range(len(views.rig)) if k != c]
     rig = views.rig.select(tuple(views.rig.names[k] for k in others))
@@ -57,7 +57,7 @@ def share_against(x_world: NDArray, camera: Camera, uv: NDArray, limit: float) -
     return float(np.median(np.minimum(np.nan_to_num(error, nan=limit), limit)) / limit)
 
 
-def share_against_others(views: Views, c: int) -> float:
+def share_against_others(views: KeypointViews, c: int) -> float:
     """The same of one camera of the rig, and the points that the others make."""
     return share_against(points_of_others(views, c), views.rig.cameras[c], sample(views)[:, c], views.limit)
 
@@ -72,7 +72,7 @@ def median_error(rig: Rig, uv: NDArray) -> float:
     return float(np.median(np.nan_to_num(error[np.isfinite(uv).all(-1)], nan=np.inf)))
 
 
-def pair_misses(views: Views) -> NDArray:
+def pair_misses(views: KeypointViews) -> NDArray:
     """(C, C) [px] median by which two cameras alone miss each other's points; NaN where they see none together."""
     uv, count = sample(views), len(views.rig)
     out = np.full((count, count), np.nan)
@@ -87,7 +87,7 @@ def pair_misses(views: Views) -> NDArray:
     return out
 
 
-def odd_camera(views: Views) -> int | None:
+def odd_camera(views: KeypointViews) -> int | None:
     """The one camera without which all others agree, while without any other they do not; None where there is none.
 
     Of four cameras or more: of three, two are left, which always nearly agree.
@@ -105,7 +105,7 @@ def odd_camera(views: Views) -> int | None:
     return None if agrees else odd
 
 
-def stranger_findings(views: Views) -> list[Finding]:
+def stranger_findings(views: KeypointViews) -> list[Finding]:
     """Cameras that do not agree with the others, or a rig that does not belong to the views.
 
     The cameras are in step, and gross mistakes are undone.
@@ -140,7 +140,7 @@ def _stranger(name: str, text: str) -> Finding:
     return Finding("fault", "stranger", text, (name,), "Sure: the other cameras agree with each other.", remedy)
 
 
-def _another_session(views: Views, misses: NDArray) -> Finding:
+def _another_session(views: KeypointViews, misses: NDArray) -> Finding:
     least = float(np.nanmin(misses))
     told = (
         f"even two of them alone miss by {least:.0f} px or more" if np.isfinite(least) else "no two of them meet at all"

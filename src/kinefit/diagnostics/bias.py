@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.views import Views, from_others, meet
+from kinefit.diagnostics.views import KeypointViews, from_others, meet
 
 SHIFT, TURN, SCALE = slice(0, 2), slice(2, 3), slice(3, 4)
 PER_CAMERA = 4  # parameters of a camera's picture: shift along u and v [px], turn [rad], scale [1]
@@ -56,7 +56,7 @@ class CameraBias:
         return float(np.hypot(*self.bias))
 
 
-def camera_biases(views: Views) -> tuple[CameraBias, ...]:
+def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
     """Bias and spread of every camera of the rig."""
     x, agree = meet(views)
     out = []
@@ -137,7 +137,7 @@ def _solve(matrix: NDArray, right: NDArray) -> NDArray:
     return scale * (vectors[:, sure] @ ((vectors[:, sure].T @ (scale * right)) / values[sure]))
 
 
-def disagreement(views: Views) -> Disagreement:
+def disagreement(views: KeypointViews) -> Disagreement:
     """How the cameras disagree, in terms of each one's picture being shifted, turned and scaled.
 
     Each point's normal equations with its own three unknowns taken out (Schur complement); only points that three or

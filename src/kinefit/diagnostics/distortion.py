@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.diagnostics.arrangement import median_error, sample
 from kinefit.diagnostics.bias import disagreement, without_points
-from kinefit.diagnostics.views import Views, meet
+from kinefit.diagnostics.views import KeypointViews, meet
 from kinefit.findings import Finding, listed
 from kinefit.geometry.camera import Rig
 
@@ -21,7 +21,7 @@ _MIN_OVER_MOVED = 0.75  # of what one camera that moved explains: bent lenses 0.
 _MAX_BENDING = 0.7  # |k1| of real lenses: fisheyes have another model
 
 
-def distortion_findings(views: Views) -> list[Finding]:
+def distortion_findings(views: KeypointViews) -> list[Finding]:
     """Whether the points lie as if lenses that the calibration states without distortion had some.
 
     One radial coefficient k1 of each of these cameras is solved for, every point in space taken out.
@@ -51,7 +51,7 @@ def distortion_findings(views: Views) -> list[Finding]:
     return [Finding("fault", "distortion", text, names, sure, remedy)]
 
 
-def _solve(views: Views, ideal: list[int]) -> tuple[NDArray, NDArray, float]:
+def _solve(views: KeypointViews, ideal: list[int]) -> tuple[NDArray, NDArray, float]:
     """k1 of some cameras, and how much of the disagreement [px] each alone and all together explain."""
     x, agree = meet(views)
     use = (agree.sum(axis=2) >= 2) & np.isfinite(x[..., 0])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit.diagnostics.arrangement import disagreement_share, sample
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding, listed
 from kinefit.geometry.camera import ImageFrame
 
@@ -16,13 +16,13 @@ _BETTER = 0.7  # of the cameras' mean error: a few pixels of difference are lost
 
 
 def frame_findings(
-    views: Views, images: Mapping[str, ImageFrame], told: Mapping[str, str]
-) -> tuple[list[Finding], Views]:
+    views: KeypointViews, images: Mapping[str, ImageFrame], told: Mapping[str, str]
+) -> tuple[list[Finding], KeypointViews]:
     """A fault where the cameras agree far better with the keypoints in the other picture; and the views so.
 
     Parameters
     ----------
-    views : Views with the keypoints read as told.
+    views : KeypointViews with the keypoints read as told.
     images : {camera: ImageFrame} of the videos.
     told : {camera: "video" or "calibration"}
         Only of cameras whose keypoints' picture the take tells.
@@ -46,8 +46,8 @@ def frame_findings(
 
 
 def _otherwise(
-    views: Views, images: Mapping[str, ImageFrame], told: Mapping[str, str], which: tuple[str, ...]
-) -> Views:
+    views: KeypointViews, images: Mapping[str, ImageFrame], told: Mapping[str, str], which: tuple[str, ...]
+) -> KeypointViews:
     """The views with the keypoints of some cameras in the other picture than told."""
     uv = views.uv.copy()
     for name in which:

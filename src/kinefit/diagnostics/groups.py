@@ -30,7 +30,7 @@ _MIN_RISE = 1.5  # of the cost itself
 
 
 @dataclass(frozen=True)
-class _Part:
+class _FrameRun:
     """Consecutive frames, and of every pair of cameras how well no shift fits beside others, and its cost [px]."""
 
     start: int
@@ -62,10 +62,10 @@ def group_findings(rig: Rig, keypoints: Sequence[Keypoints], first: int = 0) -> 
     return []
 
 
-def _part(rig: Rig, keypoints: Sequence[Keypoints], start: int, stop: int) -> _Part:
+def _part(rig: Rig, keypoints: Sequence[Keypoints], start: int, stop: int) -> _FrameRun:
     count = min(stop - start, _MAX_FRAMES)
     begin = (start + stop - count) // 2
-    part = _Part(start, stop, {}, {})
+    part = _FrameRun(start, stop, {}, {})
     try:
         records = [k.rows(slice(begin, begin + count), k.time_offset) for k in keypoints]
         views = make_views(rig, records, filled=True)
@@ -86,7 +86,7 @@ def _groups(cameras: int) -> list[tuple[int, ...]]:
     return [group for group in every if 2 * len(group) < cameras or group[0] == 0]
 
 
-def _is_apart(good: _Part, bad: _Part, group: tuple[int, ...]) -> bool:
+def _is_apart(good: _FrameRun, bad: _FrameRun, group: tuple[int, ...]) -> bool:
     common = [pair for pair in bad.cost if pair in good.cost]
     across = [pair for pair in common if (pair[0] in group) != (pair[1] in group)]
     within = [bad.advantage[pair] for pair in common if pair not in across]
@@ -100,7 +100,7 @@ def _is_apart(good: _Part, bad: _Part, group: tuple[int, ...]) -> bool:
     return fits_nowhere and max(within) >= _MIN_WITHIN and fall >= _MIN_FALL and rise >= _MIN_RISE
 
 
-def _finding(rig: Rig, group: tuple[int, ...], good: _Part, bad: _Part, first: int) -> Finding:
+def _finding(rig: Rig, group: tuple[int, ...], good: _FrameRun, bad: _FrameRun, first: int) -> Finding:
     names = [rig.names[c] for c in group]
     others = [rig.names[c] for c in range(len(rig)) if c not in group]
     text = (

@@ -17,11 +17,11 @@ from kinefit.diagnostics.frames import frame_findings
 from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.mistakes import focal_findings, mistake_findings
 from kinefit.diagnostics.person import size_findings, stature, upright_findings
-from kinefit.diagnostics.scene import Coverage, coverage, coverage_findings, lens_findings, placement_findings
-from kinefit.diagnostics.sensor_fit import SensorFit
+from kinefit.diagnostics.scene import CameraCoverage, coverage, coverage_findings, lens_findings, placement_findings
+from kinefit.diagnostics.sensor_fit import SensorAlignment
 from kinefit.diagnostics.timing import TimeOffsets, fast_pixels, shifted, time_offsets
 from kinefit.diagnostics.verdicts import bias_findings, explained, side_findings, time_findings
-from kinefit.diagnostics.views import Views, make_views, meet, with_sides_right
+from kinefit.diagnostics.views import KeypointViews, make_views, meet, with_sides_right
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding, faults_of, ranked
 from kinefit.geometry.camera import Rig
@@ -50,7 +50,7 @@ class Check:
     take : Take or None
         As it could be read: where something did not fit, with the remedy that the finding names.
     observations : Observations or None
-    views : Views or None
+    views : KeypointViews or None
         The person's keypoints, left and right put right, brought in step; of some frames alone after a quick check.
     x_world : (F, K, 3) [m] or None
         Where they meet.
@@ -65,13 +65,13 @@ class Check:
     findings: tuple[Finding, ...]
     take: Take | None = None
     observations: Observations | None = None
-    views: Views | None = None
+    views: KeypointViews | None = None
     x_world: NDArray | None = None
     biases: tuple[CameraBias, ...] = ()
-    coverage: tuple[Coverage, ...] = ()
+    coverage: tuple[CameraCoverage, ...] = ()
     times: TimeOffsets | None = None
     frames_late: Mapping[str, int] = field(default_factory=dict)
-    sensors: tuple[SensorFit, ...] = ()
+    sensors: tuple[SensorAlignment, ...] = ()
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -119,7 +119,7 @@ def check_keypoints(
     def done(what: int) -> None:
         step("checking", what, _STEPS)
 
-    def ended(views: Views | None = None, **more: object) -> Check:
+    def ended(views: KeypointViews | None = None, **more: object) -> Check:
         return Check(name, ranked(findings), views=views, **known, **more)  # type: ignore[arg-type]
 
     done(0)
@@ -202,7 +202,7 @@ def _liveliest(record: Keypoints, keypoints: Sequence[Keypoints]) -> Keypoints:
     return record.rows(slice(start, min(start + _QUICK_FRAMES, length)), record.time_offset)
 
 
-def _seen(views: Views) -> tuple[Views, list[Finding]]:
+def _seen(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
     """The views of the cameras that saw somebody, and which did not."""
     seen = np.isfinite(views.uv).any(axis=(0, 1, 3))
     out = []
@@ -212,7 +212,7 @@ def _seen(views: Views) -> tuple[Views, list[Finding]]:
     return views.select([n for n, s in zip(views.rig.names, seen, strict=True) if s]), out
 
 
-def _in_step(views: Views) -> tuple[TimeOffsets, Views, dict[str, int]]:
+def _in_step(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:
     """Time offsets, and the views with left and right put right and brought in step where that is sure.
 
     Sides can only be told of cameras in step, offsets only of points with their right names; two rounds do both.
@@ -231,7 +231,7 @@ def _in_step(views: Views) -> tuple[TimeOffsets, Views, dict[str, int]]:
     return again, moved, dict(zip(views.rig.names, delays.astype(int).tolist(), strict=True))
 
 
-def _unmoved(views: Views, moved: Views, delays: NDArray) -> Views:
+def _unmoved(views: KeypointViews, moved: KeypointViews, delays: NDArray) -> KeypointViews:
     """The views as they came, with the sides exchanged that were found exchanged once they were in step."""
     uv, swapped = views.uv.copy(), views.swapped.copy()
     for c, delay in enumerate(delays.astype(int)):

@@ -22,7 +22,7 @@ from kinefit.diagnostics.arrangement import (
     sample,
     share_against,
 )
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding, listed
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
@@ -88,12 +88,12 @@ class Mistake:
         return Finding("fault", self.kind, f"{text}.", self.cameras, sure, self.remedy)
 
 
-def mistake_findings(views: Views, take_file: str = "the take", *, lenient: bool = False) -> list[Finding]:
+def mistake_findings(views: KeypointViews, take_file: str = "the take", *, lenient: bool = False) -> list[Finding]:
     """The gross mistake that explains why the cameras do not agree, if there is one.
 
     Parameters
     ----------
-    views : Views
+    views : KeypointViews
     take_file : name, for remedies.
     lenient : bool, whether it is known that there is a mistake, so that a smaller fall of the error will do.
     """
@@ -101,7 +101,7 @@ def mistake_findings(views: Views, take_file: str = "the take", *, lenient: bool
     return [mistake.finding(views.rig.names, views.limit)] if mistake else []
 
 
-def focal_findings(views: Views) -> list[Finding]:
+def focal_findings(views: KeypointViews) -> list[Finding]:
     """Focal lengths of another image size, of a person who has no human size."""
     uv = sample(views)
     trials = ((mistake, rig, uv) for mistake, rig in _focal_lengths(views.rig))
@@ -109,7 +109,7 @@ def focal_findings(views: Views) -> list[Finding]:
     return [mistake.finding(views.rig.names, views.limit)] if mistake else []
 
 
-def _of_the_rig(views: Views, take_file: str, lenient: bool) -> Mistake | None:
+def _of_the_rig(views: KeypointViews, take_file: str, lenient: bool) -> Mistake | None:
     """The gross mistake that makes all cameras agree."""
     uv = sample(views)
     before = disagreement_share(views.rig, uv)
@@ -126,7 +126,7 @@ def _best(trials: Iterator[tuple[Mistake, Rig, NDArray]], before: float, *, leni
     return best
 
 
-def _of_one_camera(views: Views, lenient: bool) -> Mistake | None:
+def _of_one_camera(views: KeypointViews, lenient: bool) -> Mistake | None:
     """A mistake of one camera, where the others agree: undone, it fits what they saw."""
     best: Mistake | None = None
     odd = odd_camera(views) if lenient else None
@@ -145,7 +145,7 @@ def _of_one_camera(views: Views, lenient: bool) -> Mistake | None:
     return best
 
 
-def _share_of_free_pose(views: Views, c: int, x_world: NDArray) -> float:
+def _share_of_free_pose(views: KeypointViews, c: int, x_world: NDArray) -> float:
     """Error of one camera's views of points (N, 3) [m], as `share_against` has it, at the pose that fits them best."""
     camera, uv = views.rig.cameras[c], sample(views)[:, c]
     rays = camera.ray(uv) @ camera.T_camera_world[:3, :3].T
@@ -162,7 +162,7 @@ def _share_of_free_pose(views: Views, c: int, x_world: NDArray) -> float:
     return share_against(x_world, camera.with_pose(pose), uv, views.limit)
 
 
-def _trials_of_one(views: Views, c: int) -> Iterator[tuple[Mistake, Camera, NDArray]]:
+def _trials_of_one(views: KeypointViews, c: int) -> Iterator[tuple[Mistake, Camera, NDArray]]:
     """What may be wrong with one camera, each with the camera and the pixels (N, 2) of `sample` that it would take."""
     camera, uv = views.rig.cameras[c], sample(views)[:, c]
     name = camera.name

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.rigid_pairs import rigid_pairs
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
@@ -120,7 +120,7 @@ def _index(names: Sequence[str], side: str, joint: str) -> int | None:
     return next((k for k, n in enumerate(names) if n in (f"{side}_{joint}", f"{side[0].upper()}{short}")), None)
 
 
-def stature(body: Body, keypoint_sets: Sequence[str], views: Views, x: NDArray) -> float | None:
+def stature(body: Body, keypoint_sets: Sequence[str], views: KeypointViews, x: NDArray) -> float | None:
     """[m] height of the person by the median length of the bones seen; None where none is."""
     ratios = []
     for name in keypoint_sets:

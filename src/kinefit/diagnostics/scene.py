@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding, Severity, listed
 from kinefit.geometry.camera import Camera, Rig
 
@@ -24,7 +24,7 @@ _CELLS = 6  # of the volume along each axis, for what a camera sees of it
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
+class CameraCoverage:
     """What one camera sees.
 
     Parameters
@@ -146,7 +146,7 @@ def _weakness(ways: NDArray) -> float:
     return float(np.sqrt(values[-1] / max(values[0], 1e-12)))
 
 
-def coverage(views: Views, x: NDArray) -> tuple[Coverage, ...]:
+def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:
     """What every camera sees of the volume that the person used: x (F, K, 3) [m]."""
     known = x[np.isfinite(x).all(-1)]
     low, high = np.percentile(known, [1, 99], axis=0)
@@ -161,11 +161,11 @@ def coverage(views: Views, x: NDArray) -> tuple[Coverage, ...]:
         tall = float(np.median(np.nanmax(v, axis=1) - np.nanmin(v, axis=1))) if some.any() else np.nan
         detected = np.isfinite(views.uv).all(-1).any(axis=(0, 2))
         distance = float(np.linalg.norm(camera.centre_world - 0.5 * (low + high)))
-        out.append(Coverage(camera.name, float(inside.mean()), float(seen[:, detected].mean()), tall, distance))
+        out.append(CameraCoverage(camera.name, float(inside.mean()), float(seen[:, detected].mean()), tall, distance))
     return tuple(out)
 
 
-def coverage_findings(seen: Sequence[Coverage]) -> list[Finding]:
+def coverage_findings(seen: Sequence[CameraCoverage]) -> list[Finding]:
     """Cameras that see little of the person."""
     out = []
     for c in seen:

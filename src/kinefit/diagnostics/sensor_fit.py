@@ -26,7 +26,7 @@ _INSIDE, _DRAWS = 0.95, 4000  # share of errors within the bars that are stated;
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFit:
+class SensorAlignment:
     """How a sensor's frame lies against the world of the videos.
 
     Parameters
@@ -88,13 +88,16 @@ def per_freedom(twist: NDArray, covariance: NDArray) -> float:
 
 
 def doubts_of(
-    fit: SensorFit, origin: NDArray, halves: tuple[SensorFit, SensorFit], rivals: tuple[NDArray, ...] = ()
+    fit: SensorAlignment,
+    origin: NDArray,
+    halves: tuple[SensorAlignment, SensorAlignment],
+    rivals: tuple[NDArray, ...] = (),
 ) -> tuple[str, ...]:
     """Why a sensor is not to be moved, in words that follow "because"; none where all is well.
 
     Parameters
     ----------
-    fit : SensorFit, with what the halves disagree by in its covariance.
+    fit : SensorAlignment, with what the halves disagree by in its covariance.
     origin : (3,) [m] of the sensor's frame: a camera's centre.
     halves : as two halves of the frames have it, without what the surface leaves wrong.
     rivals : twists (7,), from the lowest end to those of other starts that explain what was measured as well.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.diagnostics.bias import without_points
-from kinefit.diagnostics.views import Views, meet
+from kinefit.diagnostics.views import KeypointViews, meet
 from kinefit.diagnostics.whole_frames import MIN_FRAMES, VALLEY, best_shift, depth, from_pairs, pair_curves
 
 _LONGEST = 1500  # frames that fractions are found from
@@ -56,12 +56,12 @@ class TimeOffsets:
         return self.offsets * self.rate
 
 
-def time_offsets(views: Views) -> TimeOffsets:
+def time_offsets(views: KeypointViews) -> TimeOffsets:
     """Offsets of all cameras from the motion of the points they see.
 
     Parameters
     ----------
-    views : Views with consecutive frames.
+    views : KeypointViews with consecutive frames.
     """
     cameras = len(views.rig)
     told = (views.begins - np.median(views.begins)) * views.rate  # parts of a frame that the take tells already
@@ -86,7 +86,7 @@ def time_offsets(views: Views) -> TimeOffsets:
     return TimeOffsets(views.rig.names, delays / views.rate, std / views.rate, views.rate, named)
 
 
-def _liveliest(views: Views) -> Views:
+def _liveliest(views: KeypointViews) -> KeypointViews:
     """At most `_LONGEST` consecutive frames, those with most motion."""
     if len(views) <= _LONGEST:
         return views
@@ -96,7 +96,7 @@ def _liveliest(views: Views) -> Views:
     return views.at(np.arange(start, start + _LONGEST))
 
 
-def fast_pixels(views: Views) -> dict[str, float]:
+def fast_pixels(views: KeypointViews) -> dict[str, float]:
     """{camera: [px]} how far the faster points of a camera's picture (the upper tenth) move in a frame."""
     x, _ = meet(views)
     speed = _speed(x, max(2, round(_STEP * views.rate)))
@@ -108,7 +108,7 @@ def fast_pixels(views: Views) -> dict[str, float]:
     return out
 
 
-def shifted(views: Views, delays: Sequence[float] | NDArray) -> Views:
+def shifted(views: KeypointViews, delays: Sequence[float] | NDArray) -> KeypointViews:
     """The views at common times: camera c's frame f shows what happened at f + delays[c]; straight between frames."""
     uv = np.full_like(views.uv, np.nan)
     t = np.arange(len(views))
@@ -123,7 +123,7 @@ def shifted(views: Views, delays: Sequence[float] | NDArray) -> Views:
     return replace(views, uv=uv)
 
 
-def _fractions(views: Views, delays: NDArray) -> tuple[NDArray, NDArray]:
+def _fractions(views: KeypointViews, delays: NDArray) -> tuple[NDArray, NDArray]:
     """Delays (C,) [frames] and their standard errors by Gauss-Newton from whole ones."""
     cameras = len(views.rig)
     for _ in range(_ROUNDS):
@@ -156,7 +156,7 @@ def _solve(matrix: NDArray, right: NDArray) -> NDArray:
     return np.linalg.lstsq(matrix + weight * np.ones_like(matrix), right, rcond=1e-9)[0]
 
 
-def _delay_equations(views: Views) -> list[tuple[NDArray, NDArray]]:
+def _delay_equations(views: KeypointViews) -> list[tuple[NDArray, NDArray]]:
     """Normal equations (B, C, C), (B, C) of the cameras' delays [frames]: of blocks of time, and of single points.
 
     None of either where too little is seen.

@@ -11,7 +11,7 @@ import numpy as np
 
 from kinefit.diagnostics.bias import SHIFT, TURN, CameraBias, Disagreement
 from kinefit.diagnostics.timing import TimeOffsets
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 from kinefit.errors import command
 from kinefit.findings import SEVERITIES, Finding, Severity, listed
 
@@ -190,7 +190,7 @@ def time_findings(
     return out
 
 
-def side_findings(views: Views) -> list[Finding]:
+def side_findings(views: KeypointViews) -> list[Finding]:
     """Where the detector took left for right."""
     if len(views.rig) < 3:
         return [Finding("note", "sides", "With two cameras it is undecided which of them takes left for right.")]

@@ -21,7 +21,7 @@ _CLEARLY = 0.6  # exchanged, the pairs must fit to this share of their error, or
 
 
 @dataclass(frozen=True, eq=False)
-class Views:
+class KeypointViews:
     """Pixels of one person's K points in F frames of the C cameras of a rig.
 
     Parameters
@@ -55,15 +55,15 @@ class Views:
         """[px] beyond which two cameras have not seen the same point."""
         return AGREE * max(float(np.hypot(*camera.size)) for camera in self.rig)
 
-    def at(self, frames: NDArray) -> Views:
+    def at(self, frames: NDArray) -> KeypointViews:
         """Some frames."""
         return replace(self, uv=self.uv[frames], swapped=self.swapped[frames])
 
-    def spread(self, count: int) -> Views:
+    def spread(self, count: int) -> KeypointViews:
         """At most so many frames, spread over the recording."""
         return self.at(np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).astype(int)))
 
-    def select(self, cameras: Sequence[str]) -> Views:
+    def select(self, cameras: Sequence[str]) -> KeypointViews:
         """Only some cameras."""
         at = [self.rig.index(name) for name in cameras]
         return replace(
@@ -76,7 +76,7 @@ class Views:
         return self.uv.reshape(-1, len(self.rig), 2)
 
 
-def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False) -> Views:
+def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False) -> KeypointViews:
     """Views of the person whom most cameras agree on, as the detectors saw it.
 
     Parameters
@@ -108,7 +108,9 @@ def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False
         ]
     known = begins[np.isfinite(begins)]
     begins = np.where(np.isfinite(begins), begins, known.min())
-    return Views(rig, names, np.array(partner), keypoints[0].rate, uv, np.zeros((frames, len(rig)), bool), begins)
+    return KeypointViews(
+        rig, names, np.array(partner), keypoints[0].rate, uv, np.zeros((frames, len(rig)), bool), begins
+    )
 
 
 def _of_person(record: Keypoints, chosen: NDArray, filled: bool) -> NDArray:
@@ -130,14 +132,14 @@ def _of_person(record: Keypoints, chosen: NDArray, filled: bool) -> NDArray:
     return np.where((chosen >= 0)[:, None, None], points[frames, np.maximum(chosen, 0)], np.nan)
 
 
-def meet(views: Views) -> tuple[NDArray, NDArray]:
+def meet(views: KeypointViews) -> tuple[NDArray, NDArray]:
     """Where the views of each point meet: x_world (F, K, 3) [m], and which of them do, (F, K, C) bool."""
     x, agree, _ = triangulate_robust(views.rig, views.pixels(), max_residual_px=views.limit)
     shape = views.uv.shape[:2]
     return x.reshape(*shape, 3), agree.reshape(*shape, len(views.rig))
 
 
-def from_others(views: Views, c: int) -> NDArray:
+def from_others(views: KeypointViews, c: int) -> NDArray:
     """(F, K, 2) [px] where camera c should see the points, by all other cameras; NaN where these do not tell."""
     uv = views.pixels().copy()
     uv[:, c] = np.nan
@@ -145,7 +147,7 @@ def from_others(views: Views, c: int) -> NDArray:
     return views.rig.cameras[c].project(x).reshape(*views.uv.shape[:2], 2)
 
 
-def with_sides_right(views: Views) -> Views:
+def with_sides_right(views: KeypointViews) -> KeypointViews:
     """The same with left and right exchanged in single cameras and frames where the others clearly want it.
 
     Needs three cameras; with two nobody can tell which one is wrong. In every frame the camera that gains most is put
@@ -171,7 +173,7 @@ def with_sides_right(views: Views) -> Views:
     return views
 
 
-def _gain(views: Views, c: int, paired: NDArray) -> NDArray:
+def _gain(views: KeypointViews, c: int, paired: NDArray) -> NDArray:
     """(F,) [px] by how much the pairs of camera c fit better exchanged; 0 where not clearly."""
     told, seen = from_others(views, c)[:, paired], views.uv[:, :, c]
     as_is, turned = (

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.views import Views
+from kinefit.diagnostics.views import KeypointViews
 
 Curve = tuple[NDArray, NDArray]
 """Shifts (S,) [frames] and their costs (S,) [px]."""
@@ -24,7 +24,7 @@ MIN_FRAMES = 12
 """Frames from which a shift can be told."""
 
 
-def pair_curves(views: Views) -> dict[tuple[int, int], Curve]:
+def pair_curves(views: KeypointViews) -> dict[tuple[int, int], Curve]:
     """{(a, b): (shifts [frames], cost [px])}: how far rays of b, so many frames later, pass those of a."""
     reach = int(min(_REACH * views.rate, 0.4 * len(views)))
     shifts = np.arange(-reach, reach + 1)

@@ -1,7 +1,7 @@
 """A result against the truth, as numbers."""
 
 from kinefit.evaluation.accuracy import (
-    Coverage,
+    ErrorBarCoverage,
     angle_errors,
     coverage,
     coverage_of_groups,
@@ -9,4 +9,4 @@ from kinefit.evaluation.accuracy import (
     orientation_errors,
 )
 
-__all__ = ["Coverage", "angle_errors", "coverage", "coverage_of_groups", "joint_errors", "orientation_errors"]
+__all__ = ["ErrorBarCoverage", "angle_errors", "coverage", "coverage_of_groups", "joint_errors", "orientation_errors"]

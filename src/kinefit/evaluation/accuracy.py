@@ -59,7 +59,7 @@ def orientation_errors(truth: Motion, result: Motion, *, relative: bool = False)
 
 
 @dataclass(frozen=True)
-class Coverage:
+class ErrorBarCoverage:
     """Share of the truth within the error bars, 0..1; NaN where no finite error bar is given.
 
     Parameters
@@ -72,16 +72,16 @@ class Coverage:
     angles: float
 
 
-def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> Coverage:
+def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> ErrorBarCoverage:
     """Share of joint centres and angles whose truth lies within so many standard deviations; 0.954 is right for two."""
     turned = _comparable(truth, result)
     shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
     angles = angle_errors(truth, result)
     angles = np.abs(np.where(truth.body.tree.prismatic, angles, np.radians(angles)))
-    return Coverage(_share(shift, sigmas * turned.joint_std), _share(angles, sigmas * turned.dof_std[:, 6:]))
+    return ErrorBarCoverage(_share(shift, sigmas * turned.joint_std), _share(angles, sigmas * turned.dof_std[:, 6:]))
 
 
-def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -> dict[str, Coverage]:
+def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -> dict[str, ErrorBarCoverage]:
     """The same for each group of joints (the body's scale groups: pelvis, trunk, ..., both sides together).
 
     A joint belongs to the group of the segment that it moves.
@@ -94,7 +94,7 @@ def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -
     for g, name in enumerate(truth.body.scale_groups):
         segments = truth.body.segment_scale == g
         dofs = segments[truth.body.tree.owners]
-        out[name] = Coverage(
+        out[name] = ErrorBarCoverage(
             _share(shift[:, segments], sigmas * turned.joint_std[:, segments]),
             _share(angles[:, dofs], sigmas * turned.dof_std[:, 6:][:, dofs]),
         )

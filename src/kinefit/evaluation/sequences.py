@@ -15,10 +15,10 @@ from kinefit.motion import Motion
 from kinefit.observations import MEDIAPIPE_33, DepthFrame, Frame, KeypointFrame
 from kinefit.sensors.channels import joined
 from kinefit.simulation._postures import MOVEMENTS
-from kinefit.simulation.movements import Person, movement, people
+from kinefit.simulation.movements import Performer, movement, people
 from kinefit.simulation.pictures import ColourSensor, picture
 from kinefit.simulation.placing import beside, in_front
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import TOF, DepthSensor, measured_depth
 
 Inputs = Literal["3d", "2d", "fusion"]
@@ -35,13 +35,13 @@ _RATE = 10.0  # [Hz] P2: 10 to 14
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class TruthSequence:
     """One sequence: a known motion and what the sensors saw of it.
 
     Parameters
     ----------
     number : int
-    person : Person
+    person : Performer
     truth : Motion
     rig : Rig of the depth camera "depth" and the colour camera "colour".
     sensor : DepthSensor
@@ -51,7 +51,7 @@ class Sequence:
     """
 
     number: int
-    person: Person
+    person: Performer
     truth: Motion
     rig: Rig
     sensor: DepthSensor
@@ -81,7 +81,7 @@ def sequences(
     rate: float = _RATE,
     room: bool = True,
     seed: int = 0,
-) -> Iterator[Sequence]:
+) -> Iterator[TruthSequence]:
     """The first `count` of a hundred sequences; every ten hold each movement and each person once.
 
     Parameters
@@ -110,29 +110,31 @@ def with_hands(body: Body) -> Body:
 
 def sequence(
     name: str,
-    person: Person,
+    person: Performer,
     *,
     sensor: DepthSensor = TOF,
     rate: float = _RATE,
     room: bool = True,
     seed: int = 0,
     number: int = 0,
-) -> Sequence:
+) -> TruthSequence:
     """One movement of one person as its sensors saw it; see `sequences`."""
     truth = movement(name, with_hands(person.body), rate=rate, speed=person.speed)
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
     head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
     colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
-    scene = Scene.of(truth, camera if room else None)
+    scene = SimulatedScene.of(truth, camera if room else None)
     depth = []
     for frame, time in enumerate(truth.times):
         random = np.random.default_rng([seed, number, frame])
         depth.append(DepthFrame("depth", float(time), measured_depth(scene, frame, camera, sensor, random)))
     features = features_of(scene, head, colour, seed=1000 * seed + number)
-    return Sequence(number, person, truth, Rig((camera, colour)), sensor, tuple(depth), features)
+    return TruthSequence(number, person, truth, Rig((camera, colour)), sensor, tuple(depth), features)
 
 
-def features_of(scene: Scene, sensor: ColourSensor, camera: Camera, *, seed: int = 0) -> tuple[KeypointFrame, ...]:
+def features_of(
+    scene: SimulatedScene, sensor: ColourSensor, camera: Camera, *, seed: int = 0
+) -> tuple[KeypointFrame, ...]:
     """Face and hands by the colour of the skin in rendered pictures of a scene; none where the first shows no face."""
     motion, tracker, out = scene.motion, None, []
     face = _face(scene, camera)
@@ -146,7 +148,7 @@ def features_of(scene: Scene, sensor: ColourSensor, camera: Camera, *, seed: int
     return tuple(out)
 
 
-def _face(scene: Scene, camera: Camera) -> tuple[float, float, float, float] | None:
+def _face(scene: SimulatedScene, camera: Camera) -> tuple[float, float, float, float] | None:
     """Box [px] of the face in the first picture, as a detector's landmarks give it; None where it looks away."""
     body, state = scene.motion.body, scene.motion.state(0)
     points = body.keypoints("MEDIAPIPE_33")

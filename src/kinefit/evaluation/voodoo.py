@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.free_parts import free_parts, parts_state
 from kinefit.errors import ObservationError
-from kinefit.evaluation.sequences import FEATURES, INPUTS, Inputs, Sequence
+from kinefit.evaluation.sequences import FEATURES, INPUTS, Inputs, TruthSequence
 from kinefit.motion import Motion
 from kinefit.recipes.voodoo import Settings, voodoo
 from kinefit.simulation.retarget import known_motion
 from kinefit.tracking.tracker import Tracker
 
-Method = Callable[[Sequence, Inputs, BodyState], Motion]
+Method = Callable[[TruthSequence, Inputs, BodyState], Motion]
 """Tracks a sequence with some of its sensors from a given pose; its body has the true one's landmarks."""
 
 GOOD_MEAN = 0.060  # [m] half the width of a thigh: drawn over the picture, limbs cover their counterparts
@@ -140,11 +140,11 @@ def grade(truth: Motion, fitted: Motion) -> Grade:
 
 
 def evaluate(
-    runs: Iterable[Sequence],
+    runs: Iterable[TruthSequence],
     method: Method,
     *,
     inputs: Iterable[Inputs] = INPUTS,
-    start: Callable[[Sequence], BodyState] | None = None,
+    start: Callable[[TruthSequence], BodyState] | None = None,
     step: Callable[[int], None] | None = None,
 ) -> dict[Inputs, Summary]:
     """Track every sequence with every choice of sensors, and grade it.
@@ -169,7 +169,7 @@ def evaluate(
     return {i: Summary(i, tuple(g)) for i, g in graded.items()}
 
 
-def stretched_share(run: Sequence, fitted: Motion) -> float:
+def stretched_share(run: TruthSequence, fitted: Motion) -> float:
     """Share of the frames with an arm stretched at the depth sensor in which all such hands are found to 150 mm.
 
     NaN where no arm is: within 25 degrees of the direction to the sensor, and no elbow bent by more than that.
@@ -188,7 +188,7 @@ def stretched_share(run: Sequence, fitted: Motion) -> float:
     return float(np.mean((found | ~stretched).all(axis=1)[frames]))
 
 
-def parts_error(run: Sequence, fitted: Motion) -> float:
+def parts_error(run: TruthSequence, fitted: Motion) -> float:
     """[m] mean distance of face and hands from the true ones across the line of sight, over frames that show them."""
     x, y = (m.positions(m.body.landmarks.select(FEATURES)) for m in (run.truth, fitted))
     ray = _unit(x - run.rig["colour"].centre_world)
@@ -220,7 +220,7 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
 
 
 def voodoo_method(
-    run: Sequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
+    run: TruthSequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
 ) -> Motion:
     """P2's method: parts that move freely, tied by bands; `model` has the true body's tree, default: that body.
 
@@ -232,17 +232,17 @@ def voodoo_method(
     return _motion(run, parts, [parts_state(parts, fit.frames) for fit in fits])
 
 
-def fusion_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
+def fusion_method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
     """The fusion tracker: a tree of hard joints, limits, robust weights, visibility; smoothed, as `kinefit track`."""
     return _tracked(run, inputs, start).motion(name=run.truth.name)
 
 
-def live_method(run: Sequence, inputs: Inputs, start: BodyState) -> Motion:
+def live_method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
     """The fusion tracker as it goes, each frame from what was seen until then."""
     return _tracked(run, inputs, start).motion(smooth=False, name=run.truth.name)
 
 
-def _tracked(run: Sequence, inputs: Inputs, start: BodyState) -> Tracker:
+def _tracked(run: TruthSequence, inputs: Inputs, start: BodyState) -> Tracker:
     tracker = Tracker(run.truth.body, run.rig, rate=run.truth.rate, sigma=run.sigma, keep=True, up="y")
     tracker.start_at(start)
     for seen in run.seen(inputs):
@@ -253,7 +253,7 @@ def _tracked(run: Sequence, inputs: Inputs, start: BodyState) -> Tracker:
 METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_method, "live": live_method}
 
 
-def found_start(run: Sequence) -> BodyState:
+def found_start(run: TruthSequence) -> BodyState:
     """Pose found in the first depth image with none given."""
     from kinefit.initialization.from_depth import start_from_points
 
@@ -261,7 +261,7 @@ def found_start(run: Sequence) -> BodyState:
     return start_from_points(run.truth.body, None, run.rig["depth"], depth, up=(0.0, 1.0, 0.0))[0].state
 
 
-def _motion(run: Sequence, body: Body, states: list[BodyState]) -> Motion:
+def _motion(run: TruthSequence, body: Body, states: list[BodyState]) -> Motion:
     roots, angles = np.array([s.T_world_root for s in states]), np.array([s.angles for s in states])
     return known_motion(body, run.truth.rate, roots, angles, up=run.truth.up, name=run.truth.name)
 

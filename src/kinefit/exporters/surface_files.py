@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.photogrammetry.strain import Strain
-from kinefit.photogrammetry.surface import Surface
+from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.trajectories import Trajectories
 
 _LARGEST = 1400  # [px] of a picture's longer side
@@ -21,7 +21,7 @@ _BAR = 90  # [px] of the scale beside it
 
 
 def point_columns(
-    surface: Surface, reference: Surface | None = None, strain: Strain | None = None
+    surface: MeasuredSurface, reference: MeasuredSurface | None = None, strain: Strain | None = None
 ) -> dict[str, NDArray]:
     """Named columns (N,) of all points: places [m], standard deviations [m], quality, displacement [m] and strain."""
     out = {}
@@ -38,7 +38,7 @@ def point_columns(
     return out
 
 
-def write_points_csv(surface: Surface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
+def write_points_csv(surface: MeasuredSurface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
     """Write the measured points: row and column of the grid, pixels in the first camera, metres, and more columns.
 
     Raises
@@ -56,7 +56,7 @@ def write_points_csv(surface: Surface, path: str | PathLike[str], columns: Mappi
     write_text(path, "\n".join(lines) + "\n")
 
 
-def write_surface_vtk(surface: Surface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
+def write_surface_vtk(surface: MeasuredSurface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
     """Write the mesh with a scalar for each column, in the legacy VTK format that ParaView opens; metres.
 
     Displacements dx_m, dy_m, dz_m become a vector as well. Errors as of `write_points_csv`.
@@ -80,7 +80,7 @@ def write_surface_vtk(surface: Surface, path: str | PathLike[str], columns: Mapp
 
 
 def write_field_picture(
-    surface: Surface, image: NDArray, values: NDArray, path: str | PathLike[str], *, title: str, unit: str
+    surface: MeasuredSurface, image: NDArray, values: NDArray, path: str | PathLike[str], *, title: str, unit: str
 ) -> None:
     """Paint a field over the first camera's image of the state, with a scale: PNG.
 

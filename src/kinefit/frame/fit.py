@@ -58,7 +58,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _FrameFit:
     """Where a fit ended: the scene there, the normal matrix (n, n), the cost under its own match."""
 
     scene: Scene
@@ -121,11 +121,11 @@ class FrameFit:
                     found, told, released = other, also, free
         return replace(self._judged(found, released_from(held, released), told, known), released=released)
 
-    def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
+    def _fitted(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
         settled = all(m.settled for m in measurements)
         return self._settled(scene, held, measurements) if settled else self._renewed(scene, held, measurements)
 
-    def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _Found:
+    def _renewed(self, scene: Scene, held: Held | None, measurements: Sequence[Measurement]) -> _FrameFit:
         """Where nearest points take part: one step under each match, within a distance that shrinks to `near`."""
         s, iterations = self.settings, 0
         reach = float(np.clip(max(m.within for m in measurements if not m.settled), s.near, s.far))
@@ -142,11 +142,11 @@ class FrameFit:
             if gain < s.tolerance**2 * len(step.delta) and reach <= s.near:
                 break
             reach = max(reach * s.shrink, s.near)
-        return _Found(scene, step.equations.matrix, step.equations.cost, tuple(matched), iterations, True)
+        return _FrameFit(scene, step.equations.matrix, step.equations.cost, tuple(matched), iterations, True)
 
     def _settled(
         self, scene: Scene, held: Held | None, measurements: Sequence[Measurement], reach: float = 0.0
-    ) -> _Found:
+    ) -> _FrameFit:
         """Where a match changes in what is discrete alone: to the minimum under each, until it stays as it is.
 
         A `reach` [m] beyond the settings' nearest widens the loss at first.
@@ -163,7 +163,7 @@ class FrameFit:
             if all(a.key == b.key for a, b in zip(matched, again)):
                 break
             matched = again
-        return _Found(scene, found.H, found.cost, tuple(matched), iterations)
+        return _FrameFit(scene, found.H, found.cost, tuple(matched), iterations)
 
     def _minimum(
         self, scene: Scene, held: Held | None, matched: Sequence[Matched], most: int, tolerance: float
@@ -202,7 +202,7 @@ class FrameFit:
         margin, sigma = -s.flesh, s.collision
         return [collision_rows(self.body, scene.state, pairs=self._pairs, margin=margin, sigma=sigma)]
 
-    def _judged(self, found: _Found, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
+    def _judged(self, found: _FrameFit, held: Held | None, each: Sequence[Evidence], known: NDArray | None) -> Fitted:
         """Where measurements contradict a segment, none makes it more certain, nor does a surface that hides it."""
         scene, tree, told = found.scene, self.body.tree, together(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]

@@ -67,7 +67,7 @@ class Constraint:
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class CgaPose:
     """What `estimate_pose` found.
 
     Parameters
@@ -94,7 +94,7 @@ def estimate_pose(
     angles: ArrayLike | None = None,
     iterations: int = 50,
     tolerance: float = 1e-12,
-) -> Pose:
+) -> CgaPose:
     """Motor M and angles θ with (M (M1 … Mn X M̃n … M̃1) M̃) × (e∧(O∧x)) = 0 in least squares (P1 2.1, 2.4).
 
     Parameters
@@ -128,7 +128,7 @@ def estimate_pose(
             )
         M, theta = unit(exp(twist(step[:6])) * M), theta + step[6:]
         taken, size = taken + 1, float(np.linalg.norm(step))
-    return Pose(M, theta, float(np.sqrt(np.mean(residual**2))), taken, size)
+    return CgaPose(M, theta, float(np.sqrt(np.mean(residual**2))), taken, size)
 
 
 def _prepared(c: Constraint, joints: int) -> Constraint:

@@ -162,7 +162,7 @@ def clusters(x: NDArray, gap: float = _GAP) -> NDArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Blob:
+class DepthBlob:
     """One thing of about a person's size in a depth image.
 
     Parameters
@@ -185,7 +185,7 @@ class Blob:
 def people(
     depth: NDArray, camera: Camera, *, mask: NDArray | None = None, floor: Floor | None = None, gap: float = _GAP,
     clearance: float = 0.05,
-) -> tuple[Blob, ...]:  # fmt: skip
+) -> tuple[DepthBlob, ...]:  # fmt: skip
     """Everything of about a person's size that is left in a depth image, the largest first: two of them are two people.
 
     Parameters
@@ -221,5 +221,5 @@ def people(
             shown.reshape(-1)[pixel[mine]] = True
             inner = shown[rim[0] : -rim[0], rim[1] : -rim[1]]
             cut = bool(np.count_nonzero(inner) < np.count_nonzero(shown))
-            found.append(Blob(shown, np.median(x[mine], axis=0), float(area[number]), extent, cut))
+            found.append(DepthBlob(shown, np.median(x[mine], axis=0), float(area[number]), extent, cut))
     return tuple(sorted(found, key=lambda blob: -blob.area))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.images.models import Models
-from kinefit.images.person_detector import Person
+from kinefit.images.person_detector import DetectedPerson
 from kinefit.images.pose_model import SIZE
 from kinefit.images.roi import Roi, Steady
 from kinefit.observations import Detections
@@ -37,7 +37,7 @@ _MEMORY = 2.0  # [s] somebody who is lost may come back near the same place unde
 
 
 @dataclass(frozen=True, eq=False)
-class _Track:
+class _DetectionTrack:
     """One person: where to look next, and what was seen last."""
 
     column: int
@@ -48,7 +48,7 @@ class _Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class PersonDetection:
     """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m]."""
 
     column: int
@@ -76,12 +76,12 @@ class Follower:
     rate: float
     people: int = 3
     masks: bool = True
-    _tracks: list[_Track] = field(default_factory=list)
-    _lost: list[_Track] = field(default_factory=list)
+    _tracks: list[_DetectionTrack] = field(default_factory=list)
+    _lost: list[_DetectionTrack] = field(default_factory=list)
     _frame: int = -1
     _columns: int = 0
 
-    def update(self, image: NDArray[np.uint8]) -> list[Sighting]:
+    def update(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
         """Everybody in the next picture (H, W, 3) RGB."""
         self._frame += 1
         self._lost = [t for t in self._lost if self._frame - t.last <= _MEMORY * self.rate]
@@ -100,9 +100,9 @@ class Follower:
         """Whether the whole picture is looked at whatever is seen."""
         return self._frame % max(round((_SOON if self._lost else _LOOK) * self.rate), 1) == 0
 
-    def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_Track, Sighting]]:
+    def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
         """Those who are still there; two that have become one are the one that moved less."""
-        seen: list[tuple[_Track, Sighting, float]] = []
+        seen: list[tuple[_DetectionTrack, PersonDetection, float]] = []
         for track in self._tracks:
             others = [t.shape for t in self._tracks if t is not track and t.shape]
             found = self._look_at(image, track, others=others, mask=mask)
@@ -122,9 +122,9 @@ class Follower:
                 self._lost.append(track)
         return [s[:2] for s in seen]
 
-    def _find(self, image: NDArray[np.uint8], *, thorough: bool) -> list[tuple[_Track, Sighting]]:
+    def _find(self, image: NDArray[np.uint8], *, thorough: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
         """Those whom nobody follows yet, the surest first, as many as there is room for."""
-        found: list[tuple[_Track, Sighting]] = []
+        found: list[tuple[_DetectionTrack, PersonDetection]] = []
         covered = image
         while len(self._tracks) + len(found) < self.people:
             known = [*self._tracks, *(t for t, _ in found)]
@@ -139,18 +139,23 @@ class Follower:
         return found
 
     def _first(
-        self, image: NDArray[np.uint8], people: list[Person], known: list[_Track], *, searched: bool = False
-    ) -> tuple[_Track, Sighting] | None:
+        self,
+        image: NDArray[np.uint8],
+        people: list[DetectedPerson],
+        known: list[_DetectionTrack],
+        *,
+        searched: bool = False,
+    ) -> tuple[_DetectionTrack, PersonDetection] | None:
         """The first who is a person at a second look too, and nobody known; more is asked of who was searched for."""
         score, clear = (_SURE, _CLEAR) if searched else (_THERE, _VISIBLE)
         for person in people:
-            once = self._look_at(image, _Track(-1, Steady.at(person.points)), score, mask=False)
+            once = self._look_at(image, _DetectionTrack(-1, Steady.at(person.points)), score, mask=False)
             new = once and self._look_at(image, once[0], score, mask=self.masks or self.people > 1)
             if new and _clearness(new[1], image) >= clear and not any(_is_part(new[0], t) for t in known):
                 return new
         return None
 
-    def _column_of(self, new: _Track) -> int:
+    def _column_of(self, new: _DetectionTrack) -> int:
         """That of whoever was lost about here not long ago; else a column of its own."""
         back = min(self._lost, key=lambda t: _apart(t, new, _HEAD), default=None)
         if back is not None and _apart(back, new, _HEAD) < _NEAR:
@@ -160,9 +165,9 @@ class Follower:
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _Track, score: float = _THERE, *,
+        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float = _THERE, *,
         mask: bool, others: Sequence[tuple[Roi, NDArray]] = (),
-    ) -> tuple[_Track, Sighting] | None:  # fmt: skip
+    ) -> tuple[_DetectionTrack, PersonDetection] | None:  # fmt: skip
         """Landmarks of a person in the region where they are expected; None where there is nobody.
 
         Others in the region, where they were last, are painted over: the network draws a person's limbs towards them.
@@ -179,7 +184,9 @@ class Follower:
         runs = np.zeros(0, np.uint32)
         if self.masks and pose.mask is not None:
             runs = mask_runs(pose.mask, roi, image.shape[:2])
-        sighting = Sighting(track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted))
+        sighting = PersonDetection(
+            track.column, points, pose.visibility * pose.presence, runs, roi.to_upright(pose.lifted)
+        )
         shape = None if pose.mask is None else (roi, pose.mask)
         return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
 
@@ -210,17 +217,17 @@ def _moved(shape: tuple[Roi, NDArray], roi: Roi, least: float) -> NDArray[np.uin
     return (cv2.warpAffine(shape[1], A, (SIZE, SIZE)) > least).astype(np.uint8)
 
 
-def _clearness(seen: Sighting, image: NDArray) -> float:
+def _clearness(seen: PersonDetection, image: NDArray) -> float:
     """Mean confidence of the landmarks that lie in the picture."""
     inside = ((seen.points >= 0) & (seen.points < image.shape[1::-1])).all(axis=1)
     return float(seen.confidence[inside].mean()) if inside.any() else 0.0
 
 
-def _is_same(a: _Track, b: _Track) -> bool:
+def _is_same(a: _DetectionTrack, b: _DetectionTrack) -> bool:
     return min(_apart(a, b, _HEAD), _apart(a, b, slice(None))) < _SAME_PERSON
 
 
-def _is_part(new: _Track, known: _Track) -> bool:
+def _is_part(new: _DetectionTrack, known: _DetectionTrack) -> bool:
     """Whether most of what looks like another person is somebody who is known."""
     assert new.shape and known.shape
     (roi, mask), (other_roi, other) = new.shape, known.shape
@@ -229,7 +236,7 @@ def _is_part(new: _Track, known: _Track) -> bool:
     return bool((moved & (other > _RATHER)).sum() > _MOST * area) or _is_same(new, known)
 
 
-def _apart(a: _Track, b: _Track, points: slice) -> float:
+def _apart(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
     """Median distance of some landmarks, in sides of the smaller region."""
     assert a.points is not None and b.points is not None
     side = min(a.steady.roi.side, b.steady.roi.side)
@@ -296,7 +303,7 @@ def detect_people(
         of a second has none. No column where nobody is seen.
     """
     follower = Follower(models, rate, people, masks)
-    frames: list[list[Sighting]] = []
+    frames: list[list[PersonDetection]] = []
     size = (0, 0)
     for image in images:
         size = (image.shape[1], image.shape[0])

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError
-from kinefit.images.person_detector import Person, PersonDetector
-from kinefit.images.pose_model import MASK, Pose, PoseModel
+from kinefit.images.person_detector import DetectedPerson, PersonDetector
+from kinefit.images.pose_model import MASK, PersonLandmarks, PoseModel
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
 _REMEDY = "Delete its folder; it is then fetched again."
@@ -47,15 +47,15 @@ class Models:
     def _outlines(self) -> PoseModel:
         return PoseModel(_interpreter(self._landmarks, self._threads))
 
-    def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> Pose:
+    def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
         """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
         return (self._outlines if mask else self._points)(crop)
 
-    def find_people(self, image: NDArray[np.uint8]) -> list[Person]:
+    def find_people(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
         """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""
         return self._detect(image)
 
-    def search(self, image: NDArray[np.uint8]) -> list[Person]:
+    def search(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
         """Those who are small or lie, the surest first: in parts of the picture, or in the picture turned by quarters.
 
         There is more in a picture that looks like a person when it is looked at so closely.

@@ -21,7 +21,7 @@ _SAME = 0.3  # boxes that overlap by more are one person
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class DetectedPerson:
     """Somebody in a picture.
 
     Parameters
@@ -39,7 +39,7 @@ class Person:
         """Region around the whole body."""
         return Roi.around_person(*self.points)
 
-    def turned_back(self, quarters: int, shape: tuple[int, int]) -> Person:
+    def turned_back(self, quarters: int, shape: tuple[int, int]) -> DetectedPerson:
         """The person in a picture (height, width) who was found in `numpy.rot90` of it by so many quarter turns."""
         points, (height, width) = self.points, shape
         if quarters % 2:
@@ -47,7 +47,7 @@ class Person:
         for _ in range(quarters):
             points = np.column_stack([height - 1 - points[:, 1], points[:, 0]])
             height, width = width, height
-        return Person(points, self.score)
+        return DetectedPerson(points, self.score)
 
 
 def anchors() -> NDArray:
@@ -80,7 +80,7 @@ class PersonDetector:
         outputs = {int(o["shape"][-1]): o["index"] for o in interpreter.get_output_details()}
         self._boxes, self._scores = outputs[12], outputs[1]
 
-    def __call__(self, image: NDArray[np.uint8]) -> list[Person]:
+    def __call__(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
         """People in an RGB picture (H, W, 3), the surest first."""
         square, side, offset = _letterboxed(image)
         self._interpreter.set_tensor(self._input, square[None])
@@ -88,7 +88,7 @@ class PersonDetector:
         raw = self._interpreter.get_tensor(self._boxes)[0]
         logits = self._interpreter.get_tensor(self._scores)[0, :, 0]
         return [
-            Person(points[:2] * side - offset, score) for points, score in decode(raw, logits)
+            DetectedPerson(points[:2] * side - offset, score) for points, score in decode(raw, logits)
         ]
 
 

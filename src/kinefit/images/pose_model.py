@@ -20,7 +20,7 @@ _PEAK = 0.5  # least height of a heatmap that moves its landmark
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class PersonLandmarks:
     """What the network sees in a crop.
 
     Parameters
@@ -65,7 +65,7 @@ class PoseModel:
         self._mask, self._heat = outputs.get(MASK), outputs[1, _HEAT, _HEAT, 39]
         self._lifted = outputs[1, 117]
 
-    def __call__(self, crop: NDArray[np.uint8]) -> Pose:
+    def __call__(self, crop: NDArray[np.uint8]) -> PersonLandmarks:
         """Pose of the person in an RGB crop (256, 256, 3)."""
         read = self._interpreter.get_tensor
         self._interpreter.set_tensor(self._input, (crop * np.float32(1 / 255))[None])
@@ -74,7 +74,7 @@ class PoseModel:
         points = refine(landmarks[:, :2], read(self._heat)[0])
         visibility, presence = _sigmoid(landmarks[:_POINTS, 3:].T)
         mask = None if self._mask is None else _sigmoid(read(self._mask)[0, :, :, 0])
-        return Pose(
+        return PersonLandmarks(
             points[:_POINTS], visibility, presence, points[_POINTS], points[_POINTS + 1],
             float(read(self._score).item()), mask,
             read(self._lifted).reshape(39, 3)[:_POINTS].astype(float),

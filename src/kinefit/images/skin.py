@@ -43,7 +43,7 @@ _KEPT = 0.3  # of the first colour stays for good: what is learnt cannot drift a
 
 
 @dataclass(frozen=True, eq=False)
-class Blob:
+class SkinPatch:
     """A patch of skin: centre (2,) [px], covariance (2, 2) [px²], velocity (2,) [px/s], confidence, unseen for [s]."""
 
     centre: NDArray
@@ -104,7 +104,7 @@ class SkinTracker:
         self._least = max(_LEAST * self._height**2, _PIXELS)
         centre = self._scale * np.array([left + 0.5 * width, top + 0.5 * height])
         spread = np.diag([0.25 * width * self._scale, 0.25 * height * self._scale]) ** 2
-        self.blobs: list[Blob | None] = [Blob(centre, spread, np.zeros(2), 1.0), None, None]
+        self.blobs: list[SkinPatch | None] = [SkinPatch(centre, spread, np.zeros(2), 1.0), None, None]
         self._grey: NDArray | None = None
         bins = self._chroma(image)
         self._stir = np.zeros(bins.shape, np.float32)
@@ -132,7 +132,7 @@ class SkinTracker:
         fine = np.clip((lab[..., 1:] + 48.0) * (_BINS / 96.0), 0, _BINS - 1).astype(np.int64)
         return np.asarray(fine[..., 0] * _BINS + fine[..., 1])
 
-    def update(self, image: NDArray) -> tuple[Blob | None, Blob | None, Blob | None]:
+    def update(self, image: NDArray) -> tuple[SkinPatch | None, SkinPatch | None, SkinPatch | None]:
         """Face, left and right hand in the next picture; None for one that was not seen or is lost."""
         self._check(image)
         if image.shape != self._shape:
@@ -154,7 +154,7 @@ class SkinTracker:
         uv = np.array([b.centre if b else (np.nan, np.nan) for b in seen])
         return KeypointFrame(sensor, time, names, uv, np.array([b.confidence if b else 0.0 for b in seen]))
 
-    def _shown(self, b: Blob | None) -> Blob | None:
+    def _shown(self, b: SkinPatch | None) -> SkinPatch | None:
         if b is None or b.unseen > 0.0:
             return None
         s = 1.0 / self._scale
@@ -250,7 +250,7 @@ class SkinTracker:
         old = self.blobs[k]
         jump = old is not None and float(np.linalg.norm(patch.centre - old.centre)) > 1.5 * self._height
         if old is None or jump:
-            self.blobs[k] = Blob(patch.centre, patch.covariance, np.zeros(2), 0.5)
+            self.blobs[k] = SkinPatch(patch.centre, patch.covariance, np.zeros(2), 0.5)
             return
         off = patch.centre - old.centre
         shape = old.covariance if patch.crowded else 0.7 * old.covariance + 0.3 * patch.covariance
@@ -260,7 +260,7 @@ class SkinTracker:
         sure = _SURE + (1.0 - _SURE) * size  # what was there before and has the colour is seen, also from the side
         share, gain = 0.8, 0.3  # of an alpha-beta filter for brisk movements
         speed = old.velocity + gain * off / self._step
-        self.blobs[k] = Blob(old.centre + share * off, shape, speed, 0.5 * size if patch.crowded else sure)
+        self.blobs[k] = SkinPatch(old.centre + share * off, shape, speed, 0.5 * size if patch.crowded else sure)
 
     def _learn(self, bins: NDArray, mask: NDArray) -> None:
         """Follow the light: skin's colour from what is taken for the face, the rest's from what is no skin."""

@@ -12,7 +12,7 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.limbs import limbs
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.initialization.depth_search import Search
+from kinefit.initialization.depth_search import PostureSearch
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.initialization.from_rays import starts_from_rays
@@ -109,7 +109,9 @@ def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[Poi
     return (joined(sets) if sets else empty), np.concatenate(places), np.concatenate(rays)
 
 
-def find_limbs(search: Search, state: BodyState, seek: NDArray, tries: int = 200) -> list[tuple[BodyState, float]]:
+def find_limbs(
+    search: PostureSearch, state: BodyState, seek: NDArray, tries: int = 200
+) -> list[tuple[BodyState, float]]:
     """States that a view speaks for more than for the given one, with the gain in score that each must show.
 
     Near ones come first: all else held, then the whole body moved. A limb that is found somewhere else altogether

@@ -29,7 +29,7 @@ STEP = (0.04, 0.2, 0.35)  # [m, rad, rad] first random steps of the root's place
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class PostureSearch:
     """Tries postures of a body in a view.
 
     Parameters

@@ -18,8 +18,8 @@ from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, noise_of, without_speckles
-from kinefit.images.depth_scene import Blob, find_floor, foreground, people
-from kinefit.initialization.depth_search import Search
+from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
+from kinefit.initialization.depth_search import PostureSearch
 from kinefit.sensors.depth_view import DepthView, splat, view_of
 from kinefit.subject.depth import fit_surfaces
 from kinefit.subject.subject import SubjectFit
@@ -95,7 +95,7 @@ def start_from_points(
     BodyError
         The body has no surfaces.
     """
-    found: list[tuple[Search, BodyState]] = []
+    found: list[tuple[PostureSearch, BodyState]] = []
     views: list[DepthView] = []
     more = _views(body, points, camera, depth, up, background)
     for attempt in range(max(attempts, 1)):
@@ -108,7 +108,7 @@ def start_from_points(
     return [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
 
 
-def _meant(search: Search, state: BodyState) -> float:
+def _meant(search: PostureSearch, state: BodyState) -> float:
     """Score of a person among several: one of whom little is seen (less than head and shoulders) counts for less."""
     area = float(np.sum((search.view.observed / search.view.lens[0]) ** 2))
     return search.value(state) * min(area / (0.1 * max(search.body.stature, 0.1) ** 2), 1.0)
@@ -142,7 +142,7 @@ def sized_start(
     """
     found: list[tuple[DepthView, BodyState]] = []
     for depth in depths:
-        tried: list[tuple[Search, BodyState]] = []
+        tried: list[tuple[PostureSearch, BodyState]] = []
         for views in _views(body, None, camera, depth, up, background):
             tried += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
             if max(_meant(*t) for t in tried) > _GOOD:
@@ -153,7 +153,7 @@ def sized_start(
     states = [state for _, state in found]
     for _ in range(rounds):
         fit = fit_surfaces(body, [v.cloud for v in views], states, views=views)
-        searches = [Search(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
+        searches = [PostureSearch(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
         states = [s.refined(state, s.ends(state)) for s, state in zip(searches, fit.states)]
     starts = [Start(state, s.value(state), s.score.visible(state)) for s, state in zip(searches, states)]
     return fit, starts
@@ -168,9 +168,9 @@ def _unit(up: ArrayLike) -> NDArray:
 
 def _searches(
     body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int, forward: ArrayLike | None = None
-) -> list[Search]:
+) -> list[PostureSearch]:
     ahead = None if forward is None else np.asarray(forward, float)
-    return [Search(body, view, _unit(up), np.random.default_rng(seed), ahead) for view in views]
+    return [PostureSearch(body, view, _unit(up), np.random.default_rng(seed), ahead) for view in views]
 
 
 def _views(
@@ -220,10 +220,10 @@ def _views(
     yield [view_of(smooth, person, camera)]
 
 
-def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) -> Iterator[list[Blob]]:
+def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) -> Iterator[list[DepthBlob]]:
     """Things of a person's size, the likeliest first; then those that are only things if less is joined to them."""
     floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
-    known: list[Blob] = []
+    known: list[DepthBlob] = []
     for gap in _GAPS:
         new = [b for b in people(depth, camera, mask=mask, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
         new.sort(key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))
@@ -232,7 +232,7 @@ def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) ->
             yield new[:_MOST]
 
 
-def _same(a: Blob, b: Blob) -> bool:
+def _same(a: DepthBlob, b: DepthBlob) -> bool:
     return bool(np.sum(a.mask & b.mask) > _SAME * np.sum(a.mask | b.mask))
 
 

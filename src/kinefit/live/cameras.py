@@ -18,7 +18,7 @@ from kinefit.readers.video import Video
 _AGAIN = 1.0  # [s] between attempts to open a camera that went away
 
 
-class Clock:
+class SessionClock:
     """The session's: 0 when its first source starts."""
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class Clock:
 class ThreadSource:
     """A source of one sensor, in a thread of its own."""
 
-    def __init__(self, name: str, clock: Clock) -> None:
+    def __init__(self, name: str, clock: SessionClock) -> None:
         self.name, self.clock = name, clock
         self.sensors: tuple[str, ...] = (name,)
         self.patient = False
@@ -70,7 +70,7 @@ class ThreadSource:
 class CameraSource(ThreadSource):
     """A source of one camera's images of a size (width, height) [px]."""
 
-    def __init__(self, name: str, size: tuple[int, int], clock: Clock) -> None:
+    def __init__(self, name: str, size: tuple[int, int], clock: SessionClock) -> None:
         super().__init__(name, clock)
         self.size = size
 
@@ -91,7 +91,7 @@ class CameraStream(CameraSource):
     name : of the camera in the rig
     stream : "0", "1", ... or an address such as "rtsp://..."
     size : (width, height) [px] of its images
-    clock : Clock of the session
+    clock : SessionClock of the session
 
     Raises
     ------
@@ -99,7 +99,7 @@ class CameraStream(CameraSource):
         It cannot be opened to begin with.
     """
 
-    def __init__(self, name: str, stream: str, size: tuple[int, int], clock: Clock) -> None:
+    def __init__(self, name: str, stream: str, size: tuple[int, int], clock: SessionClock) -> None:
         super().__init__(name, size, clock)
         self.stream = stream
         self._capture = self._opened()
@@ -146,7 +146,7 @@ class VideoReplay(CameraSource):
     """
 
     def __init__(
-        self, name: str, video: Path, clock: Clock, *, rate: float | None = None, offset: float = 0.0,
+        self, name: str, video: Path, clock: SessionClock, *, rate: float | None = None, offset: float = 0.0,
         speed: float = 1.0, frames: tuple[int, int] | None = None,
     ) -> None:  # fmt: skip
         self._video = Video(video, rate=rate)

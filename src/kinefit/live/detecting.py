@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from kinefit.geometry.camera import ImageFrame
-from kinefit.images.detection import Follower, Sighting
+from kinefit.images.detection import Follower, PersonDetection
 from kinefit.images.models import Models
 from kinefit.live.inbox import Arrived
 from kinefit.observations import MEDIAPIPE_33, Keypoints
@@ -56,7 +56,7 @@ class LiveDetector:
 
 
 def as_keypoints(
-    seen: Sequence[Sighting], camera: str, time: float, rate: float, image: ImageFrame
+    seen: Sequence[PersonDetection], camera: str, time: float, rate: float, image: ImageFrame
 ) -> Keypoints:
     """Everybody seen in one image, in the calibration's image frame."""
     count = len(seen), len(MEDIAPIPE_33)

@@ -13,7 +13,7 @@ import numpy as np
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.live.cameras import Clock, ThreadSource
+from kinefit.live.cameras import SessionClock, ThreadSource
 from kinefit.live.inbox import Arrived, Inbox
 from kinefit.observations import DepthFrame
 from kinefit.readers.depth.images import PICTURES, counts_of, depth_picture, natural
@@ -36,7 +36,7 @@ class FolderSource(ThreadSource):
     name : of the sensor
     folder : Path
     endings : of the files, ".png"
-    clock : Clock of the session
+    clock : SessionClock of the session
 
     Raises
     ------
@@ -44,7 +44,7 @@ class FolderSource(ThreadSource):
         No such folder.
     """
 
-    def __init__(self, name: str, folder: Path, endings: tuple[str, ...], clock: Clock) -> None:
+    def __init__(self, name: str, folder: Path, endings: tuple[str, ...], clock: SessionClock) -> None:
         super().__init__(name, clock)
         self.folder, self.endings = folder, endings
         if not folder.is_dir():
@@ -99,7 +99,7 @@ class FolderSource(ThreadSource):
 class ImageFolderStream(FolderSource):
     """Images (PNG, JPEG) of a camera of a size (width, height) [px], for the detector."""
 
-    def __init__(self, name: str, folder: Path, size: tuple[int, int], clock: Clock) -> None:
+    def __init__(self, name: str, folder: Path, size: tuple[int, int], clock: SessionClock) -> None:
         super().__init__(name, folder, (".png", ".jpg", ".jpeg"), clock)
         self.size = size
 
@@ -130,7 +130,7 @@ class DepthFolderStream(FolderSource):
     """
 
     def __init__(
-        self, name: str, folder: Path, size: tuple[int, int], clock: Clock, *, unit: float | None = None,
+        self, name: str, folder: Path, size: tuple[int, int], clock: SessionClock, *, unit: float | None = None,
         near: float = 0.0, far: float = np.inf,
     ) -> None:  # fmt: skip
         super().__init__(name, folder, PICTURES, clock)
@@ -166,7 +166,14 @@ class KeypointFolderStream(FolderSource):
     """
 
     def __init__(
-        self, name: str, folder: Path, clock: Clock, *, keypoint_set: str, rate: float, image: ImageFrame | None = None
+        self,
+        name: str,
+        folder: Path,
+        clock: SessionClock,
+        *,
+        keypoint_set: str,
+        rate: float,
+        image: ImageFrame | None = None,
     ) -> None:
         super().__init__(name, folder, (".json",), clock)
         self.keypoint_set, self.rate, self.image = keypoint_set, rate, image

@@ -16,7 +16,7 @@ from kinefit.frame.results import FrameResult
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosePacket:
     """A pose as receivers get it.
 
     Parameters

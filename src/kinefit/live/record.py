@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
 from kinefit.exporters.motion_file import write_motion
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 from kinefit.motion import Motion
 
 _SPOOL = "poses.unfinished"
@@ -60,7 +60,7 @@ class MotionRecord:
             self._last = None
         self._body = body
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Keep a pose at the step of its time."""
         r = posed.result
         self.dropped = sum(posed.dropped.values())

@@ -19,7 +19,7 @@ from kinefit.exporters.pose_lines import hello
 from kinefit.frame.results import FrameResult
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.inbox import Arrived, Inbox
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 from kinefit.live.people import LivePerson
 from kinefit.live.replay import REPLAY
 from kinefit.live.seen import SeenRecord
@@ -54,7 +54,7 @@ class Receiver(Protocol):
     def hello(self, body: Body, packet: bytes) -> None:
         """The body that follows, with its packet."""
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """A pose, with its packet."""
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ class LiveSession:
         if result is not None:
             state = result.state
             poses = self.tracker.body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
-        posed = Posed(
+        posed = PosePacket(
             self.processed, self.tracker.body, result, poses, now, time.monotonic() - at, self.inbox.dropped,
             self.inbox.silent(),
         )  # fmt: skip

@@ -11,7 +11,7 @@ from kinefit.bodies import Body
 from kinefit.errors import CalibrationError, TakeError
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.images.depth_scene import background_model
-from kinefit.live.cameras import CameraStream, Clock
+from kinefit.live.cameras import CameraStream, SessionClock
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
 from kinefit.live.session import Source
@@ -49,7 +49,7 @@ def opened_streams(take: Take, body: Body, threads: int, tell: Tell) -> Opened:
     KinefitError
         What opening streams raises.
     """
-    rig, clock, rate = read_rig(take), Clock(), take.rate or _RATE
+    rig, clock, rate = read_rig(take), SessionClock(), take.rate or _RATE
     cameras = [entry for entry in take.cameras if entry.stream is not None]
     if cameras:
         sizes = {entry.name: _size(entry, rig, take) for entry in cameras}
@@ -127,7 +127,7 @@ def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
     return size
 
 
-def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: Clock) -> Source:
+def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: SessionClock) -> Source:
     """The images of one camera, as they come."""
     assert entry.stream is not None
     folder = take.path.parent / entry.stream

@@ -10,7 +10,7 @@ from kinefit._threads import cores
 from kinefit.bodies import Body, load_body
 from kinefit.errors import TakeError
 from kinefit.identification.take.named import with_names
-from kinefit.live.cameras import Clock, VideoReplay
+from kinefit.live.cameras import SessionClock, VideoReplay
 from kinefit.live.people import LivePerson
 from kinefit.live.replay import Replay
 from kinefit.live.seen import SeenRecord
@@ -96,7 +96,7 @@ def _videos(take: Take, body: Body, speed: float, threads: int, tell: Tell) -> O
     if not entries:
         remedy = "Give its cameras a stream or a video."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
-    clock, sources = Clock(), []
+    clock, sources = SessionClock(), []
     for entry in entries:
         assert entry.video is not None
         sources.append(VideoReplay(

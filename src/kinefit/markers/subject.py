@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.marker_sets import Placement, find_placement
+from kinefit.bodies.marker_sets import MarkerPlacement, find_placement
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.markers.poses import LOSS, columns, sequence_both_ways
@@ -165,13 +165,13 @@ def _stride(trial: Markers) -> int:
     return max(1, min(round(trial.rate / _RATE), len(trial) // _ENOUGH))
 
 
-def _worn(placed: Placement, x: NDArray, seen: NDArray) -> tuple[Placement, NDArray, NDArray]:
+def _worn(placed: MarkerPlacement, x: NDArray, seen: NDArray) -> tuple[MarkerPlacement, NDArray, NDArray]:
     """Without markers that are never seen."""
     keep = seen.any(axis=0)
     return placed.select(np.array(placed.points.names)[keep]), x[:, keep], seen[:, keep]
 
 
-def _first_size(body: Body, placed: Placement, x: NDArray) -> float:
+def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
     """How many times the generic body's size the subject has: by distances that postures change little."""
     rng, tree = np.random.default_rng(0), body.tree
     away = 0.5 * tree.spread * rng.normal(size=(_POSTURES, len(tree.usual)))
@@ -213,7 +213,7 @@ def _moved(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDA
         return np.nan_to_num(np.nanmedian(local, axis=0) - points.points)
 
 
-def _measured(placed: Placement, x: NDArray, sigma: NDArray) -> list[Measurement]:
+def _measured(placed: MarkerPlacement, x: NDArray, sigma: NDArray) -> list[Measurement]:
     """Markers (K, 3) [m] of one frame, those that were seen, each as sure as it sits on its segment."""
     here = np.flatnonzero(np.isfinite(x).all(axis=1))
     sensor = MarkerSensor("markers", sigma[here], LOSS, joint.REACH[-1])

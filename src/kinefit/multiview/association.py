@@ -160,7 +160,7 @@ def _meet(pair: Rig, a: NDArray, b: NDArray) -> NDArray:
 
 
 @dataclass(frozen=True)
-class Group:
+class DetectionGroup:
     """Detections of one frame that are of one person."""
 
     nodes: tuple[Node, ...]
@@ -171,11 +171,11 @@ class Group:
 def groups_of(
     people: list[Node], meetings: Mapping[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int,
     full: float,
-) -> list[Group]:  # fmt: skip
+) -> list[DetectionGroup]:  # fmt: skip
     """Largest sets of people of different records that all meet in a frame; single ones where nobody meets."""
     there = set(people)
     links = {pair: centre for pair, centre in meetings.items() if pair[0] in there and pair[1] in there}
-    found: dict[frozenset[Node], Group] = {}
+    found: dict[frozenset[Node], DetectionGroup] = {}
     for pair in links:
         group = list(pair)
         for node in people:
@@ -184,12 +184,14 @@ def groups_of(
         score = sum(float(surety[q][frame, p]) for q, p in group) / full
         # of all its pairs: one of them may have only half of the person in common
         middle = np.median([c for (a, b), c in links.items() if a in group and b in group], axis=0)
-        found.setdefault(frozenset(group), Group(tuple(group), score, middle))
+        found.setdefault(frozenset(group), DetectionGroup(tuple(group), score, middle))
     nowhere = np.full(3, np.nan)
-    return list(found.values()) or [Group(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people]
+    return list(found.values()) or [
+        DetectionGroup(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people
+    ]
 
 
-def _one_person(groups: Sequence[Sequence[Group]], rate: float) -> list[tuple[Node, ...]]:
+def _one_person(groups: Sequence[Sequence[DetectionGroup]], rate: float) -> list[tuple[Node, ...]]:
     """The detections of one person in each frame, none where unseen: the path through the groups that shows most."""
     value, centre, unseen = np.zeros(1), np.full((1, 3), np.nan), np.zeros(1)  # of every path that is borne in mind
     history: list[tuple[NDArray, NDArray]] = []  # for each path the one it goes on from, and its group or -1

@@ -12,7 +12,7 @@ from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.one_camera import lifted_alone, people_before
-from kinefit.multiview.people import Person, may_be_several, people_of
+from kinefit.multiview.people import PersonTrack, may_be_several, people_of
 from kinefit.observations import Keypoints
 from kinefit.observations.person import FORMS, PersonChoice
 
@@ -21,7 +21,7 @@ PEOPLE = "people"
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class PersonKeypoints:
     """One person's keypoints.
 
     Parameters
@@ -33,7 +33,7 @@ class Followed:
     """
 
     keypoints: tuple[Keypoints, ...]
-    people: tuple[Person, ...] = ()
+    people: tuple[PersonTrack, ...] = ()
     number: int = 1
     rate: float = 1.0
 
@@ -57,9 +57,9 @@ class Followed:
 
 
 def follow(
-    rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None, people: Sequence[Person] | None = None,
-    pictures: Pictures | None = None,
-) -> Followed:  # fmt: skip
+    rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None,
+    people: Sequence[PersonTrack] | None = None, pictures: Pictures | None = None,
+) -> PersonKeypoints:  # fmt: skip
     """The keypoints of one of the people in view.
 
     Parameters
@@ -86,12 +86,12 @@ def follow(
     people = tuple(people)
     number = choose(people, person)
     if len(people) < 2:
-        return Followed(tuple(keypoints), people)
+        return PersonKeypoints(tuple(keypoints), people)
     own = tuple(k.of_one(chosen) for k, chosen in zip(keypoints, people[number].chosen))
-    return Followed(own, people, number + 1, keypoints[0].rate)
+    return PersonKeypoints(own, people, number + 1, keypoints[0].rate)
 
 
-def choose(people: Sequence[Person], person: int | str | None) -> int:
+def choose(people: Sequence[PersonTrack], person: int | str | None) -> int:
     """Which of the people in view is meant, from 0; errors and forms as of `follow`."""
     wanted = PersonChoice.of(person)
     if wanted.way == "number" and wanted.number > max(len(people), 1):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lifting import placed
 from kinefit.multiview.association import surety_of
-from kinefit.multiview.people import STEP, Person, lasting
+from kinefit.multiview.people import STEP, PersonTrack, lasting
 from kinefit.observations import Keypoints
 
 
@@ -20,7 +20,7 @@ def lifted_alone(keypoints: Sequence[Keypoints]) -> Keypoints | None:
     return next((k for k in keypoints if k.lifted is not None), None) if of_one else None
 
 
-def people_before(rig: Rig, keypoints: Sequence[Keypoints], record: Keypoints) -> list[Person]:
+def people_before(rig: Rig, keypoints: Sequence[Keypoints], record: Keypoints) -> list[PersonTrack]:
     """Everybody whom one camera sees for a second, the one of whom most is seen first.
 
     Each column of the record is a person: the built-in detector keeps them apart. Places are those of people of the
@@ -42,7 +42,7 @@ def people_before(rig: Rig, keypoints: Sequence[Keypoints], record: Keypoints) -
         speed, size = _speed(x, record.rate), np.nanmean(np.ptp(record.points[seen, column, :, 1], axis=1))
         place = np.nanmedian(x[seen].mean(axis=1), axis=0)
         each = tuple(chosen if k is record else np.full(frames, -1) for k in keypoints)
-        people.append(Person(each, seen.astype(int), float(surety[:, column].sum()), speed, float(size), place))
+        people.append(PersonTrack(each, seen.astype(int), float(surety[:, column].sum()), speed, float(size), place))
     return sorted(people, key=lambda one: -one.surety)
 
 

@@ -20,7 +20,7 @@ from kinefit.multiview.association import SPEED, STRIDE, Node, groups_of, links_
 from kinefit.multiview.boxes import once, same_people
 from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
-from kinefit.multiview.returns import BRIEF, Chain, Return, Span, chains_of
+from kinefit.multiview.returns import BRIEF, Chain, PresenceSpan, Return, chains_of
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import mirror_name
 from kinefit.solvers.assignment import assign
@@ -35,7 +35,7 @@ STEP = 0.2  # [s] over which speeds are taken: in less, detectors' noise is as l
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class PersonTrack:
     """One of the people in view.
 
     Parameters
@@ -82,7 +82,7 @@ def lasting(rate: float, frames: int) -> float:
     return min(_LASTING * rate, 0.5 * frames)
 
 
-def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | None = None) -> list[Person]:
+def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | None = None) -> list[PersonTrack]:
     """Everybody whom enough cameras see for a second, the one of whom most is seen first.
 
     Parameters
@@ -102,8 +102,8 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | Non
     for f in reversed(range(search.frames)):
         search.backward(f)
     needed, long = search.needed, lasting(keypoints[0].rate, search.frames)
-    spans = [Span(t.nodes, t.path) for t in search.tracks]
-    people: list[tuple[Person, Chain]] = []
+    spans = [PresenceSpan(t.nodes, t.path) for t in search.tracks]
+    people: list[tuple[PersonTrack, Chain]] = []
     for chain in chains_of(rig, search.keypoints, spans, needed, pictures):
         views = np.zeros(search.frames, int)
         chosen = [np.full(search.frames, -1) for _ in keypoints]
@@ -129,7 +129,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | Non
 
 
 @dataclass(eq=False)
-class _Track:
+class _OpenTrack:
     """One person while the search goes on."""
 
     x: NDArray  # (k, 3) [m] last known points
@@ -170,7 +170,7 @@ class _Search:
         self.rate = keypoints[0].rate
         self.surety = [once(k, surety_of(k, self.frames)) for k in keypoints]
         self.cameras = [rig[k.camera] for k in keypoints]
-        self.tracks: list[_Track] = []
+        self.tracks: list[_OpenTrack] = []
         self.needed = views_needed(len({k.camera for k in keypoints}))
         names = keypoints[0].names
         some = some_points(len(names))
@@ -201,7 +201,7 @@ class _Search:
         for k, (nodes, x) in enumerate(came):
             track = back.get(k)
             if track is None:
-                track = _Track(x, np.zeros_like(x), frame, frame, frame)
+                track = _OpenTrack(x, np.zeros_like(x), frame, frame, frame)
                 self.tracks.append(track)
             else:
                 track.x, track.v, track.last = x, np.zeros_like(x), frame
@@ -238,7 +238,7 @@ class _Search:
         early = [t for t in self.tracks if t.born > frame and t.last - frame <= self.rate]
         self._go_on(frame, early)
 
-    def _go_on(self, frame: int, tracks: Sequence[_Track]) -> None:
+    def _go_on(self, frame: int, tracks: Sequence[_OpenTrack]) -> None:
         """Pair people with detections, camera by camera."""
         free, views, sides = self.free(frame), [list[Node]() for _ in tracks], set[Node]()
         expected = [t.expected(frame) for t in tracks]
@@ -302,7 +302,7 @@ class _Search:
         """Whether somebody stands at these very points: a second detection of one person is no other."""
         return any(_apart(t.x, x) < _SAME for t in self.tracks if frame in t.nodes)
 
-    def person(self, chain: Chain, chosen: list[NDArray], views: NDArray) -> Person:
+    def person(self, chain: Chain, chosen: list[NDArray], views: NDArray) -> PersonTrack:
         """What is told of a person."""
         step = max(round(STEP * self.rate), 1)
         nodes, path = chain.span.nodes, chain.span.path
@@ -313,7 +313,7 @@ class _Search:
         sure = sum(float(self.surety[q][f, p]) for f, each in nodes.items() for q, p in each)
         place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
-        return Person(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place, chain.returns)
+        return PersonTrack(tuple(chosen), views, sure, speed, float(np.mean(sizes)), place, chain.returns)
 
 
 def _seen(record: Keypoints, columns: Sequence[int] | NDArray) -> NDArray:

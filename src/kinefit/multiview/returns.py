@@ -31,7 +31,7 @@ _ANYWHERE = 0.5  # share of those who come back elsewhere, by another door
 
 
 @dataclass(frozen=True, eq=False)
-class Span:
+class PresenceSpan:
     """Somebody from one absence to the next.
 
     Parameters
@@ -79,14 +79,14 @@ class Chain:
     maybe : numbers of other spans before the first one that may be of the same person
     """
 
-    span: Span
+    span: PresenceSpan
     members: tuple[int, ...]
     returns: tuple[Return, ...] = ()
     maybe: tuple[int, ...] = ()
 
 
 def chains_of(
-    rig: Rig, keypoints: Sequence[Keypoints], spans: Sequence[Span], needed: int, pictures: Pictures | None
+    rig: Rig, keypoints: Sequence[Keypoints], spans: Sequence[PresenceSpan], needed: int, pictures: Pictures | None
 ) -> list[Chain]:
     """Spans of one person together.
 
@@ -140,7 +140,7 @@ def chains_of(
     return out
 
 
-def _parted(spans: Sequence[Span], needed: int, rate: float) -> list[Span]:
+def _parted(spans: Sequence[PresenceSpan], needed: int, rate: float) -> list[PresenceSpan]:
     """Spans of which one may go on with another, without what one or two views took for them beside the other.
 
     Who is gone is followed on by single views of things and of others' second detections, and found so before having
@@ -165,9 +165,9 @@ def _parted(spans: Sequence[Span], needed: int, rate: float) -> list[Span]:
     return out
 
 
-def _within(span: Span, first: float, end: float) -> Span:
+def _within(span: PresenceSpan, first: float, end: float) -> PresenceSpan:
     """What of a span lies in frames from `first` to before `end`."""
-    return Span(
+    return PresenceSpan(
         {f: v for f, v in span.nodes.items() if first <= f < end},
         {f: x for f, x in span.path.items() if first <= f < end},
     )
@@ -181,20 +181,20 @@ def _paired(odds: NDArray) -> list[tuple[int, int]]:
     return [(int(rows[i]), int(columns[j])) for i, j in assign(cost, 0.0)] if len(rows) else []
 
 
-def _in_reach(a: Span, b: Span, rate: float) -> bool:
+def _in_reach(a: PresenceSpan, b: PresenceSpan, rate: float) -> bool:
     """Whether somebody could have gone from the end of one span to the beginning of another."""
     apart, waited = _between(a, b, rate)
     return apart <= STRIDE + SPEED * waited
 
 
-def _between(a: Span, b: Span, rate: float) -> tuple[float, float]:
+def _between(a: PresenceSpan, b: PresenceSpan, rate: float) -> tuple[float, float]:
     """[m] and [s] from the end of one span to the beginning of another."""
     left, came = a.ends[1], b.ends[0]
     x, y = (medians(points.T) for points in (a.path[left], b.path[came]))
     return float(np.linalg.norm(y - x)), (came - left) / rate
 
 
-def _way(a: Span, b: Span, rate: float) -> float:
+def _way(a: PresenceSpan, b: PresenceSpan, rate: float) -> float:
     """Logarithm of how much likelier a way is for one who comes back than for another, who comes anywhere."""
     apart, waited = _between(a, b, rate)
     std = _WAY[0] + _WAY[1] * waited
@@ -202,14 +202,14 @@ def _way(a: Span, b: Span, rate: float) -> float:
     return float(np.log(_ANYWHERE + (1.0 - _ANYWHERE) * near))
 
 
-def _looks(rig: Rig, keypoints: Sequence[Keypoints], span: Span, pictures: Pictures | None) -> Looks:
+def _looks(rig: Rig, keypoints: Sequence[Keypoints], span: PresenceSpan, pictures: Pictures | None) -> Looks:
     views = {f: nodes for f, nodes in span.nodes.items() if len(nodes) > 1}
     looks = bones_of(rig, keypoints, views)
     return looks if pictures is None else replace(looks, colours=colours_of(keypoints, views, pictures))
 
 
-def _joined(a: Span, b: Span, back: Return) -> Span:
+def _joined(a: PresenceSpan, b: PresenceSpan, back: Return) -> PresenceSpan:
     """Both spans; what one camera alone saw of the one while the other was in view is left out."""
     nodes = {f: v for f, v in b.nodes.items() if f > back.left} | {f: v for f, v in a.nodes.items() if f < back.came}
     path = {f: x for f, x in b.path.items() if f > back.left} | {f: x for f, x in a.path.items() if f < back.came}
-    return Span(nodes, path)
+    return PresenceSpan(nodes, path)

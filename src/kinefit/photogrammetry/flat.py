@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.surface import Surface, refuse_repeated, refuse_untextured
+from kinefit.photogrammetry.surface import MeasuredSurface, refuse_repeated, refuse_untextured
 from kinefit.photogrammetry.unaided import grow_over_time
 
 _EXACT = 1e-6  # [px²] of the places in the first image, which define the points
@@ -26,7 +26,7 @@ def measure_flat(
     window: int | ArrayLike = WINDOW,
     least: float = LEAST_CORRELATION,
     incremental: bool = False,
-) -> list[Surface]:
+) -> list[MeasuredSurface]:
     """Places of a flat surface's points in several states, from one camera whose axis is at right angles to it.
 
     Distance and lens must stay as they are: a motion towards the camera by a thousandth of the distance looks like a
@@ -73,7 +73,7 @@ def measure_flat(
     return out
 
 
-def _surface(grid: Grid, found: Matches | None, pixel: float) -> Surface:
+def _surface(grid: Grid, found: Matches | None, pixel: float) -> MeasuredSurface:
     """Of the first image, or of the matches in a later one."""
     uv: NDArray = grid.points if found is None else found.uv
     exact = np.where(grid.inside[:, None, None], _EXACT * np.eye(2), np.nan)
@@ -82,7 +82,7 @@ def _surface(grid: Grid, found: Matches | None, pixel: float) -> Surface:
     covariance[:, :2, :2] = turned @ (exact if found is None else found.covariance) @ turned
     x = np.column_stack([uv @ turned, np.where(np.isfinite(uv[:, 0]), 0.0, np.nan)])
     correlation = np.where(grid.inside, 1.0, np.nan) if found is None else found.correlation
-    return Surface(
+    return MeasuredSurface(
         grid, ("image",), x, covariance, uv[:, None], correlation, np.where(np.isfinite(correlation), 0.0, np.nan),
         np.zeros((len(uv), 0, 2, 2)),
     )  # fmt: skip

@@ -15,7 +15,7 @@ from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.strain import Strain, grid_step, strain
-from kinefit.photogrammetry.surface import Surface, check_images, from_matches, measure
+from kinefit.photogrammetry.surface import MeasuredSurface, check_images, from_matches, measure
 from kinefit.photogrammetry.unaided import grow_between, grow_over_time, grow_through
 
 Progress = Callable[[str, int, int], None]
@@ -32,7 +32,7 @@ def measure_states(
     constrained: bool | None = None,
     incremental: bool = False,
     progress: Progress | None = None,
-) -> list[Surface]:
+) -> list[MeasuredSurface]:
     """Measure the same points of a surface in each of several states.
 
     Parameters
@@ -76,7 +76,7 @@ def measure_states(
     return out
 
 
-def surface_strain(reference: Surface, state: Surface, gauge: float, window: int = 0) -> Strain:
+def surface_strain(reference: MeasuredSurface, state: MeasuredSurface, gauge: float, window: int = 0) -> Strain:
     """Strain from one state of a surface to another.
 
     Parameters

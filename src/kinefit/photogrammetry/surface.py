@@ -28,7 +28,7 @@ _LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration lea
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class MeasuredSurface:
     """A measured surface.
 
     Parameters
@@ -103,7 +103,7 @@ def measure(
     window: int | ArrayLike = WINDOW,
     least: float = LEAST_CORRELATION,
     constrained: bool | None = None,
-) -> Surface:
+) -> MeasuredSurface:
     """Measure a surface that two or more cameras see at one time.
 
     Parameters
@@ -181,7 +181,7 @@ def refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, pla
         raise ObservationError(problem, place=place, remedy="Give seeds by hand: they say where; or another texture.")
 
 
-def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> Surface:
+def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> MeasuredSurface:
     """Intersect matches of a grid; those whose parallax is far from the others' are left out.
 
     Parameters
@@ -200,7 +200,7 @@ def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Mat
     gap = told.parallax
     good = gap <= largest_parallax(gap)
     keep = good[:, None, None]
-    return Surface(
+    return MeasuredSurface(
         grid, rig.names, np.where(keep[..., 0], told.x_world, np.nan), np.where(keep, told.covariance, np.nan),
         np.where(keep, uv, np.nan), np.where(good, correlation, np.nan), np.where(good, gap, np.nan),
         np.stack([m.deformation for m in others], axis=1),
@@ -219,12 +219,12 @@ def largest_parallax(gaps: NDArray) -> float:
 def match_rays(
     rig: Rig,
     images: Sequence[SplineImage],
-    surface: Surface,
+    surface: MeasuredSurface,
     found: Sequence[Matches],
     *,
     window: int | ArrayLike = WINDOW,
     least: float = LEAST_CORRELATION,
-) -> Surface:
+) -> MeasuredSurface:
     """Match all images of a surface at once along the first camera's rays, from where it was measured.
 
     Parameters
@@ -241,7 +241,7 @@ def match_rays(
     uv = np.stack([at, *(camera.project(told.x_world) for camera in rig.cameras[1:])], axis=1)
     uv[:, 1:][~told.used] = np.nan
     keep = good[:, None]
-    return Surface(
+    return MeasuredSurface(
         surface.grid, rig.names, np.where(keep, told.x_world, np.nan),
         np.where(keep[..., None], covariance + across, np.nan), np.where(keep[..., None], uv, np.nan),
         np.where(good, told.correlation, np.nan), np.where(good, told.parallax, np.nan), surface.deformation,

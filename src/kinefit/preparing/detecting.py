@@ -40,7 +40,7 @@ _ENDS = 2**20  # [bytes] of a video's begin and end by which it is recognised
 
 
 @dataclass(frozen=True)
-class Job:
+class DetectionJob:
     """One video to look through.
 
     Parameters
@@ -61,12 +61,12 @@ class Job:
     seconds: tuple[float, float] | None = None
 
 
-def jobs_of_take(take: Take) -> list[Job]:
+def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.detections import detections_file
 
     found = [
-        Job(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c))
+        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c))
         for c in take.cameras if c.video is not None
     ]  # fmt: skip
     if not found:
@@ -92,9 +92,9 @@ def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
 
 
 def detect(
-    jobs: Sequence[Job], *, people: int | None = None, masks: bool | None = None, force: bool = False,
+    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, force: bool = False,
     progress: Step | None = None, tell: Tell,
-) -> list[Job]:
+) -> list[DetectionJob]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
@@ -121,7 +121,7 @@ def detect(
 
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
-    def work(job: Job) -> None:
+    def work(job: DetectionJob) -> None:
         key = f"{keys[job]} {_settings(number, outlines, job.seconds)}"
         _look_through(job, folder, number, outlines, key, step, threads)
 
@@ -143,7 +143,7 @@ def detect(
     return todo
 
 
-def _from_beside(job: Job, key: str, people: int | None, masks: bool | None) -> None:
+def _from_beside(job: DetectionJob, key: str, people: int | None, masks: bool | None) -> None:
     """Copy what another take of the same folder found in the same video already."""
     from kinefit.exporters.atomic import writing
     from kinefit.readers.detections import detections_key
@@ -162,7 +162,13 @@ class _Stopped(Exception):
 
 
 def _look_through(
-    job: Job, folder: Path, people: int, masks: bool, key: str, tell: Callable[[str, int, int], None], threads: int
+    job: DetectionJob,
+    folder: Path,
+    people: int,
+    masks: bool,
+    key: str,
+    tell: Callable[[str, int, int], None],
+    threads: int,
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detection import detect_people
@@ -207,7 +213,7 @@ def networks(progress: Step | None, tell: Tell) -> Path:
     return detector_models(told)
 
 
-def _video_key(job: Job) -> str:
+def _video_key(job: DetectionJob) -> str:
     """Text that another video, or another detector, does not have."""
     from kinefit.assets import MODELS_PACKAGE
     from kinefit.errors import FileError

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from kinefit.errors import ObservationError
-from kinefit.preparing.detecting import Job, Step, Tell, detect, jobs_of_take
+from kinefit.preparing.detecting import DetectionJob, Step, Tell, detect, jobs_of_take
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
@@ -102,7 +102,7 @@ def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:
     return msgspec.structs.replace(entry, file=detections_file(take.path, entry.camera))
 
 
-def somebody(jobs: Sequence[Job], tell: Tell = warn) -> dict[str, Path]:
+def somebody(jobs: Sequence[DetectionJob], tell: Tell = warn) -> dict[str, Path]:
     """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
     empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
     remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."

@@ -53,15 +53,15 @@ def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
     return KEYPOINT_SETS[keypoint_set]
 
 
-class _Person(msgspec.Struct):
+class _OpenPosePerson(msgspec.Struct):
     pose_keypoints_2d: list[float]
 
 
 class _OpenPoseFrame(msgspec.Struct):
-    people: list[_Person]
+    people: list[_OpenPosePerson]
 
 
-_decode = msgspec.json.Decoder(_OpenPoseFrame).decode
+decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
 
 
 @checked
@@ -299,7 +299,7 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     """(P, K, 3): x, y, confidence of all people of one frame."""
     raw = path.read_bytes()
     try:
-        people = _decode(raw).people
+        people = decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"

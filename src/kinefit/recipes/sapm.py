@@ -21,7 +21,7 @@ CORRECTIONS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class SapmProblem:
     """A model and a frame.
 
     Parameters
@@ -60,7 +60,7 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
     at = np.asarray(points, float)
     if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
         raise ObservationError(f"points of shape {at.shape}, or not finite", remedy="Give (N, 3) [m] without gaps.")
-    subject = Subject(model, at, epsilon, beta)
+    subject = SapmProblem(model, at, epsilon, beta)
     size = [len(m) for m in model.segments]
     root = max(range(len(size)), key=lambda s: (size[s], sum(s in (j.parent, j.child) for j in model.joints)))
     found, broken = identify_below(subject, root, -1, np.full(len(model), -1))
@@ -71,7 +71,7 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
 
 
 def identify_below(
-    subject: Subject, s: int, parent: int, found: NDArray, alone: bool = False
+    subject: SapmProblem, s: int, parent: int, found: NDArray, alone: bool = False
 ) -> tuple[NDArray, list[int]]:
     """A segment and all below it, depth first; what was found, and the segments of chains that broke (P5 3.2).
 
@@ -94,7 +94,7 @@ def identify_below(
     return (best, best_broken) if most >= 0 else (found, [] if alone else below(subject, s, parent))
 
 
-def below(subject: Subject, s: int, parent: int) -> list[int]:
+def below(subject: SapmProblem, s: int, parent: int) -> list[int]:
     """A segment and all that hang on it, seen from its parent, nearest first."""
     found, above = [s], {parent}
     for a in found:
@@ -104,7 +104,7 @@ def below(subject: Subject, s: int, parent: int) -> list[int]:
     return found
 
 
-def segment_matches(subject: Subject, s: int, parent: int, found: NDArray) -> Iterator[NDArray]:
+def segment_matches(subject: SapmProblem, s: int, parent: int, found: NDArray) -> Iterator[NDArray]:
     """(k,) each: matches of a segment that hold (2) and (3), from its tables in order of priority (P5 Fig. 1)."""
     x, epsilon, points = subject.places(s), subject.epsilon, subject.points
     length, count = mean_distance(x), len(x)
@@ -127,7 +127,7 @@ def segment_matches(subject: Subject, s: int, parent: int, found: NDArray) -> It
                     yield match
 
 
-def pivots(subject: Subject, s: int, parent: int, found: NDArray, free: NDArray) -> Iterator[tuple]:
+def pivots(subject: SapmProblem, s: int, parent: int, found: NDArray, free: NDArray) -> Iterator[tuple]:
     """Candidate tables of a segment, for one pivot after the other: its joint if known, seen or virtual; else any."""
     x, points, epsilon = subject.places(s), subject.points, subject.epsilon
     known = found[subject.markers(s)]

@@ -78,7 +78,7 @@ class Settings:
     steps: tuple[int, int] = (0, 15)
 
 
-class Fit(NamedTuple):
+class LimbFit(NamedTuple):
     """One frame: frames (S, 12) of the limbs, the mean squared distance [m²] left, and the steps that were done."""
 
     frames: NDArray
@@ -88,7 +88,7 @@ class Fit(NamedTuple):
 
 def voodoo(
     stream: Iterable[Sequence[Frame]], body: Body, start: BodyState, rig: Rig, settings: Settings | None = None
-) -> Iterator[Fit]:
+) -> Iterator[LimbFit]:
     """Track a body from frame to frame; each starts where the one before ended.
 
     Parameters
@@ -107,7 +107,7 @@ def voodoo(
         yield fit
 
 
-def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> Fit:
+def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> LimbFit:
     """Steps 1 to 7, until the quality is met, ICP gains no more, or the steps are spent (P2 3.2 and 4.2, fig. 3)."""
     sight = near_body(sight, boxes, frames, s.body_box + _MOST, s.floor, s.clear)
     (least, most), step, before = s.steps, 0, np.inf
@@ -116,7 +116,7 @@ def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, ba
         own, other = motion.band_weights(bands, measured, s.band, s.minimum if s.band_rule == "points" else None)
         now = steps.quality(steps.joined(measured, *motion.band_pairs(bands, ends, own, other)))
         if step == most or (step >= least and (now <= s.quality or (s.stop is not None and before - now < s.stop))):
-            return Fit(frames, now, step)
+            return LimbFit(frames, now, step)
         moved = motion.moved_down if s.down else motion.moved
         frames = moved(body, frames, measured, bands, ends, own, other, s.stay)
         measured, ends = _measured(body, frames, sight, boxes, s), motion.band_ends(body, frames, bands)

@@ -24,7 +24,7 @@ from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.triangulation import triangulated_frame
+from kinefit.sensors.triangulation import rays, triangulated_frame
 from kinefit.sensors.view_bias import beside, trunks
 
 NAME = "keypoints"
@@ -214,11 +214,7 @@ class KeypointMeasurement(Measurement):
         """Points on which two cameras agree, and a ray of each point from a camera that sees it."""
         channels = self.layout.channels.with_points(scene.body)
         x, _ = triangulated_frame(channels, self.uv, self.confidence)
-        rays = np.full((len(channels.points), 2, 3), np.nan)
-        for number in np.unique(channels.camera[self.weight > 0]):
-            camera, own = channels.rig.cameras[number], (channels.camera == number) & (self.weight > 0)
-            rays[channels.column[own], 0], rays[channels.column[own], 1] = camera.centre_world, camera.ray(self.uv[own])
-        return Hints(channels.points, x, rays)
+        return Hints(channels.points, x, rays(channels, self.uv, self.weight > 0))
 
 
 @dataclass(frozen=True, eq=False)

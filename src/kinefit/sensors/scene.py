@@ -15,7 +15,7 @@ from kinefit.correspondences import targets
 from kinefit.correspondences.morphed import on_moved_joints
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import DofRows, Rows
-from kinefit.sensors.surface import Surface
+from kinefit.sensors.surface import TrackedSurface
 
 if TYPE_CHECKING:
     from kinefit.sensors.base import Measurement
@@ -40,7 +40,7 @@ class Scene:
     values : {sensor: {name: value}}, optional
         What is thought of a sensor's own unknowns, such as the length of a rope.
     measurements : what all sensors measured at this time, for those that ask each other
-    surface : Surface of the body, made when it is first needed
+    surface : TrackedSurface of the body, made when it is first needed
     others : scenes of other bodies at the same time
     covariance : (6 + D, 6 + D) [m, rad], optional
         Of the state, where a fit gave it.
@@ -49,7 +49,7 @@ class Scene:
     def __init__(
         self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
         values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
-        surface: Surface | None = None, others: Sequence[Scene] = (), samples: int = SAMPLES,
+        surface: TrackedSurface | None = None, others: Sequence[Scene] = (), samples: int = SAMPLES,
         covariance: NDArray | None = None,
     ) -> None:  # fmt: skip
         self.covariance = covariance
@@ -94,7 +94,7 @@ class Scene:
         return camera if np.array_equal(there.T_camera_world, camera.T_camera_world) else _placed(camera, there)
 
     @property
-    def surface(self) -> Surface:
+    def surface(self) -> TrackedSurface:
         """The body's surface, with room to draw it.
 
         Raises
@@ -103,7 +103,7 @@ class Scene:
             A body without surfaces.
         """
         if "surface" not in self._shared:
-            self._shared["surface"] = Surface(self.body, self._samples)
+            self._shared["surface"] = TrackedSurface(self.body, self._samples)
         return self._shared["surface"]
 
     @property

@@ -21,7 +21,7 @@ from kinefit.sensors.visibility import Layers
 _COLUMNS = 160  # of the image in which the body's own hidden parts are found: a forearm at 3 m is four pixels wide
 
 
-class Surface:
+class TrackedSurface:
     """A body's surface, for one tracker at a time.
 
     Parameters

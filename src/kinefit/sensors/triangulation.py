@@ -42,6 +42,18 @@ def triangulated_frame(
     return best, swapped
 
 
+def rays(channels: Channels, uv: NDArray, seen: NDArray) -> NDArray:
+    """(K, 2, 3) origin [m] and direction in the world of a ray on which each point of one frame lies; NaN where unseen.
+
+    Of several cameras that see a point, the last.
+    """
+    out = np.full((len(channels.points), 2, 3), np.nan)
+    for number in np.unique(channels.camera[seen]):
+        camera, own = channels.rig.cameras[number], seen & (channels.camera == number)
+        out[channels.column[own], 0], out[channels.column[own], 1] = camera.centre_world, camera.ray(uv[own])
+    return out
+
+
 def _agreed(
     channels: Channels, uv: NDArray, confidence: NDArray, swapped: NDArray, limit: float
 ) -> tuple[NDArray, float]:

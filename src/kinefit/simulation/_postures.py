@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, eq=False)
-class Posture:
+class PostureSequence:
     """Joint angles and the trunk's turn over time.
 
     Parameters
@@ -50,10 +50,10 @@ def _standing(**changed: ArrayLike) -> dict[str, ArrayLike]:
     return out | changed
 
 
-def point(u: NDArray) -> Posture:
+def point(u: NDArray) -> PostureSequence:
     """The right arm points ahead, then sweeps outward and back."""
     b, sweep = _held(u), _ease(u, 0.35, 0.5) * (1.0 - _ease(u, 0.5, 0.68))
-    return Posture(
+    return PostureSequence(
         _standing(
             arm_flex_r=78 * b - 10 * sweep, arm_add_r=-9 - 5 * b - 45 * sweep, elbow_flex_r=14 - 8 * b,
             neck_rotation=-15 * b - 20 * sweep,
@@ -62,7 +62,7 @@ def point(u: NDArray) -> Posture:
     )  # fmt: skip
 
 
-def walk(u: NDArray) -> Posture:
+def walk(u: NDArray) -> PostureSequence:
     """Two and a half strides towards where the person looks."""
     go = _ease(u, 0.0, 0.15) * (1.0 - _ease(u, 0.85, 1.0))
     phase = 2.0 * np.pi * 2.5 * u
@@ -73,14 +73,14 @@ def walk(u: NDArray) -> Posture:
         degrees[f"knee_angle_{side}"] = go * (6 + 45 * swing)
         degrees[f"ankle_angle_{side}"] = go * 5 * swing
         degrees[f"elbow_flex_{side}"] = 14 + go * (10 - sign * 8 * np.sin(phase))
-    return Posture(degrees, lean=3 * go, heading=4 * go * np.sin(phase))
+    return PostureSequence(degrees, lean=3 * go, heading=4 * go * np.sin(phase))
 
 
-def wave(u: NDArray) -> Posture:
+def wave(u: NDArray) -> PostureSequence:
     """The right hand, raised beside the head, waves four times."""
     b = _held(u, 0.25, 0.75)
     swing = b * _swings(u - 0.25, 8.0) * _ease(u, 0.2, 0.3) * (1.0 - _ease(u, 0.7, 0.8))
-    return Posture(
+    return PostureSequence(
         _standing(
             arm_flex_r=15 * b, arm_add_r=-9 - 66 * b, arm_rot_r=-75 * b, elbow_flex_r=14 + 66 * b + 28 * swing,
             pro_sup_r=80 - 60 * b, neck_bending=4 * swing,
@@ -88,24 +88,24 @@ def wave(u: NDArray) -> Posture:
     )  # fmt: skip
 
 
-def shake_hands(u: NDArray) -> Posture:
+def shake_hands(u: NDArray) -> PostureSequence:
     """The right hand is held out and shaken up and down three times."""
     b = _held(u)
     shake = _swings(u - 0.3, 7.5) * _ease(u, 0.28, 0.38) * (1.0 - _ease(u, 0.62, 0.72))
-    return Posture(
+    return PostureSequence(
         _standing(arm_flex_r=30 * b + 8 * shake, elbow_flex_r=14 + 40 * b + 10 * shake, neck_extension=-4 * b),
         lean=6 * b, heading=5 * b,
     )  # fmt: skip
 
 
-def bow(u: NDArray) -> Posture:
+def bow(u: NDArray) -> PostureSequence:
     """A deep bow from the hips."""
     b = _held(u, 0.42, 0.58)
     arms = {f"arm_flex_{side}": 18 * b for side in "lr"} | {f"hip_flexion_{side}": 55 * b for side in "lr"}
-    return Posture(_standing(neck_extension=-10 * b, lumbar_extension=-8 * b, **arms), lean=55 * b)
+    return PostureSequence(_standing(neck_extension=-10 * b, lumbar_extension=-8 * b, **arms), lean=55 * b)
 
 
-def clap(u: NDArray) -> Posture:
+def clap(u: NDArray) -> PostureSequence:
     """Both hands clap five times before the chest."""
     b = _held(u, 0.25, 0.75)
     apart = 0.5 - 0.5 * np.cos(2.0 * np.pi * 10.0 * (u - 0.25) * (u > 0.25) * (u < 0.75))
@@ -115,23 +115,23 @@ def clap(u: NDArray) -> Posture:
             f"arm_flex_{side}": 36 * b, f"arm_add_{side}": -9 * (1 - b) - 6 * b,
             f"arm_rot_{side}": b * (38 - 30 * apart), f"elbow_flex_{side}": 14 + 66 * b,
         }  # fmt: skip
-    return Posture(_standing(**arms))
+    return PostureSequence(_standing(**arms))
 
 
-def sit_down(u: NDArray) -> Posture:
+def sit_down(u: NDArray) -> PostureSequence:
     """Down onto a seat that is not there, and up again."""
     b = _held(u, 0.42, 0.62)
     bent = 4.0 * b * (1.0 - b)
     legs = {f"hip_flexion_{side}": 86 * b + 25 * bent for side in "lr"}
     legs |= {f"knee_angle_{side}": 88 * b for side in "lr"} | {f"hip_adduction_{side}": -3 - 5 * b for side in "lr"}
     legs |= {f"arm_flex_{side}": 30 * b for side in "lr"} | {f"elbow_flex_{side}": 14 + 40 * b for side in "lr"}
-    return Posture(_standing(**legs), lean=8 * b + 25 * bent)
+    return PostureSequence(_standing(**legs), lean=8 * b + 25 * bent)
 
 
-def kick(u: NDArray) -> Posture:
+def kick(u: NDArray) -> PostureSequence:
     """The right leg swings back and kicks ahead."""
     back, kicked = _ease(u, 0.05, 0.35) * (1 - _ease(u, 0.38, 0.5)), _ease(u, 0.38, 0.55) * (1 - _ease(u, 0.6, 0.95))
-    return Posture(
+    return PostureSequence(
         _standing(
             hip_flexion_r=-10 * back + 54 * kicked, knee_angle_r=50 * back + 8 * kicked, hip_adduction_r=-3 - 2 * back,
             hip_flexion_l=10 * back - 5 * kicked, knee_angle_l=6 * back + 4 * kicked,
@@ -143,16 +143,16 @@ def kick(u: NDArray) -> Posture:
     )  # fmt: skip
 
 
-def squat(u: NDArray) -> Posture:
+def squat(u: NDArray) -> PostureSequence:
     """A squat with the arms held ahead."""
     b = _held(u, 0.45, 0.55)
     legs = {f"hip_flexion_{side}": 92 * b for side in "lr"} | {f"knee_angle_{side}": 96 * b for side in "lr"}
     legs |= {f"hip_adduction_{side}": -3 - 9 * b for side in "lr"} | {f"ankle_angle_{side}": 28 * b for side in "lr"}
     legs |= {f"arm_flex_{side}": 68 * b for side in "lr"}
-    return Posture(_standing(neck_extension=16 * b, **legs), lean=28 * b)
+    return PostureSequence(_standing(neck_extension=16 * b, **legs), lean=28 * b)
 
 
-def arms_at_sensor(u: NDArray) -> Posture:
+def arms_at_sensor(u: NDArray) -> PostureSequence:
     """Both arms are stretched straight ahead, at whoever stands there, and held."""
     b, sway = _held(u, 0.3, 0.75), _swings(u, 3.0)
     arms = {
@@ -160,9 +160,9 @@ def arms_at_sensor(u: NDArray) -> Posture:
         for side in "lr"
         for name, value in (("arm_flex", 88 * b + 4 * b * sway), ("arm_add", -9 + 9 * b), ("elbow_flex", 14 - 12 * b))
     }
-    return Posture(_standing(**arms), lean=2 * b)
+    return PostureSequence(_standing(**arms), lean=2 * b)
 
 
-MOVEMENTS: Mapping[str, Callable[[NDArray], Posture]] = {
+MOVEMENTS: Mapping[str, Callable[[NDArray], PostureSequence]] = {
     f.__name__: f for f in (point, walk, wave, shake_hands, bow, clap, sit_down, kick, squat, arms_at_sensor)
 }

@@ -21,7 +21,7 @@ _THICK = 0.015  # [m] of a foot below the axis of its toes
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class Performer:
     """Who moves, and how fast.
 
     Parameters
@@ -83,7 +83,7 @@ def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: 
     return known_motion(body, rate, Ts_world_root, angles, up="y", name=name)
 
 
-def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple[Person, ...]:
+def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple[Performer, ...]:
     """People of 1.50 to 2.00 m, thin and stout, slow and fast (speeds 0.6 to 1.6), seen from the front and half beside.
 
     Every property runs evenly over its range; who has which is drawn by the seed. Limbs are up to 4 % longer or
@@ -100,7 +100,7 @@ def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple
     out = []
     for stature, girth, speed, azimuth in zip(statures, girths, speeds, azimuths):
         factors = stature / body.stature * random.uniform(0.96, 1.04, len(body.scale_groups))
-        out.append(Person(_stouter(body.scaled(factors), girth), float(speed), float(azimuth)))
+        out.append(Performer(_stouter(body.scaled(factors), girth), float(speed), float(azimuth)))
     return tuple(out)
 
 

@@ -16,7 +16,7 @@ from kinefit.motion import UP_AXES
 from kinefit.rendering import scaled
 from kinefit.simulation.placing import beside
 from kinefit.simulation.room import PARTS
-from kinefit.simulation.scenes import Scene, View
+from kinefit.simulation.scenes import RenderedView, SimulatedScene
 
 SKIN = (130, 160, 210)  # BGR, as all colours here
 _CLOTHES = {
@@ -87,7 +87,13 @@ STEREO = StereoSensor("stereo", (320, 240), 290.0)
 
 
 def picture(
-    scene: Scene, frame: int, camera: Camera, sensor: ColourSensor = COLOUR, *, grey: bool = False, seed: int = 0
+    scene: SimulatedScene,
+    frame: int,
+    camera: Camera,
+    sensor: ColourSensor = COLOUR,
+    *,
+    grey: bool = False,
+    seed: int = 0,
 ) -> NDArray:
     """Picture (H, W, 3) BGR, or (H, W) grey, 8 bit, of one frame of a scene.
 
@@ -117,7 +123,7 @@ def depth_picture(depth: NDArray, near: float, far: float) -> NDArray:
     return out
 
 
-def _shaded(scene: Scene, view: View) -> NDArray:
+def _shaded(scene: SimulatedScene, view: RenderedView) -> NDArray:
     """(H, W, 3) float32 BGR without noise."""
     names = [*map(_worn, scene.motion.body.tree.segments), *PARTS]
     base = np.array([_CLOTHES[name] for name in names] + [_NOTHING], np.float32)
@@ -136,7 +142,7 @@ def _shaded(scene: Scene, view: View) -> NDArray:
     return np.clip(colour * shade[..., None], 0.0, 255.0)
 
 
-def _sleeves(body: Body, view: View) -> list[NDArray]:
+def _sleeves(body: Body, view: RenderedView) -> list[NDArray]:
     """(H, W) bool a forearm: its pixels above the wrist, where the hand is part of the forearm: both would be bare."""
     tree, out = body.tree, []
     for side in "lr":
@@ -155,7 +161,7 @@ def _worn(segment: str) -> str:
     return _WORN.get(part, "shirt")
 
 
-def _hair_and_collar(body: Body, view: View) -> tuple[NDArray, NDArray]:
+def _hair_and_collar(body: Body, view: RenderedView) -> tuple[NDArray, NDArray]:
     """(H, W) bool each, a head's pixels above its brow or behind its ears, and those below its chin.
 
     Where the neck is part of the head: heads with a neck of their own are skin all over.

@@ -25,7 +25,7 @@ from kinefit.simulation.keypoints import simulate_keypoints
 from kinefit.simulation.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
 from kinefit.simulation.placing import in_front, places
 from kinefit.simulation.room import room as room_around
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 from kinefit.simulation.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
@@ -45,7 +45,7 @@ Step = Callable[[str, int, int], None]
 class _Job:
     """What there is to write: the scene, one camera for every name, and where to say how far it has come."""
 
-    scene: Scene
+    scene: SimulatedScene
     rig: Rig
     seed: int
     step: Step
@@ -115,11 +115,11 @@ def write_recording(
     if not chosen:
         raise ObservationError("no sensor is named", remedy=f"Name some of: {', '.join(SENSORS)}.")
     cameras = _cameras(motion, chosen, distance, azimuth, height)
-    scene = Scene.of(motion)
+    scene = SimulatedScene.of(motion)
     if room:
         middle = places(motion).mean(axis=0)
         farthest = max(cameras, key=lambda camera: float(np.linalg.norm(camera.centre_world - middle)))
-        scene = Scene(motion, scene.mesh, room_around(motion, farthest))
+        scene = SimulatedScene(motion, scene.mesh, room_around(motion, farthest))
     job = _Job(scene, Rig(tuple(cameras)), seed, step or (lambda what, done, total: None))
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -225,7 +225,7 @@ def _write_keypoints(job: _Job, folder: Path) -> str:
     )
 
 
-def preview(scene: Scene, rig: Rig, *, frame: int | None = None, seed: int = 0) -> NDArray:
+def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: int = 0) -> NDArray:
     """Picture (240, W, 3) BGR of what the sensors of a recording see in one frame, by default the middle one.
 
     Depth as colours: near red, far blue, black where nothing was measured.

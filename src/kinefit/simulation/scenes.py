@@ -16,7 +16,7 @@ from kinefit.simulation.room import Room, room
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RenderedView:
     """One frame of a scene in one camera.
 
     Parameters
@@ -73,7 +73,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class SimulatedScene:
     """A known motion, the triangles of its body, and the room around it.
 
     Parameters
@@ -88,7 +88,7 @@ class Scene:
     room: Room | None = None
 
     @classmethod
-    def of(cls, motion: Motion, camera: Camera | None = None) -> Scene:
+    def of(cls, motion: Motion, camera: Camera | None = None) -> SimulatedScene:
         """Scene of a motion; with a room that `camera` looks into, where one is given."""
         return cls(motion, body_mesh(motion.body), None if camera is None else room(motion, camera))
 
@@ -109,7 +109,7 @@ class Scene:
             parts.append(self.room.parts + len(self.motion.body.tree.segments))
         return np.concatenate(parts)
 
-    def view(self, frame: int, camera: Camera) -> View:
+    def view(self, frame: int, camera: Camera) -> RenderedView:
         """What a camera sees in a frame of the motion, without any error."""
         state = self.motion.state(frame)
         frames, _ = self.motion.body.tree.forward(state.T_world_root, state.angles)
@@ -117,4 +117,4 @@ class Scene:
         if self.room is not None:
             vertices = np.concatenate([vertices, self.room.vertices])
         raster = Canvas(camera.size).draw_for(camera, vertices, self.faces, cull=True, labels=self.labels)
-        return View(raster, camera, vertices, self.faces, frames)
+        return RenderedView(raster, camera, vertices, self.faces, frames)

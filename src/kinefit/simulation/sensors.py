@@ -13,7 +13,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations.depth import DepthVideo
 from kinefit.rendering import scaled
-from kinefit.simulation.scenes import Scene, View
+from kinefit.simulation.scenes import RenderedView, SimulatedScene
 
 _STEP = 0.1  # [m] within 3 x 3 pixels: an edge, for a sensor that matches patterns
 _BRIGHTEST = 0.2  # cosine below which a sensor's noise grows no more
@@ -103,7 +103,13 @@ DEPTH_SENSORS = {sensor.name: sensor for sensor in (TOF, KINECT)}
 
 
 def simulate_depth(
-    motion: Motion, camera: Camera, sensor: DepthSensor, *, room: bool = True, seed: int = 0, scene: Scene | None = None
+    motion: Motion,
+    camera: Camera,
+    sensor: DepthSensor,
+    *,
+    room: bool = True,
+    seed: int = 0,
+    scene: SimulatedScene | None = None,
 ) -> DepthVideo:
     """Depth images that a sensor would have taken of a motion, one for each of its frames.
 
@@ -118,7 +124,7 @@ def simulate_depth(
         Whether floor, walls and a table stand around the body.
     seed : int
         The same seed gives the same errors, in whatever order frames are asked for.
-    scene : Scene, optional
+    scene : SimulatedScene, optional
         Of the motion, where several sensors share one; `room` is then not looked at.
 
     Returns
@@ -126,7 +132,7 @@ def simulate_depth(
     DepthVideo
         Every frame is drawn when it is asked for.
     """
-    scene = scene or Scene.of(motion, camera if room else None)
+    scene = scene or SimulatedScene.of(motion, camera if room else None)
 
     def image(frame: int) -> NDArray:
         return measured_depth(scene, frame, camera, sensor, np.random.default_rng([seed, frame]))
@@ -138,7 +144,7 @@ def simulate_depth(
 
 
 def measured_depth(
-    scene: Scene, frame: int, camera: Camera, sensor: DepthSensor, random: np.random.Generator
+    scene: SimulatedScene, frame: int, camera: Camera, sensor: DepthSensor, random: np.random.Generator
 ) -> NDArray:
     """(H, W) float32 [m] one image of a sensor; 0 where nothing was measured."""
     width, height = camera.size
@@ -163,7 +169,7 @@ def measured_depth(
     return np.where(lost | (z < sensor.near) | (z > sensor.far), 0.0, z).astype(np.float32)
 
 
-def _pixels(view: View, n: int, height: int, width: int) -> tuple[NDArray, NDArray]:
+def _pixels(view: RenderedView, n: int, height: int, width: int) -> tuple[NDArray, NDArray]:
     """Depth (H, W) [m], inf where most of a pixel sees nothing, and cosine (H, W) of its nearest surface's slant."""
     z = view.raster.depth.astype(float)
     if n == 1:
@@ -185,7 +191,7 @@ def _edges(z: NDArray) -> NDArray:
     return cv2.dilate(z, window) - cv2.erode(z, window) > _STEP
 
 
-def _in_shadow(scene: Scene, frame: int, camera: Camera, sensor: DepthSensor, z: NDArray) -> NDArray:
+def _in_shadow(scene: SimulatedScene, frame: int, camera: Camera, sensor: DepthSensor, z: NDArray) -> NDArray:
     """(H, W) bool, points that something hides from the projector."""
     T = np.eye(4)
     T[0, 3] = -sensor.baseline

@@ -12,7 +12,7 @@ from kinefit._arguments import checked
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import scaled
-from kinefit.simulation.scenes import Scene
+from kinefit.simulation.scenes import SimulatedScene
 
 _CELLS = 64  # of the texture's lattice, after which it repeats
 _SAMPLES = 2  # rays along each side of a pixel
@@ -21,7 +21,7 @@ _GREY, _CONTRAST, _GROUND = 120.0, 45.0, 50.0
 
 @checked
 def textured_picture(
-    scene: Scene, frame: int, camera: Camera, *, grain: float = 0.003, noise: float = 2.0, seed: int = 0
+    scene: SimulatedScene, frame: int, camera: Camera, *, grain: float = 0.003, noise: float = 2.0, seed: int = 0
 ) -> NDArray:
     """Image (H, W), 8 bit grey, of one frame of a scene; the texture is a smooth function of the place on the body.
 

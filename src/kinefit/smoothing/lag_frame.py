@@ -50,7 +50,7 @@ class Follows(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class TrackerView:
     """What is asked of a tracker, of one that has done its work."""
 
     body: Body

@@ -83,7 +83,7 @@ def shape_errors(
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
         scene, matched = seen(frame)
-        one = _Frame(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]), scale or {})
+        one = _FrameMatches(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]), scale or {})
         pushed = one.points(step) + one.surfaces(step, settings)
         answer = P @ pushed
         moves = joint_moves(scene.body, scene.state)
@@ -94,7 +94,7 @@ def shape_errors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Frame:
+class _FrameMatches:
     """One frame's matches in the worlds of parameters (p,), of which q are kept: a problem of one frame.
 
     `wide` are those of the q that move more than places of points.

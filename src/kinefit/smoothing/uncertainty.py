@@ -33,7 +33,7 @@ from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
-from kinefit.solvers.whitened import Pose, columns
+from kinefit.solvers.whitened import PoseScrews, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves
@@ -213,7 +213,7 @@ def lasting(
         np.zeros((len(weight), 2)), np.ascontiguousarray(weight),
     )  # fmt: skip
     frames, _ = tree.forward(state.T_world_root, state.angles)
-    by_pose, Sigma = columns(rows, Pose.of(body, state)), known.covariance
+    by_pose, Sigma = columns(rows, PoseScrews.of(body, state)), known.covariance
     by_shape, stretch = known.columns(layout, rows, tree, frames)
     by_pose, by_shape = (shared.whitened(one, weight, rows.group) for one in (by_pose, by_shape))
     if body.closures:

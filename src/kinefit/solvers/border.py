@@ -21,8 +21,8 @@ from kinefit.solvers import _kernels_linear
 from kinefit.solvers.border_frames import (
     POSTURE,
     SETTLING,
-    Frame,
-    Problem,
+    BorderedProblem,
+    FrameEquations,
     Weighing,
     differences,
     gram,
@@ -86,7 +86,7 @@ class Bordered:
 class _Block:
     """One frame's part of the arrow."""
 
-    frame: Frame
+    frame: FrameEquations
     by_theta: NDArray  # (N, p) whitened, as it was found
     felt: NDArray  # (N,) bool
     B: NDArray  # (n, p)
@@ -95,7 +95,7 @@ class _Block:
 
 
 def solve(
-    problem: Problem,
+    problem: BorderedProblem,
     theta: NDArray,
     states: Sequence[BodyState],
     prior: Prior,
@@ -112,7 +112,7 @@ def solve(
 
     Parameters
     ----------
-    problem : Problem
+    problem : BorderedProblem
     theta : (p,) to start from.
     states : K, to start from; limits of joints hold.
     prior : Prior
@@ -170,7 +170,7 @@ def solve(
 class _Task:
     """A problem with all that weighs it."""
 
-    problem: Problem
+    problem: BorderedProblem
     prior: Prior
     steps: NDArray
     weighing: Weighing
@@ -180,13 +180,17 @@ class _Task:
         """Damping of poses in steps with θ: angles that hardly anything holds settle by themselves."""
         return _LEAST * self.weighing.most
 
-    def cost(self, theta: NDArray, frames: Sequence[Frame]) -> float:
+    def cost(self, theta: NDArray, frames: Sequence[FrameEquations]) -> float:
         """Of rows, postures and prior."""
         away = theta - self.prior.mean
         return float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
 
     def blocks(
-        self, theta: NDArray, states: Sequence[BodyState], frames: Sequence[Frame], near: Sequence[_Block] | None
+        self,
+        theta: NDArray,
+        states: Sequence[BodyState],
+        frames: Sequence[FrameEquations],
+        near: Sequence[_Block] | None,
     ) -> list[_Block]:
         """The frames' parts of the arrow, with the derivatives by θ of `near` blocks where those will do."""
         felt = [frame.felt for frame in frames]

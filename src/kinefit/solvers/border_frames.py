@@ -16,7 +16,7 @@ from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.equations import dense_pattern, lock, normal_equations
-from kinefit.solvers.whitened import Pose, columns, residuals, softening
+from kinefit.solvers.whitened import PoseScrews, columns, residuals, softening
 
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
@@ -32,7 +32,7 @@ Part = tuple[str, AnyRows]
 """Rows, and the name of the sensor that made them."""
 
 
-class Problem(Protocol):
+class BorderedProblem(Protocol):
     """What the parameters and the frames are.
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
@@ -71,7 +71,7 @@ class Weighing:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class FrameEquations:
     """One frame's rows and the equations of its pose.
 
     Parameters
@@ -101,7 +101,7 @@ class Frame:
     @cached_property
     def J(self) -> NDArray:
         """(N, n) derivatives by the pose, whitened and softened."""
-        pose = Pose.of(self.body, self.state)
+        pose = PoseScrews.of(self.body, self.state)
         every = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
         return np.asarray(self.factor[:, None] * np.concatenate(every))
 
@@ -138,7 +138,9 @@ class Frame:
         return move, float(fall)
 
 
-def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, weighing: Weighing) -> Frame:
+def frame_at(
+    problem: BorderedProblem, theta: NDArray, frame: int, state: BodyState, weighing: Weighing
+) -> FrameEquations:
     """A frame's rows and equations at parameters (p,) and a state."""
     body = problem.body(theta)
     parts = problem.parts(theta, frame, state)
@@ -149,12 +151,12 @@ def frame_at(problem: Problem, theta: NDArray, frame: int, state: BodyState, wei
     away = state.angles - body.tree.usual
     H[6:, 6:] += pull
     g[6:] -= pull @ away
-    return Frame(body, state, parts, weighing, H, g, found.cost + float(away @ pull @ away))
+    return FrameEquations(body, state, parts, weighing, H, g, found.cost + float(away @ pull @ away))
 
 
 def settle(
-    problem: Problem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
-) -> tuple[list[Frame], list[BodyState]]:
+    problem: BorderedProblem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
+) -> tuple[list[FrameEquations], list[BodyState]]:
     """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
     bounds, frames, out = limits(problem.body(theta)), [], []
     for f, state in enumerate(states):
@@ -180,7 +182,7 @@ def limits(body: Body) -> tuple[NDArray, NDArray]:
     return body.tree.lower, body.tree.upper
 
 
-def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
+def differences(problem: BorderedProblem, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
     """(N, p) of every frame: how far each row's point moves, whitened, with each parameter; central differences.
 
     Raises
@@ -223,7 +225,7 @@ def differences(problem: Problem, theta: NDArray, steps: NDArray, states: Sequen
 
 
 def _by_rows(
-    problem: Problem, theta: NDArray, change: NDArray, frame: int, state: BodyState, parts: Sequence[Part]
+    problem: BorderedProblem, theta: NDArray, change: NDArray, frame: int, state: BodyState, parts: Sequence[Part]
 ) -> NDArray:
     """(N,) how far each row's point moves with half the change, whitened: from its rows on either side."""
     ends = [problem.parts(theta + sign * change, frame, state) for sign in (1.0, -1.0)]

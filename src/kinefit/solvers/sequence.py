@@ -37,7 +37,7 @@ class Planes:
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class SequenceFit:
     """Fitted frames: roots (F, 4, 4), angles (F, D), cost Σ ρ (F,) and iterations (F,)."""
 
     Ts_world_root: NDArray
@@ -62,7 +62,7 @@ def fit_sequence(
     damping: float = 1e-3,
     max_iterations: int = 200,
     tolerance: float = 1e-6,
-) -> Sequence:
+) -> SequenceFit:
     """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).
 
     The same minimum as `levenberg_marquardt` with `point_rows` and `plane_rows`, without its calls from Python.
@@ -116,7 +116,7 @@ def fit_sequence(
         posture / np.square(tree.spread),
         loss.kind, loss.scale, max_iterations, tolerance, damping, roots, angles, costs, iterations,
     )  # fmt: skip
-    return Sequence(roots, angles, costs, iterations)
+    return SequenceFit(roots, angles, costs, iterations)
 
 
 @dataclass(frozen=True, eq=False)

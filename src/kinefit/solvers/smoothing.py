@@ -30,7 +30,7 @@ MakeEquations = Callable[[NDArray, NDArray], Equations]
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class _BandEquations:
     """Normal equations, undamped; see `_kernels_band`."""
 
     C: NDArray
@@ -59,7 +59,7 @@ class Smoothed:
     iterations: int
     converged: bool
     prior: MotionPrior
-    system: _System
+    system: _BandEquations
     pattern: tuple[NDArray, NDArray]
 
     @property
@@ -193,7 +193,7 @@ def _system(
     prior: MotionPrior,
     depth: NDArray,
     entering: Entering | None = None,
-) -> _System:
+) -> _BandEquations:
     T, n = len(roots), body.tree.n_dofs
     C, g, cost = equations(roots, angles)
     precision, away = prior.precision, prior.usual - angles
@@ -211,7 +211,7 @@ def _system(
     changes = steps.copy()
     changes[1:] -= past[1:, :1] * steps[:-1]
     changes[2:] -= past[2:, 1:] * steps[:-2]
-    return _System(C, band, g, total, changes, entering)
+    return _BandEquations(C, band, g, total, changes, entering)
 
 
 def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | None = None) -> Posterior:

@@ -15,7 +15,7 @@ from kinefit.solvers import _kernels_border
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class PoseScrews:
     """How a body at a state moves with its degrees of freedom.
 
     Parameters
@@ -30,7 +30,7 @@ class Pose:
     screws: NDArray
 
     @classmethod
-    def of(cls, body: Body, state: BodyState) -> Pose:
+    def of(cls, body: Body, state: BodyState) -> PoseScrews:
         """The body at a state."""
         return cls(body, state, body.tree.forward(state.T_world_root, state.angles)[1])
 
@@ -63,7 +63,7 @@ def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
     return np.ones(len(rows)), float(left @ left)
 
 
-def columns(rows: AnyRows, pose: Pose) -> NDArray:
+def columns(rows: AnyRows, pose: PoseScrews) -> NDArray:
     """(N, n) derivative of a point's whitened place by the degrees of freedom, so that `residuals` ≈ columns · δ.
 
     Raises

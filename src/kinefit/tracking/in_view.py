@@ -12,11 +12,11 @@ from kinefit.bodies import Body, BodyState, load_body
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, without_speckles
-from kinefit.images.depth_scene import Blob, find_floor, foreground, people
+from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
 from kinefit.initialization.from_depth import start_from_points
 from kinefit.motion import ARRAYS, Motion
-from kinefit.multiview.followed import Followed, choose, follow
-from kinefit.multiview.people import Person
+from kinefit.multiview.followed import PersonKeypoints, choose, follow
+from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations, load_observations
@@ -48,7 +48,7 @@ class InView:
     """
 
     seen: Observations
-    people: tuple[Person, ...]
+    people: tuple[PersonTrack, ...]
     depth: tuple[Mapping[int, DepthFrame], ...] = ()
     starts: tuple[tuple[int, BodyState], ...] = ()
     _motions: dict[int, Motion] = field(default_factory=dict)
@@ -80,7 +80,7 @@ class InView:
     def _of(self, number: int, recording: Recording) -> Recording:
         if not self.depth:
             return recording
-        who = Followed((), self.people, number + 1)
+        who = PersonKeypoints((), self.people, number + 1)
         return replace(recording, depth=self.depth[number], start=self.starts[number], followed=who)
 
     def _motion(self, k: int, recording: Recording, body: Body, settings: TrackSettings) -> Motion | None:
@@ -138,7 +138,7 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
         return InView(seen, ())
     frame = recording.depth[step]
     camera = recording.rig[frame.sensor]
-    scored: list[tuple[float, Blob, BodyState]] = []
+    scored: list[tuple[float, DepthBlob, BodyState]] = []
     for blob in found[step][:_MOST]:
         alone = np.where(blob.mask, frame.depth, 0.0)
         try:
@@ -156,7 +156,7 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
     return InView(seen, persons, images, tuple((step, state) for *_, state in scored))
 
 
-def _blobs(frame: DepthFrame, recording: Recording) -> list[Blob]:
+def _blobs(frame: DepthFrame, recording: Recording) -> list[DepthBlob]:
     """Things of a person's size in a depth image, the largest first."""
     camera = recording.rig[frame.sensor]
     depth = denoised(without_speckles(frame.depth, camera, closed=True), camera)
@@ -166,7 +166,7 @@ def _blobs(frame: DepthFrame, recording: Recording) -> list[Blob]:
 
 
 def _of_blob(
-    k: int, every: Sequence[Blob], step: int, found: Mapping[int, Sequence[Blob]], recording: Recording
+    k: int, every: Sequence[DepthBlob], step: int, found: Mapping[int, Sequence[DepthBlob]], recording: Recording
 ) -> dict[int, DepthFrame]:
     """Depth images by step without the other people: where each is a thing by itself, near to where it was."""
     out = {}
@@ -181,7 +181,7 @@ def _of_blob(
     return out
 
 
-def _moves(blob: Blob, step: int, found: Mapping[int, Sequence[Blob]]) -> bool:
+def _moves(blob: DepthBlob, step: int, found: Mapping[int, Sequence[DepthBlob]]) -> bool:
     """Whether a thing covers other pixels in another image; furniture does not, nor does one image tell."""
     others = [found[at] for at in found if at != step]
     overlaps = [max((_overlap(blob.mask, b.mask) for b in among), default=0.0) for among in others]
@@ -192,7 +192,7 @@ def _overlap(one: NDArray, other: NDArray) -> float:
     return float((one & other).sum() / max((one | other).sum(), 1))
 
 
-def _nearest(blob: Blob, among: Sequence[Blob], reach: float) -> Blob | None:
+def _nearest(blob: DepthBlob, among: Sequence[DepthBlob], reach: float) -> DepthBlob | None:
     if not among:
         return None
     away = [float(np.linalg.norm(other.centre - blob.centre)) for other in among]
@@ -200,6 +200,6 @@ def _nearest(blob: Blob, among: Sequence[Blob], reach: float) -> Blob | None:
     return among[best] if away[best] < reach else None
 
 
-def _person(blob: Blob, surety: float, steps: int) -> Person:
+def _person(blob: DepthBlob, surety: float, steps: int) -> PersonTrack:
     rows: NDArray = np.flatnonzero(blob.mask.any(axis=1))
-    return Person((), np.ones(steps, int), surety, 0.0, float(np.ptp(rows)), np.asarray(blob.centre))
+    return PersonTrack((), np.ones(steps, int), surety, 0.0, float(np.ptp(rows)), np.asarray(blob.centre))

@@ -22,7 +22,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import FixedLag
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.smoothing.lag_frame import Followed
+from kinefit.smoothing.lag_frame import TrackerView
 from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
@@ -181,7 +181,7 @@ def _behind(
 
     Beside the results, which have the matches of keypoints alone, those of all other sensors.
     """
-    behind = FixedLag(Followed(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
+    behind = FixedLag(TrackerView(body, frames.rate, settings, frames.scene_of, frames.apart), lag, noise=noise)
     out: list[FrameResult] = []
     matched = Spool[tuple[Matched, ...]]()
 

@@ -16,9 +16,9 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people
-from kinefit.multiview.followed import Followed, follow
+from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.multiview.one_camera import lifted_alone
-from kinefit.multiview.people import Person
+from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
     KEYPOINT_SIGMA,
     DepthFrame,
@@ -73,7 +73,7 @@ class Recording:
     steps: Steps = lambda i: ()
     keypoints: tuple[Keypoints, ...] = ()
     people: tuple[NDArray, ...] = ()
-    followed: Followed | None = None
+    followed: PersonKeypoints | None = None
     sigma: Mapping[str, float] = field(default_factory=dict)
     keypoint_sigma: tuple[float, ...] = ()
     sensors: tuple[Sensor, ...] = ()
@@ -118,7 +118,7 @@ class Recording:
     @renamed(accuracy="sigma")
     def of_keypoints(
         cls, rig: Rig, keypoints: Sequence[Keypoints], *, sigma: float | Sequence[float] = KEYPOINT_SIGMA,
-        person: int | str | None = None, people: Sequence[Person] | None = None, **more: Any,
+        person: int | str | None = None, people: Sequence[PersonTrack] | None = None, **more: Any,
     ) -> Recording:  # fmt: skip
         """Keypoints of calibrated cameras; the person is chosen among all detected.
 

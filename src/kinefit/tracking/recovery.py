@@ -14,7 +14,7 @@ from kinefit.frame.prediction import forgetting
 from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
-from kinefit.initialization.depth_search import Search
+from kinefit.initialization.depth_search import PostureSearch
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
@@ -117,7 +117,7 @@ class Recovery:
 
     def _from_views(
         self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None,
-        search: Search | None = None,
+        search: PostureSearch | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from what shows a whole person; `search`, where much about the result is left out by it."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
@@ -142,7 +142,7 @@ class Recovery:
         return result
 
     def _limbs(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], search: Search, result: FrameResult,
+        self, tracker: Tracker, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
         seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
         free = dofs_of_limbs(self.body, seek)
@@ -161,12 +161,12 @@ class Recovery:
 
     def _search(
         self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
-    ) -> Search | None:
+    ) -> PostureSearch | None:
         """In the first view that there is of what was measured."""
         scene = tracker.scene_of(result.state, time)
         surfaces = [m for m in measurements if not m.settled]  # points by name show no limb that could be sought
         view = next((v for m in surfaces if (v := m.hints(scene).view) is not None), None)
-        return None if view is None else Search(self.body, view, self.up, np.random.default_rng(0))
+        return None if view is None else PostureSearch(self.body, view, self.up, np.random.default_rng(0))
 
     def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
@@ -203,7 +203,7 @@ def _astray(result: FrameResult, poor: float) -> bool:
     return bool(result.lost[0]) or float(seen.mean() if len(seen) else 0.0) < poor
 
 
-def _explains(search: Search | None, new: FrameResult, old: FrameResult) -> bool:
+def _explains(search: PostureSearch | None, new: FrameResult, old: FrameResult) -> bool:
     """Less of the person is missing, by a limb at least, and nothing that was explained before is in its place."""
     if search is None or search.score.of(new.state) <= search.score.of(old.state):
         return False

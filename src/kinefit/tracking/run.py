@@ -32,7 +32,7 @@ _EVERY = 300  # steps after which a checkpoint is written: ten seconds of video,
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class TrackedSteps:
     """A recording, tracked frame by frame.
 
     Parameters
@@ -85,11 +85,11 @@ class _Frames:
         self.written = len(self.place)
         return tracker
 
-    def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> Tracked:
+    def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> TrackedSteps:
         """In the order of time; `steps` of the whole recording."""
         done = sorted(self.place)
         order = [self.place[i] for i in done]
-        return Tracked(
+        return TrackedSteps(
             self.results.chosen(order), done, self.measurements.chosen(order), self.leftovers.chosen(order), tracker,
             not stopped and len(done) == steps,
         )  # fmt: skip
@@ -112,7 +112,7 @@ def tracker_of(
 def run(
     recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *,
     start: Any = None, values: Any = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
-) -> Tracked:  # fmt: skip
+) -> TrackedSteps:  # fmt: skip
     """Track all steps of a recording, each from those before it.
 
     Parameters
@@ -164,7 +164,8 @@ def run(
             if progress:
                 progress("frames", i + 1 - begin, len(times))
         if not frames.place:
-            remedy = "Begin with a step that shows the whole person; check units, calibration and the range gate."
+            remedy = "Begin with a step that shows the whole person, or say where it stands: start=(step, state). "
+            remedy += "Check units, calibration and the range gate."
             raise TrackingError(f"the body is found in none of the first {i + 1 - begin} steps", remedy=remedy)
         if checkpoint is not None and len(times) > at:
             tracker = frames.keep(checkpoint, tracker, len(times), anew)

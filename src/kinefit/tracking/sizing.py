@@ -41,7 +41,7 @@ Start = tuple[int, BodyState]
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class SizedPerson:
     """A body of the person's size and shape.
 
     Parameters
@@ -76,7 +76,7 @@ def channels_of(recording: Recording, body: Body) -> Channels:
 def fitted_to_person(
     recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *, subject: Subject | None,
     trial: Subject | None, height: float | None, size: bool, frames: int | None, progress: Progress | None,
-) -> Person:  # fmt: skip
+) -> SizedPerson:  # fmt: skip
     """The body in the person's size and shape; `channels` on the body as it is, other arguments as of `track`.
 
     Raises
@@ -103,7 +103,7 @@ def fitted_to_person(
             problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
             raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
     subject_as_is = Subject(body, np.ones(len(body.scale_groups)))
-    person = Person(recording, subject_as_is, channels, recording.start, calibrated=recording.rig)
+    person = SizedPerson(recording, subject_as_is, channels, recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
@@ -131,7 +131,7 @@ def _others(recording: Recording) -> bool:
     return any(len(recording.steps(i)) for i in range(min(len(recording), _TRIED)))
 
 
-def _wearing(person: Person, subject: Subject, **told: Any) -> Person:
+def _wearing(person: SizedPerson, subject: Subject, **told: Any) -> SizedPerson:
     channels = person.channels.with_points(subject.body)
     if subject.view_bias is not None:
         channels = subject.view_bias.known_to(channels)
@@ -147,7 +147,7 @@ def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
     return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
 
 
-def _seen_by(person: Person, rig: Rig) -> Person:
+def _seen_by(person: SizedPerson, rig: Rig) -> SizedPerson:
     """With cameras where a fit found them."""
     if rig is person.recording.rig:
         return person
@@ -156,7 +156,7 @@ def _seen_by(person: Person, rig: Rig) -> Person:
     )  # fmt: skip
 
 
-def _by_markers(person: Person, height: float | None, progress: Progress | None) -> Person:
+def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> SizedPerson:
     """Lengths and the markers' own places, from the markers alone."""
     r, body = person.recording, person.subject.body
     found = fit_marker_subject(body, r.markers[0], r.marker_sets[0][0], height=height, progress=progress)
@@ -164,7 +164,7 @@ def _by_markers(person: Person, height: float | None, progress: Progress | None)
     return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames})
 
 
-def _by_depth(person: Person, progress: Progress | None) -> Person:
+def _by_depth(person: SizedPerson, progress: Progress | None) -> SizedPerson:
     """The body in the size of the person in some depth images; as it is where nobody is found in them."""
     r, body = person.recording, person.subject.body
     frames = r.depth
@@ -186,9 +186,9 @@ def _by_depth(person: Person, progress: Progress | None) -> Person:
 
 
 def _by_all(
-    person: Person, generic: Body, settings: TrackSettings, progress: Progress | None, *, size: bool = True,
+    person: SizedPerson, generic: Body, settings: TrackSettings, progress: Progress | None, *, size: bool = True,
     height: float | None = None, trial: Subject | None = None,
-) -> Person:  # fmt: skip
+) -> SizedPerson:  # fmt: skip
     """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
 
     The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
@@ -253,7 +253,7 @@ def _by_all(
     return replace(person, start=(first + tracked.steps[chosen[0]], states[0]))
 
 
-def _by_joint(person: Person, found: SubjectFit) -> Person:
+def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:
     """The person as a fit of several kinds of sensors found it; with its lengths where they were sought."""
     subject, count = person.subject, len(person.subject.scales)
     if any(isinstance(p, SegmentScales) for p in found.parameters):

@@ -17,7 +17,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
-from kinefit.multiview.people import Person
+from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers, SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
@@ -60,7 +60,7 @@ class NamedMarkers:
 
 
 def recording_of(
-    take: Take, seen: Observations, body: Body, people: Sequence[Person] | None = None
+    take: Take, seen: Observations, body: Body, people: Sequence[PersonTrack] | None = None
 ) -> tuple[Recording, Body]:
     """What all sensors of a take saw, and the body with the marker sets that they name.
 

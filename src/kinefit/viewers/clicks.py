@@ -25,7 +25,7 @@ _FILES = {
 }  # fmt: skip
 
 
-class _Told(msgspec.Struct, forbid_unknown_fields=True):
+class _ClicksMessage(msgspec.Struct, forbid_unknown_fields=True):
     """What the page sends when the user is done; no part of it is of any depth."""
 
     step: int
@@ -87,7 +87,7 @@ class ClickPage:
 
     def _answer(self, text: bytes) -> tuple[str, bool]:
         try:
-            return self.take(msgspec.to_builtins(msgspec.json.decode(text, type=_Told))), True
+            return self.take(msgspec.to_builtins(msgspec.json.decode(text, type=_ClicksMessage))), True
         except msgspec.DecodeError as error:
             return f"These are no clicks: {error}.", False
         except KinefitError as error:

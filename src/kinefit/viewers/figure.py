@@ -107,7 +107,7 @@ class Figure:
                 node.scale = tuple(half)
 
 
-class Cloud:
+class ScenePoints:
     """Points that no segment carries, one small ball each.
 
     Parameters

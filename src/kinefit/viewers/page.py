@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.viewers.show import Choice, Recording, Show
+from kinefit.viewers.show import Choice, Show, ViewerContent
 from kinefit.viewers.stage import POLICY, open_server, quiet
 
 MOST_FRAMES, MOST_PICTURES = 600, 240
 """Frames and camera pictures that a page holds at most, so that it stays below 10 MB and loads at once."""
 
 
-def page(recording: Recording, *, choice: Choice = Choice()) -> tuple[str, int]:  # noqa: B008
+def page(recording: ViewerContent, *, choice: Choice = Choice()) -> tuple[str, int]:  # noqa: B008
     """The scene with its animation as one self-contained HTML text, and the number of frames in it.
 
     Longer recordings are thinned out evenly to `MOST_FRAMES`; the cameras' pictures change as often as `MOST_PICTURES`

@@ -19,7 +19,7 @@ _KEPT = 96_000_000  # bytes of pictures that are kept
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PinholeView:
     """What a camera sees, as a flat picture: a pinhole with its axis in the middle that covers the whole image.
 
     Parameters
@@ -54,7 +54,7 @@ class View:
         return (x_camera[..., :2] / x_camera[..., 2:] / self.tangents + 1.0) * half - 0.5
 
 
-def flat_view(camera: Camera, longest: int) -> View:
+def flat_view(camera: Camera, longest: int) -> PinholeView:
     """The view of a camera whose longer side has `longest` pixels."""
     w, h = camera.size
     u, v = np.linspace(-0.5, w - 0.5, 33), np.linspace(-0.5, h - 0.5, 33)
@@ -68,10 +68,10 @@ def flat_view(camera: Camera, longest: int) -> View:
     plain = 0.5 * np.array([w, h]) / camera.matrix[[0, 1], [0, 1]]  # where no ray reaches the border
     tx, ty = (float(t) for t in np.minimum(slopes.max(axis=0) if len(slopes) else plain, _WIDEST))
     scale = longest / max(tx, ty)
-    return View((max(1, round(scale * tx)), max(1, round(scale * ty))), (tx, ty))
+    return PinholeView((max(1, round(scale * tx)), max(1, round(scale * ty))), (tx, ty))
 
 
-def undistortion(camera: Camera, image: ImageFrame, view: View) -> NDArray:
+def undistortion(camera: Camera, image: ImageFrame, view: PinholeView) -> NDArray:
     """(H, W, 2) [px] of the delivered picture for every pixel of a flat view; NaN where the lens shows nothing."""
     return image.from_calibration(camera.with_pose(np.eye(4)).project(view.rays()))
 
@@ -89,7 +89,7 @@ def flatten(picture: NDArray[np.uint8], pixels: NDArray) -> NDArray[np.uint8]:
     return np.asarray(out, np.uint8)
 
 
-class Pictures:
+class CameraImages:
     """Flat pictures of cameras over time, decoded on demand; the last ones are kept.
 
     Parameters

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.motion import Motion
 from kinefit.viewers import figure, scene
-from kinefit.viewers.show import ALL, LAYERS, NONE, USUAL, Choice, Recording, Show
+from kinefit.viewers.show import ALL, LAYERS, NONE, USUAL, Choice, Show, ViewerContent
 from kinefit.viewers.stage import look_through
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _HELP = "drag: turn, right drag: shift, wheel: nearer; P plays, B and N step"
 
 
 @dataclass
-class Clock:
+class PlaybackClock:
     """Where the player is: `position` [frames] runs on while playing."""
 
     count: int
@@ -58,13 +58,13 @@ class Player:
     Parameters
     ----------
     server : viser.ViserServer
-    recording : Recording
+    recording : ViewerContent
     """
 
-    def __init__(self, server: viser.ViserServer, recording: Recording) -> None:
+    def __init__(self, server: viser.ViserServer, recording: ViewerContent) -> None:
         self.server, self.recording = server, recording
         self.show = Show(server, recording)
-        self.clock = Clock(len(recording.times), recording.rate)
+        self.clock = PlaybackClock(len(recording.times), recording.rate)
         self._shown: tuple[int, Choice] | None = None
         self._told: tuple[Any, ...] = ()
         self._since_told = 0.0

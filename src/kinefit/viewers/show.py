@@ -15,7 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import Markers
 from kinefit.viewers import figure, scene, stage
-from kinefit.viewers.pictures import Pictures
+from kinefit.viewers.pictures import CameraImages
 
 if TYPE_CHECKING:
     import viser
@@ -31,7 +31,7 @@ _POINT, _MARKER, _PATH = (245, 205, 40), (225, 60, 120), (110, 120, 135)
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class ViewerContent:
     """What there is to show.
 
     Parameters
@@ -39,7 +39,7 @@ class Recording:
     motions : tuple of Motion
         The first one leads the time; the others are shown beside it in other colours, by time.
     rig : Rig, optional
-    pictures : Pictures, optional
+    pictures : CameraImages, optional
     markers : tuple of Markers
         In the take's time: t = frame / rate + `marker_offsets`.
     marker_offsets : tuple of float [s]
@@ -59,7 +59,7 @@ class Recording:
 
     motions: tuple[Motion, ...] = ()
     rig: Rig | None = None
-    pictures: Pictures | None = None
+    pictures: CameraImages | None = None
     markers: tuple[Markers, ...] = ()
     marker_offsets: tuple[float, ...] = ()
     points: NDArray | None = None
@@ -145,7 +145,7 @@ class Choice:
 class Show:
     """A recording in a server's scene; `frame` brings it to one time."""
 
-    def __init__(self, server: viser.ViserServer, recording: Recording) -> None:
+    def __init__(self, server: viser.ViserServer, recording: ViewerContent) -> None:
         self.server, self.recording = server, recording
         floor = scene.floor_height(recording.places, recording.up)
         self._way = recording.way()
@@ -211,7 +211,7 @@ class Show:
             f = nearest(times, time, rate)
             cloud.show(values[f] if f is not None and layer in choice.layers else None)
 
-    def _make_clouds(self) -> Iterator[tuple[figure.Cloud, str, NDArray, NDArray, float]]:
+    def _make_clouds(self) -> Iterator[tuple[figure.ScenePoints, str, NDArray, NDArray, float]]:
         """Every cloud with its layer, its points (F, K, 3) [m], their times (F,) [s] and rate [Hz]."""
         recording, given = self.recording, []
         if recording.points is not None and recording.steps is not None:
@@ -223,7 +223,7 @@ class Show:
             measured = [r.measured for r in motion.residuals.values() if r.unit == "m"]
             given += [("markers", _MARKER, x, motion.times, motion.rate) for x in measured]
         for n, (layer, colour, values, times, rate) in enumerate(given):
-            cloud = figure.Cloud(self.server.scene, f"{layer}{n}", values.shape[1], colour)
+            cloud = figure.ScenePoints(self.server.scene, f"{layer}{n}", values.shape[1], colour)
             yield cloud, layer, values, times, rate
 
     def _show_rays(self, i: int, choice: Choice) -> None:

@@ -18,7 +18,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES
 from kinefit.serving.access import Access
-from kinefit.viewers.pictures import View, flat_view
+from kinefit.viewers.pictures import PinholeView, flat_view
 
 if TYPE_CHECKING:
     import viser
@@ -123,7 +123,7 @@ class CameraNode:
 
     def __init__(self, scene: Any, camera: Camera, *, size: float, far: float) -> None:
         self.camera, self.far = camera, far
-        self.view: View = flat_view(camera, SMALL)
+        self.view: PinholeView = flat_view(camera, SMALL)
         T = camera.T_world_camera
         self.wxyz, self.position = se3.quaternion(T[:3, :3]), T[:3, 3]
         tx, ty = self.view.tangents

@@ -5,13 +5,13 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.skin_tubes import Posed, field, tube
+from kinefit.bodies.surfaces.skin_tubes import PosedLimb, field, tube
 from kinefit.bodies.surfaces.subdivision import check_closed
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 
 BODY = load_body("arm_metaballs")
-LIMBS = [Posed(s, se3.transform(np.eye(3), BODY.tree.rest[s.segment])) for s in BODY.surfaces]
+LIMBS = [PosedLimb(s, se3.transform(np.eye(3), BODY.tree.rest[s.segment])) for s in BODY.surfaces]
 
 
 @pytest.mark.parametrize("around", [8, 16, 32])
@@ -47,6 +47,6 @@ def test_vertices_belong_to_the_limb_they_lie_on():
 
 
 def test_limbs_that_do_not_meet_are_refused():
-    thin = [Posed(Metaballs.of(p.limb.segment, p.limb.centres[:1], p.limb.radii[:1]), p.T) for p in LIMBS]
+    thin = [PosedLimb(Metaballs.of(p.limb.segment, p.limb.centres[:1], p.limb.radii[:1]), p.T) for p in LIMBS]
     with pytest.raises(BodyError, match="limbs of metaballs do not meet near"):
         tube(thin, 16, (True, True))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.calibration.bar.bundle import INTERIOR, POSE, Problem
+from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarProblem
 from kinefit.calibration.bar.calibrate import calibrate_bar
 from kinefit.calibration.bar.placing import place
 from kinefit.calibration.bar.start import epipolar, flat
@@ -80,7 +80,7 @@ def test_derivatives_of_the_adjustment(known):
     rig, ends, seen = known
     uv = np.stack([np.stack([seen[c.name].ends.get(f, np.full((2, 2), np.nan)) for c in rig]) for f in range(5)])
     x = ends[:5] + 1e-3
-    problem = Problem(uv, LENGTH, interiors=True, sigma=1e3, scatter=10.0)  # far from the losses' bends
+    problem = BarProblem(uv, LENGTH, interiors=True, sigma=1e3, scatter=10.0)  # far from the losses' bends
     problem.free[:] = True
     system = problem.system(rig, x)
     rng = np.random.default_rng(0)

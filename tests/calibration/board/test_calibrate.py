@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.calibration.board.bundle import Corners, _Problem, adjust_boards, interior_parameters, pixel_columns
+from kinefit.calibration.board.bundle import Corners, _BoardProblem, adjust_boards, interior_parameters, pixel_columns
 from kinefit.calibration.board.calibrate import calibrate_board
-from kinefit.calibration.board.detection import Board, CameraViews, Finder, View, fitting_boards, with_dictionary
+from kinefit.calibration.board.detection import Board, BoardView, CameraViews, Finder, fitting_boards, with_dictionary
 from kinefit.calibration.board.extrinsics import place_cameras
 from kinefit.calibration.board.intrinsics import calibrate_interiors
 from kinefit.calibration.board.sources import camera_sources, find_boards
@@ -63,7 +63,7 @@ def looked(rig, board, Ts_world_board, noise=0.15, seed=1, turned=False, moved=N
                 ids = np.arange(len(uv))
                 if turned and rng.random() < 0.5:
                     ids = board.symmetries[1][ids]
-                views.append(View(f, ids, uv + rng.normal(0, noise, uv.shape)))
+                views.append(BoardView(f, ids, uv + rng.normal(0, noise, uv.shape)))
         seen[camera.name] = CameraViews(SIZE, tuple(views))
     return seen
 
@@ -131,7 +131,7 @@ def test_cameras_out_of_step_do_not_bend_the_lenses():
 def test_interiors_alone_need_no_common_frame():
     rig = studio(2)
     seen = looked(rig, CHECKER, waved(CHECKER, 40))
-    other = tuple(View(view.frame + 1000, view.ids, view.uv) for view in seen["cam1"].views)
+    other = tuple(BoardView(view.frame + 1000, view.ids, view.uv) for view in seen["cam1"].views)
     seen["cam1"] = CameraViews(SIZE, other)
     found = calibrate_board(seen, CHECKER, exteriors=False)
     for camera, true in zip(found.rig, rig):
@@ -144,7 +144,7 @@ def test_interiors_alone_need_no_common_frame():
 def test_a_bad_view_is_dropped():
     rig = studio(1)
     seen = looked(rig, CHECKER, waved(CHECKER, 25))["cam0"]
-    wrong = View(99, seen.views[3].ids, seen.views[3].uv + np.random.default_rng(0).normal(0, 8, (54, 2)))
+    wrong = BoardView(99, seen.views[3].ids, seen.views[3].uv + np.random.default_rng(0).normal(0, 8, (54, 2)))
     found = calibrate_interiors("cam0", CameraViews(SIZE, (*seen.views, wrong)), CHECKER)
     assert 99 not in found.frames and found.rms_px < 0.3
 
@@ -185,7 +185,7 @@ def test_gradient_of_the_cost_against_differences(interiors):
     placed = place_cameras(
         {c.name: c.with_pose(np.eye(4)) for c in rig}, looked(rig, CHECKER, Ts, noise=0.05), CHECKER
     )
-    problem = _Problem(placed.corners, interiors, (1e-3, 2e-3))
+    problem = _BoardProblem(placed.corners, interiors, (1e-3, 2e-3))
     system = problem.system(placed.rig, placed.Ts_world_board)
     P, h = system.free.shape[1], 1e-6
 
@@ -449,7 +449,7 @@ def test_too_few_and_contradicting_views(change, words):
 
 def shuffled(seen):
     frames = np.random.default_rng(3).permutation([view.frame for view in seen.views])
-    views = (View(int(f), view.ids, view.uv) for f, view in zip(frames, seen.views))
+    views = (BoardView(int(f), view.ids, view.uv) for f, view in zip(frames, seen.views))
     return CameraViews(seen.size, tuple(sorted(views, key=lambda view: view.frame)))
 
 
@@ -487,7 +487,7 @@ def test_floor_and_interiors_that_do_not_fit():
 
 
 def bent(view):
-    return View(view.frame, view.ids, view.uv + np.random.default_rng(view.frame).normal(0, 120, view.uv.shape))
+    return BoardView(view.frame, view.ids, view.uv + np.random.default_rng(view.frame).normal(0, 120, view.uv.shape))
 
 
 # ---------------------------------------------------------------- real recordings

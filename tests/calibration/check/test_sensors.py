@@ -9,7 +9,7 @@ import pytest
 
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
 from kinefit.cli._check_refine import Refined
-from kinefit.diagnostics.sensor_fit import SensorFit, doubts_of
+from kinefit.diagnostics.sensor_fit import SensorAlignment, doubts_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.take.entries import DepthEntry, MarkersEntry
@@ -22,7 +22,7 @@ def fit(sensor="depth", kind="depth", **moved):
     twist = np.zeros(7)
     for name, value in moved.items():
         twist[("x", "y", "z", "rx", "ry", "rz", "clock").index(name)] = value
-    return SensorFit(sensor, kind, twist, np.diag(STD**2), CENTRE)
+    return SensorAlignment(sensor, kind, twist, np.diag(STD**2), CENTRE)
 
 
 def take(**entries):

@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.identification.frame.beliefs import LEAST, MOST, Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import identify
-from kinefit.identification.frame.search import Frame, Search
+from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.frame.tables import segment_tables
 
@@ -41,7 +41,7 @@ def test_a_name_costs_what_its_absence_makes_it():
     absent = Beliefs(np.where(np.arange(len(body)) == toe, 0.3, usual), noise)
     gaps = np.linalg.norm(pose.points[:, None] - pose.points, axis=-1)
     told = [None, Beliefs(usual, noise), absent, Beliefs(usual, 2 * noise)]
-    search = [Search(tables, Frame(pose.points, gaps, 10.0, 12.0, 4.5, beliefs=b), 1.0) for b in told]
+    search = [LabelSearch(tables, UnlabelledFrame(pose.points, gaps, 10.0, 12.0, 4.5, beliefs=b), 1.0) for b in told]
     cost = [one.alone(one.by_index[foot])[0] for one in search]
     assert cost[1] == pytest.approx(cost[0]) and cost[3] > cost[0]
     assert cost[2] - cost[0] == pytest.approx(-absent.odds[toe], abs=1e-6)

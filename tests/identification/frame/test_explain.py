@@ -9,7 +9,7 @@ from kinefit.errors import ObservationError
 from kinefit.identification.frame.explain import at_level, explain, gain_of
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.frame.polish import apart, cost_of, labels_of, polish, rivals, shared
-from kinefit.identification.frame.search import Frame, Search
+from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.frame.tables import segment_tables
 
@@ -24,12 +24,12 @@ def seen(body, seed, **kind):
     at = pose.points
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     gaps = np.linalg.norm(at[:, None] - at, axis=-1)
-    return pose, Frame(at, gaps, box, gain_of(0.9 * len(body), len(body), len(at), box), 4.5)
+    return pose, UnlabelledFrame(at, gaps, box, gain_of(0.9 * len(body), len(body), len(at), box), 4.5)
 
 
 def begun(body, frame, root=0):
     """What a short search makes of a frame: points may be taken twice."""
-    search = Search(segment_tables(body, root), frame, 1.0, 80, 40)
+    search = LabelSearch(segment_tables(body, root), frame, 1.0, 80, 40)
     return search, search.decode(search.node(search.tables[0], None, -1))
 
 

@@ -1,7 +1,7 @@
 """The catalogue of marker sets: labels, segments, places on a body; and the rule by which labels agree."""
 
 from kinefit.bodies.marker_sets.labels import bare, matched, subject_of
-from kinefit.bodies.marker_sets.placement import Placement, find_placement, known_set, placed_set_names, placement
+from kinefit.bodies.marker_sets.placement import MarkerPlacement, find_placement, known_set, placed_set_names, placement
 from kinefit.bodies.marker_sets.sets import (
     FEWEST,
     GIVE,
@@ -17,8 +17,8 @@ __all__ = [
     "FEWEST",
     "GIVE",
     "RANGE",
+    "MarkerPlacement",
     "MarkerSet",
-    "Placement",
     "SetSegment",
     "bare",
     "find_marker_set",

@@ -32,11 +32,7 @@ _REMEDY = (
 )
 
 
-class _Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    pass
-
-
-class SegmentRecord(_Record, frozen=True, kw_only=True):
+class MarkerSegmentRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """`[[segment]]`: labels that move as one, and the joint to its parent."""
 
     name: str
@@ -48,7 +44,7 @@ class SegmentRecord(_Record, frozen=True, kw_only=True):
     range: float = np.degrees(RANGE)
 
 
-class MarkerRecord(_Record, frozen=True, kw_only=True):
+class MarkerRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A row of `[markers]`: on a landmark of the body, or on a segment at a place."""
 
     landmark: str | None = None
@@ -58,11 +54,11 @@ class MarkerRecord(_Record, frozen=True, kw_only=True):
     spread: float = LANDMARK_SPREAD
 
 
-class SetRecord(_Record, frozen=True, kw_only=True):
+class SetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A file: `[places]` and `[[segment]]` are of identification, `[markers]` are of fitting a body."""
 
     name: str
-    segment: list[SegmentRecord] = []
+    segment: list[MarkerSegmentRecord] = []
     places: dict[str, _Vector] = {}
     markers: dict[str, MarkerRecord] = {}
     also: list[str] = []

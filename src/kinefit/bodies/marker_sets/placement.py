@@ -17,7 +17,7 @@ from kinefit.errors import FileError, ObservationError
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class MarkerPlacement:
     """Markers of a set on a body.
 
     Parameters
@@ -31,11 +31,11 @@ class Placement:
     points: PointSet
     spread: NDArray
 
-    def select(self, names: Iterable[str]) -> Placement:
+    def select(self, names: Iterable[str]) -> MarkerPlacement:
         """The named markers, in that order."""
         names = tuple(names)
         rows = [self.points.index(n) for n in names]
-        return Placement(self.name, self.points.select(names), self.spread[rows])
+        return MarkerPlacement(self.name, self.points.select(names), self.spread[rows])
 
 
 def placed_set_names() -> tuple[str, ...]:
@@ -43,7 +43,7 @@ def placed_set_names() -> tuple[str, ...]:
     return set_names(placed=True)
 
 
-def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
+def placement(body: Body, marker_set: str | PathLike[str]) -> MarkerPlacement:
     """A marker set on a body: one of the catalogue, one of the body's own, or a file of your own (.toml).
 
     Markers on segments or landmarks that the body does not have are left out.
@@ -58,7 +58,7 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
     name = str(marker_set)
     if name in body.marker_sets:
         points = body.markers(name)
-        return Placement(name, points, np.full(len(points), LANDMARK_SPREAD))
+        return MarkerPlacement(name, points, np.full(len(points), LANDMARK_SPREAD))
     record, source = find_record(marker_set, (*body.marker_sets, *placed_set_names()))
     if not record.markers:
         raise FileError(
@@ -68,7 +68,7 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> Placement:
     return placed(body, record)
 
 
-def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> Placement:
+def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> MarkerPlacement:
     """The markers of a set that are among the labels; default: of the set that shares most labels.
 
     Which label stands for which marker is told by `labels.matched`.
@@ -80,7 +80,7 @@ def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike
     """
     labels = tuple(labels)
     names = [marker_set] if marker_set else [*body.marker_sets, *placed_set_names()]
-    best: Placement | None = None
+    best: MarkerPlacement | None = None
     for name in names:
         whole = placement(body, name)
         known = set(matched(labels, whole.points.names))
@@ -129,7 +129,7 @@ def _listed(labels: tuple[str, ...]) -> str:
     return ", ".join(labels[:8]) + (" ..." if len(labels) > 8 else "")
 
 
-def placed(body: Body, record: SetRecord) -> Placement:
+def placed(body: Body, record: SetRecord) -> MarkerPlacement:
     """A set's record on a body; markers on segments or landmarks that the body does not have are left out."""
     names, segments, at, spread = [], [], [], []
     for label, entry in record.markers.items():
@@ -141,7 +141,7 @@ def placed(body: Body, record: SetRecord) -> Placement:
                 at.append(found[1])
                 spread.append(entry.spread)
     points = PointSet(tuple(names), np.array(segments, np.int64), np.array(at, float).reshape(-1, 3))
-    return Placement(record.name, points, np.array(spread))
+    return MarkerPlacement(record.name, points, np.array(spread))
 
 
 def _with_image(label: str, record: SetRecord) -> list[tuple[str, bool]]:

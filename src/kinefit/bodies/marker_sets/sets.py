@@ -10,7 +10,15 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.marker_sets.files import GIVE, RANGE, SegmentRecord, SetRecord, catalogue, find_record, set_names
+from kinefit.bodies.marker_sets.files import (
+    GIVE,
+    RANGE,
+    MarkerSegmentRecord,
+    SetRecord,
+    catalogue,
+    find_record,
+    set_names,
+)
 from kinefit.bodies.marker_sets.labels import matched, plain
 from kinefit.errors import FileError, choices
 
@@ -162,7 +170,7 @@ def _built(record: SetRecord, source: str) -> MarkerSet:
     return MarkerSet(record.name, labels, places, tuple(segments), tuple(record.also), tuple(dict.fromkeys(computed)))
 
 
-def _wrong(s: SegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
+def _wrong(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
     """What is wrong with a segment, and what to do; empty if nothing is."""
     if name in names:
         return "a segment is there twice", "Give each its own name."

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from kinefit.bodies.body import Body
 
 
-class _Places(NamedTuple):
+class _SurfacePlaces(NamedTuple):
     """Of N anchors: the surface, the face (0 for cylinders), three coordinates, and the normal as a covector."""
 
     surface: NDArray
@@ -91,10 +91,10 @@ class SurfaceAnchors:
         return []
 
     @cached_property
-    def _places(self) -> _Places:
+    def _places(self) -> _SurfacePlaces:
         """Each anchor on the surface of its segment that is nearest."""
         body, count = self.body, len(self)
-        out = _Places(np.full(count, -1), np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
+        out = _SurfacePlaces(np.full(count, -1), np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
         best = np.full(count, np.inf)
         for k, surface in enumerate(body.surfaces):
             own = np.flatnonzero(self.segment == surface.segment)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.body import Body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces.metaballs import LEVEL, Metaballs
-from kinefit.bodies.surfaces.skin_tubes import Posed, Tube, field, tube
+from kinefit.bodies.surfaces.skin_tubes import PosedLimb, Tube, field, tube
 from kinefit.bodies.surfaces.subdivision import check_closed, interpolated, limit, spread, subdivided
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
@@ -49,11 +49,11 @@ class BodySkin:
     faces: NDArray
     weights: NDArray
     joined: NDArray
-    tubes: tuple[tuple[Posed, ...], ...]
+    tubes: tuple[tuple[PosedLimb, ...], ...]
     Ts: NDArray
 
     @property
-    def limbs(self) -> tuple[Posed, ...]:
+    def limbs(self) -> tuple[PosedLimb, ...]:
         """All of them."""
         return tuple(limb for limbs in self.tubes for limb in limbs)
 
@@ -97,7 +97,7 @@ def body_skins(body: Body) -> list[BodySkin]:
 
 
 @dataclass(eq=False)
-class _Part:
+class _TubePart:
     """A tube to be, with what it is joined to: the part that its start, or its end, is let into."""
 
     segments: list[int]
@@ -110,7 +110,7 @@ def _skin(body: Body, balls: dict[int, Metaballs], first: int) -> BodySkin:
     Ts = np.tile(np.eye(4), (len(frames), 1, 1))
     Ts[:, :3, :3] = frames[:, :9].reshape(-1, 3, 3)
     Ts[:, :3, 3] = frames[:, 9:]
-    posed = {s: Posed(limb, Ts[s] @ se3.transform(np.eye(3), body.tree.rest[s])) for s, limb in balls.items()}
+    posed = {s: PosedLimb(limb, Ts[s] @ se3.transform(np.eye(3), body.tree.rest[s])) for s, limb in balls.items()}
     parts = _parts(body, posed, first)
     hosts = {part.start for part in parts}
     around = [TRUNK if k in hosts else AROUND for k in range(len(parts))]
@@ -137,9 +137,9 @@ def _apart(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
     return BodyState(np.eye(4), angles)
 
 
-def _parts(body: Body, posed: dict[int, Posed], first: int) -> list[_Part]:
+def _parts(body: Body, posed: dict[int, PosedLimb], first: int) -> list[_TubePart]:
     """Tubes of a body: a limb goes on in its child that bends least, the others branch off."""
-    parents, parts = body.tree.parents, [_Part([first])]
+    parents, parts = body.tree.parents, [_TubePart([first])]
     for number, part in ((k, p) for k in range(len(posed)) if k < len(parts) for p in [parts[k]]):
         while True:
             last = part.segments[-1]
@@ -149,16 +149,16 @@ def _parts(body: Body, posed: dict[int, Posed], first: int) -> list[_Part]:
             for k, child in enumerate(children):
                 if k != on and len(children) == 1:  # as the foot: the limb ends in it
                     part.end = len(parts)
-                    parts.append(_Part([child]))
+                    parts.append(_TubePart([child]))
                 elif k != on:
-                    parts.append(_Part([child], start=number))
+                    parts.append(_TubePart([child], start=number))
             if on is None:
                 break
             part.segments.append(children[on])
     return parts
 
 
-def _joined(body: Body, parts: Sequence[_Part], tubes: list[Tube], Ts: NDArray) -> BodySkin:
+def _joined(body: Body, parts: Sequence[_TubePart], tubes: list[Tube], Ts: NDArray) -> BodySkin:
     """One net of all tubes."""
     joints = [(k, part.start, 0) for k, part in enumerate(parts) if part.start is not None]
     joints += [(k, part.end, -1) for k, part in enumerate(parts) if part.end is not None]
@@ -212,7 +212,7 @@ def _shortened(body: Body, limb: Tube, host: Tube, end: int) -> Tube:
 
 
 def _hole(
-    body: Body, host: Tube, faces: NDArray, free: NDArray, ring: NDArray, limbs: Sequence[Posed]
+    body: Body, host: Tube, faces: NDArray, free: NDArray, ring: NDArray, limbs: Sequence[PosedLimb]
 ) -> tuple[NDArray, NDArray]:
     """Faces of a tube to be cut out for a limb whose ring (A, 3) [m] is given, and the border (A,) that fits it best.
 

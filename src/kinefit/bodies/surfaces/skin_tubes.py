@@ -23,7 +23,7 @@ _FIRST = 24  # rings with which a tube is measured, before it gets as many as ma
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PosedLimb:
     """A limb of metaballs where a pose has it.
 
     Parameters
@@ -53,7 +53,7 @@ class Posed:
         return self.limb.field((x - self.T[:3, 3]) @ self.T[:3, :3])
 
 
-def field(limbs: Sequence[Posed], x: NDArray) -> NDArray:
+def field(limbs: Sequence[PosedLimb], x: NDArray) -> NDArray:
     """(...) of some limbs at points (..., 3) [m]: the root of the sum of their fields' squares.
 
     Their sum would make a joint, where two limbs end in each other, thicker than both; the largest of them a groove.
@@ -74,7 +74,7 @@ class Tube:
     segment : (V,) that each belongs to
     """
 
-    limbs: tuple[Posed, ...]
+    limbs: tuple[PosedLimb, ...]
     rings: NDArray
     caps: tuple[NDArray | None, NDArray | None]
     vertices: NDArray
@@ -101,7 +101,7 @@ class Tube:
         return Tube(self.limbs, number[self.rings], (low, high), self.vertices[kept], self.segment[kept])
 
 
-def tube(limbs: Sequence[Posed], around: int, closed: tuple[bool, bool]) -> Tube:
+def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> Tube:
     """The net about limbs, with so many corners around (a multiple of 8), closed at the start or the end or open.
 
     Raises
@@ -206,7 +206,7 @@ def _sides(along: NDArray) -> NDArray:
     return out
 
 
-def _exits(starts: NDArray, ways: NDArray, reach: float, limbs: Sequence[Posed]) -> NDArray:
+def _exits(starts: NDArray, ways: NDArray, reach: float, limbs: Sequence[PosedLimb]) -> NDArray:
     """(N,) [m] along rays, where they leave the last limb.
 
     Raises

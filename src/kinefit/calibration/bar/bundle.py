@@ -56,7 +56,7 @@ class BarBundle:
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class _BarEquations:
     """Normal equations: cameras' H, b; places' Hp (F, 6, 6), bp; cross (F, 6, n)."""
 
     H: NDArray
@@ -87,7 +87,7 @@ class _System:
         return delta, (inverse @ (self.bp - self.cross @ delta)[..., None])[..., 0]
 
 
-class Problem:
+class BarProblem:
     """What was observed, and what may change.
 
     Parameters
@@ -115,7 +115,7 @@ class Problem:
                 break
         return rig, x_world
 
-    def _solve(self, rig: Rig, x_world: NDArray, iterations: int) -> tuple[Rig, NDArray, _System]:
+    def _solve(self, rig: Rig, x_world: NDArray, iterations: int) -> tuple[Rig, NDArray, _BarEquations]:
         system, damping, free = self.system(rig, x_world), 1e-4, self.free.ravel()
         for _ in range(iterations):
             before = system.cost
@@ -137,7 +137,7 @@ class Problem:
                 break
         return rig, x_world, system
 
-    def _components(self, rig: Rig, system: _System) -> None:
+    def _components(self, rig: Rig, system: _BarEquations) -> None:
         """Variances of pixels and distance, each from its squares and its share of the redundancy."""
         cov, ends = self._covariances(rig, system)
         prior = self._prior(rig)[0]
@@ -150,7 +150,7 @@ class Problem:
         left = max(1.0 - float(np.mean(of_length)), 0.05)
         self.scatter = max(square / np.sqrt(left), _LEAST_SCATTER * self.length)
 
-    def _covariances(self, rig: Rig, system: _System) -> tuple[NDArray, NDArray]:
+    def _covariances(self, rig: Rig, system: _BarEquations) -> tuple[NDArray, NDArray]:
         free = self.free.ravel()
         S, _, inverse = system.reduced(free, 0.0)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
@@ -179,7 +179,7 @@ class Problem:
                 pull[c, POSE + 2 :] = -now / deviation**2
         return information.ravel(), pull.ravel()
 
-    def system(self, rig: Rig, x_world: NDArray) -> _System:
+    def system(self, rig: Rig, x_world: NDArray) -> _BarEquations:
         """Linearise at a rig and ends."""
         F, C, P = len(self.uv), len(rig), self.columns
         H, b, cross = np.zeros((C * P, C * P)), np.zeros(C * P), np.zeros((F, 6, C * P))
@@ -220,7 +220,7 @@ class Problem:
         if self.interiors:
             cost += self._square_pixels(rig, H, b)
         misfit, more = self._distances(x_world, Hp, bp)
-        return _System(H, b, Hp, bp, cross, cost + more, residuals, misfit, squares, total)
+        return _BarEquations(H, b, Hp, bp, cross, cost + more, residuals, misfit, squares, total)
 
     def _square_pixels(self, rig: Rig, H: NDArray, b: NDArray) -> float:
         """Add fx - fy = 0 of each camera; its cost."""

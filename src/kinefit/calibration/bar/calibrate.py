@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, Problem
+from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, BarProblem
 from kinefit.calibration.bar.placing import place
-from kinefit.calibration.bar.report import CameraReport, advice_of, reports_of
+from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
 from kinefit.calibration.bar.start import FEWEST, first_pairs, near, resect
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.bar.world import on_floor
@@ -52,7 +52,7 @@ class BarCalibration:
 
     rig: Rig
     length: float
-    cameras: dict[str, CameraReport]
+    cameras: dict[str, BarCameraReport]
     sigma_px: float
     scatter: float
     frames: NDArray
@@ -182,7 +182,7 @@ def _adjusted(
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
         scatter = (1e-3, 1e-3, 1e-4, 1e-4)[n] * length
-        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter)
+        problem = BarProblem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=scatter)
         rig, x_world = problem.adjust(rig, placed.x_world[used], rounds=3 if n < 3 else 8, iterations=20)
         sigma = problem.sigma
     return problem.result(rig, x_world), placed.uv[used], used, placed.ambiguous
@@ -200,7 +200,7 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         if used.sum() < FEWEST:
             return rig, np.inf, 0.0
-        problem = Problem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=5e-3 * length)
+        problem = BarProblem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=5e-3 * length)
         rig, _ = problem.adjust(rig, placed.x_world[used], rounds=2, iterations=15)
         sigma = problem.sigma
         share = used.sum() / max(int((np.isfinite(uv).all(axis=(2, 3)).sum(axis=1) >= 2).sum()), 1)

@@ -13,7 +13,7 @@ from kinefit.geometry.triangulation import triangulate
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class BarPlacement:
     """Ends (F, 2, 3) [m], NaN where unknown; pixels (F, C, 2, 2) in their order, NaN where unused; ambiguous (F,)."""
 
     x_world: NDArray
@@ -21,7 +21,7 @@ class Placement:
     ambiguous: NDArray
 
 
-def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) -> Placement:
+def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) -> BarPlacement:
     """The bar in every frame: of all orders the ends that most cameras agree with and that keep the length.
 
     Frames in which two orders fit alike (two cameras and a bar in the plane through both) are left out.
@@ -60,7 +60,7 @@ def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) 
     keeps = np.abs(np.linalg.norm(x_world[:, 1] - x_world[:, 0], axis=1) - length) < 5 * tolerance
     used &= ((used.sum(axis=1) >= 2) & keeps)[:, None]
     x_world[~used.any(axis=1)] = np.nan
-    return Placement(x_world, np.where(used[:, :, None, None], ordered, np.nan), ambiguous)
+    return BarPlacement(x_world, np.where(used[:, :, None, None], ordered, np.nan), ambiguous)
 
 
 def _agreement(rig: Rig, x: NDArray, uv: NDArray, limit: float) -> tuple[NDArray, NDArray]:

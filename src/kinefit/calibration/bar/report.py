@@ -21,7 +21,7 @@ _PRIOR = 0.5  # share of the information from which on a parameter is told to be
 
 
 @dataclass(frozen=True, eq=False)
-class CameraReport:
+class BarCameraReport:
     """How well one camera was calibrated.
 
     Parameters
@@ -55,7 +55,7 @@ class CameraReport:
 
 def reports_of(
     rig: Rig, bundle: BarBundle, uv: NDArray, seen: Mapping[str, BarViews], length: float, sigma: float
-) -> dict[str, CameraReport]:
+) -> dict[str, BarCameraReport]:
     """Reports of all cameras; rig is the one of the bundle, in the world wanted."""
     interior = len(bundle.covariance) // len(rig) - POSE
     out = {}
@@ -82,7 +82,7 @@ def reports_of(
         used = np.isfinite(left).all(axis=(1, 2))
         names = (*INTERIOR, "x", "y", "z", "rx", "ry", "rz")
         assumed = tuple(name for name, part in zip(INTERIOR, share[POSE:]) if part > _PRIOR) if interior else ()
-        out[camera.name] = CameraReport(
+        out[camera.name] = BarCameraReport(
             float(np.sqrt(np.nanmean(left**2))), len(seen[camera.name].ends), int(used.sum()),
             _coverage(uv[used, c].reshape(-1, 2), camera.size), names, values, std, assumed,
         )
@@ -94,7 +94,7 @@ def _coverage(uv: NDArray, size: tuple[int, int]) -> float:
     return len(np.unique(cells, axis=0)) / _CELLS**2
 
 
-def advice_of(rig: Rig, reports: Mapping[str, CameraReport]) -> list[str]:
+def advice_of(rig: Rig, reports: Mapping[str, BarCameraReport]) -> list[str]:
     """What to record more of."""
     out = []
     for camera in rig:

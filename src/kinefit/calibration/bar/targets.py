@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.board.sources import Frames, Pictures, evenly, opened, sample
+from kinefit.calibration.board.sources import Frames, NumberedImages, evenly, opened, sample
 from kinefit.errors import CalibrationError
 
 _SAMPLES = 25  # images of which the median is the scene without the bar: it is elsewhere in more than half of them
@@ -128,7 +128,7 @@ def _centroid(weight: NDArray) -> tuple[NDArray, float]:
     return centre, float(np.sqrt(large / small))
 
 
-def _still(camera: Pictures | Frames) -> NDArray | None:
+def _still(camera: NumberedImages | Frames) -> NDArray | None:
     images = [_grey(image) for image in sample(camera, _SAMPLES)]
     return np.median(images, axis=0).astype(np.float32) if len(images) >= 5 else None
 

@@ -86,12 +86,12 @@ def adjust_boards(
     """
     jitter = _FIRST_JITTER
     for _ in range(rounds):
-        problem = _Problem(corners, interiors, jitter)
+        problem = _BoardProblem(corners, interiors, jitter)
         rig, Ts_world_board = problem.solve(rig, Ts_world_board, max_iterations)
         before, jitter = jitter, problem.jitter_of(rig, Ts_world_board)
         if all(abs(new / old - 1) < 0.05 for new, old in zip(jitter, before)):
             break
-    problem = _Problem(corners, interiors, jitter)
+    problem = _BoardProblem(corners, interiors, jitter)
     system = problem.system(rig, Ts_world_board)
     position_std, focal_std = _deviations(system)
     left = residuals(rig, Ts_world_board, corners)
@@ -139,7 +139,7 @@ def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[N
 
 
 @dataclass(frozen=True, eq=False)
-class _System:
+class _BoardEquations:
     """Normal equations: cameras' H (C, P, C, P), b; boards' Hb (F, 6, 6), bb; cross (F, 6, C, P); what is free."""
 
     H: NDArray
@@ -172,7 +172,7 @@ class _System:
         return delta.reshape(self.free.shape), (inverse @ right[..., None])[..., 0]
 
 
-class _Problem:
+class _BoardProblem:
     """The corners, what may change, and Σ; views are runs of corners of one camera and frame."""
 
     def __init__(self, corners: Corners, interiors: bool, jitter: tuple[float, float]) -> None:
@@ -213,7 +213,7 @@ class _Problem:
         shift, turn = (float(np.sqrt(np.median(second[:, part].mean(axis=1)))) for part in (slice(0, 3), slice(3, 6)))
         return max(shift, _LEAST_JITTER[0]), max(turn, _LEAST_JITTER[1])
 
-    def system(self, rig: Rig, Ts: NDArray) -> _System:
+    def system(self, rig: Rig, Ts: NDArray) -> _BoardEquations:
         """Linearise at a rig and board poses."""
         corners, C, F, V = self.corners, len(rig), len(Ts), len(self.views)
         P = _POSE + max(interior_parameters(camera) for camera in rig) * self.interiors
@@ -245,7 +245,7 @@ class _Problem:
             bb[f] += M[P:-1, -1]
             cross[f, :, c] += M[P:-1, :P]
             within[start:stop], cost = left, cost + more
-        return _System(H, b, Hb, bb, cross, free, cost, within, eta, spread)
+        return _BoardEquations(H, b, Hb, bb, cross, free, cost, within, eta, spread)
 
     def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         """One view's equations with η taken out; its residuals at the best η, η itself, its variances, the cost."""
@@ -263,7 +263,7 @@ class _Problem:
         return M, rest, eta, np.diag(inverse), float(cost)
 
 
-def _deviations(system: _System) -> tuple[NDArray, NDArray]:
+def _deviations(system: _BoardEquations) -> tuple[NDArray, NDArray]:
     """Standard deviations of the cameras' places [m] and focal lengths [px]."""
     free = system.free
     S = system.reduced(0.0)[0]

@@ -25,7 +25,7 @@ _SURE = 0.005  # of the focal length, one standard deviation
 
 
 @dataclass(frozen=True, eq=False)
-class CameraReport:
+class BoardCameraReport:
     """How well one camera was calibrated.
 
     Parameters
@@ -60,7 +60,7 @@ class BoardCalibration:
     rig : Rig
     board : Board
     cameras : {camera: CameraReport}
-    rms_px, own_rms_px : float [px], as in `CameraReport`, over all cameras.
+    rms_px, own_rms_px : float [px], as in `BoardCameraReport`, over all cameras.
     shared : {(camera, camera): int}
         Frames in which both see the board and agree; empty where only intrinsics were wanted.
     jitter : (float [m], float [rad])
@@ -73,7 +73,7 @@ class BoardCalibration:
 
     rig: Rig
     board: Board
-    cameras: dict[str, CameraReport]
+    cameras: dict[str, BoardCameraReport]
     rms_px: float
     own_rms_px: float
     shared: dict[tuple[str, str], int]
@@ -138,7 +138,7 @@ def _interiors_only(
     if not single:
         raise CalibrationError("intrinsics are given and extrinsics not wanted", remedy="Leave out one of the two.")
     reports = {
-        name: CameraReport(
+        name: BoardCameraReport(
             one.rms_px, one.rms_px, len(seen[name].views), len(one.frames), one.coverage, one.focal_std, np.inf
         )
         for name, one in single.items()
@@ -181,10 +181,12 @@ def _rms(residuals: NDArray) -> float:
     return float(np.sqrt(np.nanmean(np.sum(residuals**2, axis=1))))
 
 
-def _report(c: int, seen: CameraViews, single: Interiors | None, placed: Placed, bundle: BoardBundle) -> CameraReport:
+def _report(
+    c: int, seen: CameraViews, single: Interiors | None, placed: Placed, bundle: BoardBundle
+) -> BoardCameraReport:
     mine = placed.corners.camera == c
     used = len(np.unique(placed.corners.frame[mine]))
-    return CameraReport(
+    return BoardCameraReport(
         _rms(bundle.residuals[mine]), _rms(bundle.within[mine]), len(seen.views),
         len(single.frames) if single else used, coverage(seen), float(bundle.focal_std[c]),
         float(bundle.position_std[c]),
@@ -192,7 +194,7 @@ def _report(c: int, seen: CameraViews, single: Interiors | None, placed: Placed,
 
 
 def _advice(
-    rig: Rig, reports: Mapping[str, CameraReport], shared: Mapping[tuple[str, str], int], count: int
+    rig: Rig, reports: Mapping[str, BoardCameraReport], shared: Mapping[tuple[str, str], int], count: int
 ) -> list[str]:
     out = []
     for camera in rig:

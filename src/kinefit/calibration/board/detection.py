@@ -121,7 +121,7 @@ class Board:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """A board in one picture: its corners `ids` (n,) at `uv` (n, 2) [px]; `mirrored` where its back was seen."""
 
     frame: int
@@ -135,10 +135,10 @@ class CameraViews:
     """All that one camera saw of the board: picture size (width, height) [px] and the views, by rising frame."""
 
     size: tuple[int, int]
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
 
     @property
-    def frames(self) -> dict[int, View]:
+    def frames(self) -> dict[int, BoardView]:
         """{frame: view}."""
         return {view.frame: view for view in self.views}
 
@@ -164,7 +164,7 @@ class Finder:
             pattern.setLegacyPattern(board.legacy)
             self._detector = cv2.aruco.CharucoDetector(pattern)
 
-    def find(self, image: NDArray, frame: int) -> View | None:
+    def find(self, image: NDArray, frame: int) -> BoardView | None:
         """The board in a picture (H, W, 3) RGB or (H, W) grey; None where it is not seen."""
         grey = _grey(image)
         if self.board.kind == "checkerboard":
@@ -177,7 +177,7 @@ class Finder:
                 return view
         return None
 
-    def _charuco(self, grey: NDArray, frame: int, inverted: bool, mirrored: bool) -> View | None:
+    def _charuco(self, grey: NDArray, frame: int, inverted: bool, mirrored: bool) -> BoardView | None:
         grey = 255 - grey if inverted else grey
         uv, ids, _, _ = self._detector.detectBoard(np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey)
         if ids is None or len(ids) < _FEWEST:
@@ -187,9 +187,9 @@ class Finder:
             return None
         if mirrored:
             uv[:, 0] = grey.shape[1] - 1 - uv[:, 0]
-        return View(frame, ids.ravel().astype(int), uv, mirrored)
+        return BoardView(frame, ids.ravel().astype(int), uv, mirrored)
 
-    def _checkerboard(self, grey: NDArray, frame: int) -> View | None:
+    def _checkerboard(self, grey: NDArray, frame: int) -> BoardView | None:
         columns, rows = self.board.grid
         flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
         found, uv = cv2.findChessboardCorners(grey, (columns, rows), flags=flags)
@@ -203,7 +203,9 @@ class Finder:
         window = int(np.clip(0.4 * step, 2, 15))  # looks at no corner but its own
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
         points = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).astype(np.float32), (window, window), (-1, -1), stop)
-        return View(frame, np.arange(columns * rows), _upright(points.reshape(rows, columns, 2), grey).reshape(-1, 2))
+        return BoardView(
+            frame, np.arange(columns * rows), _upright(points.reshape(rows, columns, 2), grey).reshape(-1, 2)
+        )
 
 
 def _upright(grid: NDArray, grey: NDArray) -> NDArray:

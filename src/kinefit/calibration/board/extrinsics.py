@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.calibration.board.bundle import Corners
-from kinefit.calibration.board.detection import Board, CameraViews, View
+from kinefit.calibration.board.detection import Board, BoardView, CameraViews
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, transform
@@ -26,7 +26,7 @@ _FEW = 3  # frames that agree by chance
 class Poses:
     """What one camera's view tells of the board: candidates (K, 4, 4) T_camera_board, best first, and rays (n, 2)."""
 
-    view: View
+    view: BoardView
     Ts_camera_board: NDArray
     xy: NDArray  # (n, 2) normalised picture coordinates
 
@@ -70,11 +70,11 @@ def place_cameras(cameras: Mapping[str, Camera], seen: Mapping[str, CameraViews]
     return _place_boards(rig, poses, board, votes)
 
 
-def _poses(camera: Camera, view: View, board: Board) -> Poses:
+def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
     """Both poses of a flat board that its picture allows (T. Collins and A. Bartoli, IJCV 2014)."""
     rays = camera.with_pose(np.eye(4)).ray(view.uv)
     ok = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)
-    view = View(view.frame, view.ids[ok], view.uv[ok], view.mirrored)
+    view = BoardView(view.frame, view.ids[ok], view.uv[ok], view.mirrored)
     xy = rays[ok, :2] / rays[ok, 2:]
     candidates: list[tuple[float, NDArray]] = []
     if len(xy) >= 4:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.board.detection import Board, CameraViews, View
+from kinefit.calibration.board.detection import Board, BoardView, CameraViews
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 
@@ -90,13 +90,13 @@ def coverage(seen: CameraViews) -> float:
     return len(np.unique(cells, axis=0)) / _CELLS**2
 
 
-def _flags(views: list[View], size: tuple[int, int]) -> int:
+def _flags(views: list[BoardView], size: tuple[int, int]) -> int:
     uv, half = np.concatenate([view.uv for view in views]), np.array(size) / 2
     reach = np.quantile(np.linalg.norm(uv - half, axis=1), 0.98) / np.linalg.norm(half)
     return 0 if len(views) >= _MANY_VIEWS and reach > _REACH else cv2.CALIB_FIX_K3
 
 
-def _calibrate(views: list[View], size: tuple[int, int], board: Board, flags: int) -> tuple:
+def _calibrate(views: list[BoardView], size: tuple[int, int], board: Board, flags: int) -> tuple:
     """OpenCV's calibration; with the centre fixed to the picture's where it would wander without sense."""
     x = [board.corners[view.ids].astype(np.float32) for view in views]
     uv = [view.uv.reshape(-1, 1, 2).astype(np.float32) for view in views]
@@ -119,7 +119,7 @@ def _tilt(rotations: list[NDArray]) -> float:
     return float(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
 
 
-def _spread(views: list[View], size: tuple[int, int]) -> list[View]:
+def _spread(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
     """Views that differ most in place, size and shape of the board: farthest first (T. Gonzalez, 1985)."""
     if len(views) <= _MOST_VIEWS:
         return views
@@ -132,7 +132,7 @@ def _spread(views: list[View], size: tuple[int, int]) -> list[View]:
     return [views[i] for i in sorted(chosen)]
 
 
-def _shape(view: View, size: tuple[int, int]) -> NDArray:
+def _shape(view: BoardView, size: tuple[int, int]) -> NDArray:
     centre, spread = view.uv.mean(axis=0) / size, np.cov(view.uv.T)
     root = np.sqrt(np.linalg.det(spread) + 1e-9)
     return np.array([*centre, np.log(root) / 4, spread[0, 0] / root / 4, spread[0, 1] / root / 2])

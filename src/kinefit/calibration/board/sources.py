@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from kinefit._pictures import read_picture
 from kinefit.calibration.board.detection import (
     Board,
+    BoardView,
     CameraViews,
     Finder,
-    View,
     fitting_boards,
     with_dictionary,
 )
@@ -31,7 +31,7 @@ _PAIRED = 5  # frames by which videos of one recording differ where one recorder
 Progress = Callable[[str, int, int], object]
 
 
-class Pictures:
+class NumberedImages:
     """Pictures of one camera by frame number; as `Video`, but some frames may be missing."""
 
     def __init__(self, files: Mapping[int, Path]) -> None:
@@ -168,7 +168,7 @@ def find_boards(
             board = with_dictionary(board, [image for o in cameras.values() for image in sample(o, 4)])
         finder, seen, total = Finder(board), {}, len(wanted) * len(cameras)
         for n, (name, camera) in enumerate(cameras.items()):
-            views: list[View] = []
+            views: list[BoardView] = []
             own = set(camera.numbers)
             for i, frame in enumerate(wanted):
                 view = finder.find(camera.read(frame), frame) if frame in own else None
@@ -185,7 +185,7 @@ def find_boards(
 
 
 @contextmanager
-def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, Pictures | Frames]]:
+def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, NumberedImages | Frames]]:
     """The cameras of `camera_sources`, open; closed at the end.
 
     Raises
@@ -193,10 +193,10 @@ def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, 
     CalibrationError
         Videos of different lengths.
     """
-    cameras: dict[str, Pictures | Frames] = {}
+    cameras: dict[str, NumberedImages | Frames] = {}
     try:
         for name, source in sources.items():
-            cameras[name] = Pictures(source) if isinstance(source, dict) else Frames(source)
+            cameras[name] = NumberedImages(source) if isinstance(source, dict) else Frames(source)
         _check_lengths({name: len(o) for name, o in cameras.items() if isinstance(o, Frames)})
         yield cameras
     finally:
@@ -204,7 +204,7 @@ def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, 
             camera.close()
 
 
-def evenly(cameras: Mapping[str, Pictures | Frames], max_frames: int, include: Sequence[int] = ()) -> list[int]:
+def evenly(cameras: Mapping[str, NumberedImages | Frames], max_frames: int, include: Sequence[int] = ()) -> list[int]:
     """Numbers of at most so many frames, evenly over the recording, and of those to include that there are."""
     frames = sorted({frame for camera in cameras.values() for frame in camera.numbers})
     chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).astype(int)}
@@ -220,13 +220,13 @@ def _check_lengths(lengths: Mapping[str, int]) -> None:
         )
 
 
-def sample(source: Pictures | Frames, count: int) -> list[NDArray]:
+def sample(source: NumberedImages | Frames, count: int) -> list[NDArray]:
     """So many images, evenly over the recording."""
     frames = source.numbers
     return [source.read(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
 
 
-def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | Frames], others: bool) -> None:
+def _refuse(board: Board, unseen: list[str], opened: Mapping[str, NumberedImages | Frames], others: bool) -> None:
     place = f"camera{'s' * (len(unseen) > 1)} {', '.join(unseen)}"
     if others:
         raise CalibrationError(
@@ -246,7 +246,7 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, Pictures | Fra
     )
 
 
-def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, Pictures | Frames]) -> None:
+def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, NumberedImages | Frames]) -> None:
     """Refuse a board that is a part of a larger one: which part, differs from picture to picture."""
     shown = [source.read(seen[name].views[i].frame) for name, source in opened.items() for i in (0, -1)]
     for other in fitting_boards(board, shown[:4])[:1]:

@@ -13,10 +13,10 @@ from kinefit.calibration.check.sensor_verdicts import sensor_findings
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.diagnostics.keypoints import Check, Progress, check_keypoints
 from kinefit.diagnostics.scene import lens_findings
-from kinefit.diagnostics.sensor_fit import SensorFit
+from kinefit.diagnostics.sensor_fit import SensorAlignment
 from kinefit.errors import KinefitError, command
 from kinefit.findings import Finding, ranked
-from kinefit.multiview.followed import Followed, follow
+from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.one_camera import is_alone
@@ -71,7 +71,7 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     return _with_sensors(check, progress)
 
 
-def _others(one: Followed, asked: bool) -> list[Finding]:
+def _others(one: PersonKeypoints, asked: bool) -> list[Finding]:
     """Who else is in view."""
     if len(one.people) < 2:
         return []
@@ -85,7 +85,7 @@ def _with_sensors(check: Check, progress: Progress | None) -> Check:
     take, seen = check.take, check.observations
     if take is None or seen is None or not (take.depth or take.markers):
         return check
-    fits: tuple[SensorFit, ...] = ()
+    fits: tuple[SensorAlignment, ...] = ()
     if check.faults:
         text = "Whether other sensors fit the videos was not looked at: first the faults must be fixed."
         found = [Finding("note", "sensor", text)]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kinefit.diagnostics.sensor_fit import SURE, SensorFit, marker_index
+from kinefit.diagnostics.sensor_fit import SURE, SensorAlignment, marker_index
 from kinefit.errors import command
 from kinefit.findings import Finding
 from kinefit.geometry import se3
@@ -18,12 +18,12 @@ from kinefit.readers.take.file import Take
 _LATE = 0.01  # [s] by which a clock must be off: 1 cm of somebody who walks
 
 
-def misfits(fits: Iterable[SensorFit]) -> tuple[SensorFit, ...]:
+def misfits(fits: Iterable[SensorAlignment]) -> tuple[SensorAlignment, ...]:
     """Those that surely do not fit, by more than is usual."""
     return tuple(f for f in fits if f.misfit)
 
 
-def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
+def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding]:
     """A fault for each sensor that does not fit, a doubt for each clock that is off, good news of all others."""
     out, wrong, file = [], misfits(fits), take.path.name
     for fit in fits:
@@ -57,12 +57,12 @@ def sensor_findings(fits: Sequence[SensorFit], take: Take) -> list[Finding]:
     return out
 
 
-def amount(fit: SensorFit) -> str:
+def amount(fit: SensorAlignment) -> str:
     """Its shift in millimetres, with the bar."""
     return f"{1e3 * fit.shift:.1f} ± {1e3 * fit.bars[0]:.1f} mm"
 
 
-def told(fit: SensorFit) -> str:
+def told(fit: SensorAlignment) -> str:
     """What a refinement does to a sensor, or why it does nothing, in one line."""
     if fit.doubts:
         return f"{fit.sensor}: not refined, because {'; '.join(fit.doubts)}."
@@ -70,7 +70,7 @@ def told(fit: SensorFit) -> str:
     return f"{fit.sensor}: turned {turn:.2f} ± {bar:.2f}°, moved {amount(fit)} at the person (95 %)"
 
 
-def moved_cameras(fits: Iterable[SensorFit], take: Take, rig: Rig) -> Rig:
+def moved_cameras(fits: Iterable[SensorAlignment], take: Take, rig: Rig) -> Rig:
     """The depth cameras among the sensors where they belong, named as in the calibration.
 
     Parameters
@@ -86,12 +86,12 @@ def moved_cameras(fits: Iterable[SensorFit], take: Take, rig: Rig) -> Rig:
     return Rig(tuple(out))
 
 
-def marker_entry(fit: SensorFit, take: Take) -> MarkersEntry:
+def marker_entry(fit: SensorAlignment, take: Take) -> MarkersEntry:
     """The table of a marker system in the take."""
     return take.markers[marker_index(fit.sensor)]
 
 
-def marker_lines(fit: SensorFit, take: Take) -> tuple[str, str]:
+def marker_lines(fit: SensorAlignment, take: Take) -> tuple[str, str]:
     """The two lines of [[markers]] that put a marker system where it belongs."""
     T = fit.T @ marker_entry(fit, take).T_world_file
     turn, shift = np.degrees(se3.log_so3(T[:3, :3])), T[:3, 3]

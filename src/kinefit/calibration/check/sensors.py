@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
-from kinefit.diagnostics.sensor_fit import PRIOR, SensorFit, doubts_of
+from kinefit.diagnostics.sensor_fit import PRIOR, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
@@ -62,7 +62,7 @@ _CLOCK = 0.02  # [s] standard deviation of a clock
 
 def fit_sensors(
     take: Take, seen: Observations, rig: Rig | None = None, *, frames: int = FRAMES, progress: Progress | None = None
-) -> tuple[SensorFit, ...]:
+) -> tuple[SensorAlignment, ...]:
     """How the depth cameras and marker systems of a take lie against the cameras with keypoints.
 
     Parameters
@@ -95,7 +95,7 @@ def fit_sensors(
     motion = track(alone, body, subject=person, progress=progress)
     origins = {name: recording.rig[name].centre_world for name in depth}
     origins |= {marker_sensor(take, k): entry.T_world_file[:3, 3] for k, entry in enumerate(take.markers)}
-    problem = _Problem(recording, motion, person, frozenset(depth), origins)
+    problem = _PlacementProblem(recording, motion, person, frozenset(depth), origins)
     chosen = problem.chosen(frames)
     return problem.fits(chosen) if len(chosen) >= _FEWEST else ()
 
@@ -111,7 +111,7 @@ class _Look:
     velocity: NDArray
 
 
-class _Problem:
+class _PlacementProblem:
     """A recording, tracked in its keypoints alone, and the sensors that are to be placed."""
 
     def __init__(
@@ -156,7 +156,7 @@ class _Problem:
         some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
         return some[spread(len(some), most)]
 
-    def fits(self, chosen: NDArray) -> tuple[SensorFit, ...]:
+    def fits(self, chosen: NDArray) -> tuple[SensorAlignment, ...]:
         """How the sensors lie, by frames of the motion; those that do not fit by each half of the frames too."""
         looks = [self.look(int(f)) for f in chosen]
         self.names = tuple(dict.fromkeys(f.sensor for look in looks for f in look.seen))
@@ -171,7 +171,7 @@ class _Problem:
             out = [self.judged(looks, fit, (a[k], b[k]), ends.get(fit.sensor)) for k, fit in enumerate(out)]
         return tuple(out)
 
-    def with_surface(self, fit: SensorFit) -> SensorFit:
+    def with_surface(self, fit: SensorAlignment) -> SensorAlignment:
         """A fit whose covariance counts what the surface leaves wrong in all frames alike."""
         if fit.kind != "depth":
             return fit
@@ -179,8 +179,12 @@ class _Problem:
         return replace(fit, covariance=fit.covariance + np.diag(_SURFACE**2) + _UPRIGHT**2 * np.outer(up, up))
 
     def judged(
-        self, looks: Sequence[_Look], fit: SensorFit, halves: tuple[SensorFit, SensorFit], ends: Ends | None
-    ) -> SensorFit:
+        self,
+        looks: Sequence[_Look],
+        fit: SensorAlignment,
+        halves: tuple[SensorAlignment, SensorAlignment],
+        ends: Ends | None,
+    ) -> SensorAlignment:
         """A fit whose bars hold what two halves of the frames disagree by, and why it is not to be used."""
         if not fit.misfit:
             return fit
@@ -220,7 +224,7 @@ class _Problem:
         place = replace(self.place, sensors=(sensor,))
         return Registration(sensor, self.measured(own, {}, self.wide), scenes, self.centre, place.information[:6, :6])
 
-    def fitted(self, looks: Sequence[_Look], near: Mapping[str, NDArray]) -> list[SensorFit]:
+    def fitted(self, looks: Sequence[_Look], near: Mapping[str, NDArray]) -> list[SensorAlignment]:
         """The fit of everything in some frames, from twists (7,) of the sensors."""
         twists = dict(near)
         for sensor in self.depth & set(self.names):
@@ -235,7 +239,7 @@ class _Problem:
             k = found.names.index(f"{sensor} {AXES[0]}")
             part = slice(k, k + 7)
             C, kind = found.covariance[part, part], "depth" if sensor in self.depth else "markers"
-            out.append(SensorFit(sensor, kind, found.mean[part], C, self.centre))
+            out.append(SensorAlignment(sensor, kind, found.mean[part], C, self.centre))
         return out
 
     def fit(

@@ -17,7 +17,7 @@ from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.calibration.refine.gauge import resized
 from kinefit.calibration.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.calibration.refine.result import Refinement
-from kinefit.calibration.refine.sightings import Progress, Sighting
+from kinefit.calibration.refine.sightings import PersonSighting, Progress
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
@@ -85,7 +85,7 @@ def calibrate_people(
     prior_std[:, :3], prior_std[:, 3:6] = _ANYWHERE
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
-    def stand(rig: Rig, seen: Sighting) -> tuple[Rig, str]:
+    def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
     return refine_from(
@@ -169,7 +169,7 @@ def _above_soles(body: Body, points: PointSet) -> NDArray:
 
 
 def _on_the_floor(
-    rig: Rig, seen: Sighting, generic: Body, height: float | None, known_length: Length | None, up: str
+    rig: Rig, seen: PersonSighting, generic: Body, height: float | None, known_length: Length | None, up: str
 ) -> tuple[Rig, str]:
     """The rig with floor, origin and scale by the rule, and the rule."""
     body = seen.motion.body

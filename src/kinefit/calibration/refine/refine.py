@@ -12,8 +12,8 @@ from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
 from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
 from kinefit.calibration.refine.sightings import (
+    PersonSighting,
     Progress,
-    Sighting,
     body_model,
     pixel_frames,
     sight,
@@ -44,7 +44,7 @@ _IMPLAUSIBLE = 0.02  # of the image's diagonal: a camera left with more is anoth
 
 StaticPoints = Mapping[str, Mapping[str, tuple[float, float]]]
 Length = tuple[str, str, float]
-Gauge = Callable[[Rig, Sighting], tuple[Rig, str]]
+Gauge = Callable[[Rig, PersonSighting], tuple[Rig, str]]
 
 
 @renamed(accuracy="sigma")
@@ -91,7 +91,7 @@ def refine(
     check_input(rig, keypoints, height, known_length, static_points)
     prior_std = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
 
-    def gauge(new: Rig, seen: Sighting) -> tuple[Rig, str]:
+    def gauge(new: Rig, seen: PersonSighting) -> tuple[Rig, str]:
         return _in_old_frame(new, rig, seen, static_points or {}, height, known_length)
 
     return refine_from(
@@ -119,7 +119,7 @@ def refine_from(
     step = progress or (lambda *_: None)
     names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
     offsets = np.zeros(len(rig))
-    first: Sighting | None = None
+    first: PersonSighting | None = None
     rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
@@ -158,7 +158,7 @@ def refine_from(
 
 def _sight(
     rig: Rig, keypoints: Sequence[Keypoints], body: Body, sigma: float, up: str, offsets: NDArray
-) -> Sighting:
+) -> PersonSighting:
     try:
         late = dict(zip(rig.names, offsets.tolist(), strict=True))
         return sight(rig, keypoints, body, sigma=sigma, up=up, offsets=late)
@@ -188,7 +188,7 @@ def _static_residuals(rig: Rig, static: PointPixels, names: tuple[str, ...]) -> 
 
 
 def _in_old_frame(
-    rig: Rig, old: Rig, seen: Sighting, static: StaticPoints, height: float | None, known_length: Length | None
+    rig: Rig, old: Rig, seen: PersonSighting, static: StaticPoints, height: float | None, known_length: Length | None
 ) -> tuple[Rig, str]:
     """The rig in the old frame and with the right scale, and the rule in words."""
     rule = "The world is the old calibration's: all cameras together stay as near as they can to where they were"
@@ -209,7 +209,7 @@ def _in_old_frame(
     return aligned(resized(rig, metres / length), old, scale=False)[0], f"{rule} in place and turn{text}."
 
 
-def length_of(seen: Sighting, a: str, b: str) -> float:
+def length_of(seen: PersonSighting, a: str, b: str) -> float:
     """[m] median distance between two keypoints of the person as tracked."""
     x = seen.motion.positions(seen.channels.with_points(seen.motion.body).points.select((a, b)))
     return float(np.median(np.linalg.norm(x[:, 0] - x[:, 1], axis=1)))
@@ -244,7 +244,7 @@ def check_input(
             rig.index(camera)
 
 
-def _check_frames(seen: Sighting, frames: NDArray) -> None:
+def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
     if len(frames) < _LEAST_FRAMES:
         raise CalibrationError(
             f"only {len(frames)} of {len(seen.motion)} frames show the person well enough to refine the cameras",

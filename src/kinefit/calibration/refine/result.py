@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.refine.sightings import Sighting
+from kinefit.calibration.refine.sightings import PersonSighting
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.solvers.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
@@ -102,7 +102,7 @@ class Refinement:
 
 
 def changes_of(
-    old: Rig, rig: Rig, first: Sighting, last: Sighting, covariance: NDArray, offsets: NDArray
+    old: Rig, rig: Rig, first: PersonSighting, last: PersonSighting, covariance: NDArray, offsets: NDArray
 ) -> tuple[dict[str, CameraChange], float]:
     """What was done to each camera, and how far [m] a point may lie from where it is.
 
@@ -132,7 +132,7 @@ def changes_of(
     return out, distance
 
 
-def _left(seen: Sighting, camera: int) -> NDArray:
+def _left(seen: PersonSighting, camera: int) -> NDArray:
     """(M, 2) [px] what a camera's keypoints left over, seen ones alone."""
     mine = seen.residuals[:, seen.channels.camera == camera].reshape(-1, 2)
     mine = mine[np.isfinite(mine).all(axis=1)]

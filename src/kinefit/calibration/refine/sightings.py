@@ -30,7 +30,7 @@ _TRACKED = 0.3  # quality of a frame that counts
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class PersonSighting:
     """One person as tracked with a rig.
 
     Parameters
@@ -92,7 +92,7 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
 def sight(
     rig: Rig, keypoints: Sequence[Keypoints], body: Body, *, sigma: float, up: str,
     offsets: Mapping[str, float], progress: Progress | None = None,
-) -> Sighting:  # fmt: skip
+) -> PersonSighting:  # fmt: skip
     """Track one person with a rig whose cameras' clocks are late by `offsets` [s]."""
     alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
     channels = make_channels(body, rig, alone, choose_people(rig, alone), [sigma] * len(alone))
@@ -102,10 +102,10 @@ def sight(
     uv = np.concatenate([motion.residuals[name].measured for name in channels.sources], axis=1)
     own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)
     confidence = np.where(own, channels.confidence, channels.confidence[:, channels.partner])
-    return Sighting(channels, subject, motion, uv, np.where(np.isfinite(uv).all(axis=-1), confidence, 0.0))
+    return PersonSighting(channels, subject, motion, uv, np.where(np.isfinite(uv).all(axis=-1), confidence, 0.0))
 
 
-def body_model(sighting: Sighting, body: Body) -> tuple[ShapeParameters, NDArray]:
+def body_model(sighting: PersonSighting, body: Body) -> tuple[ShapeParameters, NDArray]:
     """The generic body's lengths and points as parameters with their prior, and (p,) what the subject's fit found."""
     subject, points = sighting.subject, sighting.channels.points
     found = () if subject.fit is None else subject.fit.parameters
@@ -120,13 +120,13 @@ def body_model(sighting: Sighting, body: Body) -> tuple[ShapeParameters, NDArray
     return model, theta
 
 
-def spread_frames(sighting: Sighting, most: int) -> NDArray:
+def spread_frames(sighting: PersonSighting, most: int) -> NDArray:
     """Frames with a trusted pose, spread evenly over the take."""
     good = np.flatnonzero(sighting.motion.quality > _TRACKED)
     return good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).astype(int))] if len(good) else good
 
 
-def pixel_frames(sighting: Sighting, frames: NDArray) -> tuple[PixelFrames, NDArray]:
+def pixel_frames(sighting: PersonSighting, frames: NDArray) -> tuple[PixelFrames, NDArray]:
     """Measurements of some frames, and the pixels' velocities (F, N, 2) [px/s].
 
     Errors of a detector's points on one segment in one view come together (a hidden shoulder, a blurred face): n points
@@ -143,14 +143,14 @@ def pixel_frames(sighting: Sighting, frames: NDArray) -> tuple[PixelFrames, NDAr
     )
 
 
-def _groups(sighting: Sighting) -> NDArray:
+def _groups(sighting: PersonSighting) -> NDArray:
     """(N,) int: channels of one source on one segment."""
     c = sighting.channels
     key = c.source * len(sighting.motion.body.tree.segments) + c.points.segments[c.column]
     return np.unique(key, return_inverse=True)[1]
 
 
-def togetherness(sighting: Sighting) -> float:
+def togetherness(sighting: PersonSighting) -> float:
     """Correlation, 0..1, of the residuals of points on one segment in one view."""
     values = sighting.trusted
     seen = np.isfinite(values).all(axis=-1)
@@ -164,7 +164,7 @@ def togetherness(sighting: Sighting) -> float:
     return float(np.clip(cross.sum(where=count > 1) / expected, 0.0, 1.0)) if expected > 0 else 0.0
 
 
-def velocities(sighting: Sighting) -> NDArray:
+def velocities(sighting: PersonSighting) -> NDArray:
     """(F, N, 2) [px/s] of every channel's point as tracked; 0 where it cannot be seen."""
     c, motion = sighting.channels, sighting.motion
     x = motion.positions(c.with_points(motion.body).points)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
-from kinefit.calibration.refine.sightings import Sighting, correlation_time
+from kinefit.calibration.refine.sightings import PersonSighting, correlation_time
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.body_bundle import BodyBundle, fit_body_and_cameras
 from kinefit.solvers.cameras import CameraPrior, PointPixels, departure
@@ -19,7 +19,7 @@ from kinefit.solvers.shape import PixelFrames, ShapeParameters
 _FRAMES = 40  # that the parts are compared over
 
 
-def chance(bundle: BodyBundle, prior: CameraPrior, seen: Sighting, frames: NDArray) -> NDArray:
+def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames: NDArray) -> NDArray:
     """Covariance (C · 10, C · 10) of the cameras for errors that come and go.
 
     They are as large, and last as long, as the residuals without each channel's mean.

@@ -43,7 +43,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Doubt:
     """One doubt: of one kind, about one segment ("" for the whole body) or one sensor (name, unit, usual residual)."""
 
     kind: str  # "nobody", "weak", "unseen", "against", "wide" or "off"
@@ -154,25 +154,25 @@ def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
     return stretches(flags, round(_GAP * motion.rate))
 
 
-def _whole_body(motion: Motion) -> Iterable[_Found]:
+def _whole_body(motion: Motion) -> Iterable[_Doubt]:
     nobody = motion.quality <= 0
     for start, stop in stretches(nobody):
-        yield _Found("nobody", start, stop, (start + stop) // 2, stop - start)
+        yield _Doubt("nobody", start, stop, (start + stop) // 2, stop - start)
     for start, stop in _runs(motion, (motion.quality < DOUBTFUL) & ~nobody):
         q = np.where(nobody[start:stop], 1.0, motion.quality[start:stop])
-        yield _Found("weak", start, stop, start + int(np.argmin(q)), float(np.sum(1 - q)), amount=100 * float(q.min()))
+        yield _Doubt("weak", start, stop, start + int(np.argmin(q)), float(np.sum(1 - q)), amount=100 * float(q.min()))
 
 
-def _lost(motion: Motion) -> Iterable[_Found]:
+def _lost(motion: Motion) -> Iterable[_Doubt]:
     share = 1 / len(motion.body.tree.segments)
     gone = motion.lost & (motion.quality > 0)[:, None]
     for kind, of in (("unseen", motion.segment_quality <= 0), ("against", motion.segment_quality > 0)):
         for s, name in enumerate(motion.body.tree.segments):
             for start, stop in _runs(motion, gone[:, s] & of[:, s]):
-                yield _Found(kind, start, stop, (start + stop) // 2, share * (stop - start), name)
+                yield _Doubt(kind, start, stop, (start + stop) // 2, share * (stop - start), name)
 
 
-def _wide(motion: Motion) -> Iterable[_Found]:
+def _wide(motion: Motion) -> Iterable[_Doubt]:
     share = 0.5 / len(motion.body.tree.segments)
     std = np.linalg.norm(motion.joint_std, axis=-1)
     usual = np.median(std, axis=0) if len(std) else np.zeros(std.shape[1])
@@ -181,10 +181,10 @@ def _wide(motion: Motion) -> Iterable[_Found]:
         for start, stop in _runs(motion, doubtful[:, s]):
             part = np.where(doubtful[start:stop, s], std[start:stop, s], 0.0)
             worst = start + int(np.argmax(part))
-            yield _Found("wide", start, stop, worst, share * (stop - start), name, amount=200 * float(part.max()))
+            yield _Doubt("wide", start, stop, worst, share * (stop - start), name, amount=200 * float(part.max()))
 
 
-def _off(motion: Motion) -> Iterable[_Found]:
+def _off(motion: Motion) -> Iterable[_Doubt]:
     share = 0.5 / max(len(motion.residuals), 1)
     for name, r in motion.residuals.items():
         level = frame_residuals(r) * (1 if r.unit == "px" else 1000)
@@ -200,12 +200,12 @@ def _off(motion: Motion) -> Iterable[_Found]:
             unit = "px" if r.unit == "px" else "mm"
             worst, sensor = start + int(np.argmax(part)), (name, unit, usual)
             score, most = share * float(excess.sum()), float(part.max())
-            yield _Found("off", start, stop, worst, score, amount=most, sensor=sensor)
+            yield _Doubt("off", start, stop, worst, score, amount=most, sensor=sensor)
 
 
-def _merged(found: Iterable[_Found]) -> list[Moment]:
+def _merged(found: Iterable[_Doubt]) -> list[Moment]:
     """What shares more than half of its time becomes one moment; of the same segment, half of the shorter's time."""
-    groups: list[list[_Found]] = []
+    groups: list[list[_Doubt]] = []
     spans: list[tuple[int, int]] = []
     for f in sorted(found, key=lambda f: -f.score):
         for k, (start, stop) in enumerate(spans):
@@ -229,7 +229,7 @@ def _merged(found: Iterable[_Found]) -> list[Moment]:
     ]  # fmt: skip
 
 
-def _sentences(group: Sequence[_Found]) -> Iterable[str]:
+def _sentences(group: Sequence[_Doubt]) -> Iterable[str]:
     """What a moment's findings say; what is the same of several segments is said once, of all."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]

@@ -14,7 +14,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
-from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
+from kinefit.exporters.skeletons.tubes import TubeMesh, body_mesh
 from kinefit.motion import Motion
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -90,7 +90,7 @@ class _Buffer:
         return len(self.accessors) - 1
 
 
-def _mesh(mesh: SkinnedMesh, buffer: _Buffer) -> gl.Mesh:
+def _mesh(mesh: TubeMesh, buffer: _Buffer) -> gl.Mesh:
     weights = mesh.weights.astype(np.float32)
     segments = np.where(weights > 0, mesh.segments, 0).astype(np.uint16)
     colours = np.pad(mesh.colours, ((0, 0), (0, 1)), constant_values=255)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.skeletons.common import convention
-from kinefit.exporters.skeletons.tubes import SkinnedMesh
+from kinefit.exporters.skeletons.tubes import TubeMesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.motion_columns import continuous_quaternions
@@ -66,7 +66,7 @@ class Rest:
             places.append(Ts[..., :3, 3].copy())
         return np.concatenate(turns), np.concatenate(places)
 
-    def posed(self, mesh: SkinnedMesh, body: Body) -> SkinnedMesh:
+    def posed(self, mesh: TubeMesh, body: Body) -> TubeMesh:
         """A mesh about the body, which rests as the body does, in this rest pose."""
         if not len(mesh.vertices):
             return mesh

@@ -16,7 +16,7 @@ LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
 
 
 @dataclass(frozen=True, eq=False)
-class SkinnedMesh:
+class TubeMesh:
     """Mesh in the root frame at rest.
 
     Parameters
@@ -42,7 +42,7 @@ def side_colour(name: str) -> tuple[int, int, int]:
     return LEFT if name.endswith("_l") else RIGHT if name.endswith("_r") else CENTRE
 
 
-def body_mesh(body: Body) -> SkinnedMesh:
+def body_mesh(body: Body) -> TubeMesh:
     """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that hang together.
 
     Near a joint tubes and skins follow both segments.
@@ -52,9 +52,9 @@ def body_mesh(body: Body) -> SkinnedMesh:
     parts += [_skin(body, skin) for skin in body_skins(body)]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
-        return SkinnedMesh(*(np.zeros((0, count), kind) for count, kind in columns))
+        return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
     first = np.cumsum([0] + [len(p.vertices) for p in parts])
-    return SkinnedMesh(
+    return TubeMesh(
         vertices=np.concatenate([p.vertices for p in parts]),
         normals=np.concatenate([p.normals for p in parts]),
         colours=np.concatenate([p.colours for p in parts]),
@@ -84,9 +84,9 @@ def _normals(vertices: NDArray, faces: NDArray) -> NDArray:
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
 
-def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
+def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
     count = len(mesh.vertices)
-    return SkinnedMesh(
+    return TubeMesh(
         vertices=mesh.vertices + body.tree.rest[mesh.segment],
         normals=_normals(mesh.vertices, mesh.faces),
         colours=np.tile(np.array(side_colour(body.tree.segments[mesh.segment]), np.uint8), (count, 1)),
@@ -96,19 +96,19 @@ def _rigid(body: Body, mesh: MeshSurface) -> SkinnedMesh:
     )
 
 
-def _skin(body: Body, skin: BodySkin) -> SkinnedMesh:
+def _skin(body: Body, skin: BodySkin) -> TubeMesh:
     there, faces, every = skin.mesh()
     vertices = skin.at_rest(there, every)
     order = np.argsort(-every, axis=1)[:, :FOLLOWED]
     weights = np.take_along_axis(every, order, axis=1)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
-    return SkinnedMesh(
+    return TubeMesh(
         vertices=vertices, normals=_normals(vertices, faces), colours=colours[order[:, 0]], triangles=faces,
         segments=np.where(weights > 0.0, order, 0), weights=weights,
     )
 
 
-def _tube(body: Body, c: TaperedCylinder) -> SkinnedMesh:
+def _tube(body: Body, c: TaperedCylinder) -> TubeMesh:
     tree, start, radii = body.tree, np.array(c.start), c.mean_radii
     length, (side, across, u) = c.length, c.axes
     if is_last(body, c):  # the last of a limb is as long, with its rounded end, as its surface
@@ -125,7 +125,7 @@ def _tube(body: Body, c: TaperedCylinder) -> SkinnedMesh:
     vertices = np.concatenate([[along[0] * u], points[1:-1].reshape(-1, 3), [along[-1] * u]])
     heights = np.concatenate([[along[0]], np.repeat(along[1:-1], AROUND), [along[-1]]])
     segments, weights = _weights(body, c, heights, length)
-    return SkinnedMesh(
+    return TubeMesh(
         vertices=vertices + start + tree.rest[c.segment],
         normals=np.concatenate([[-u], normals[1:-1].reshape(-1, 3), [u]]),
         colours=np.tile(np.array(side_colour(tree.segments[c.segment]), np.uint8), (len(vertices), 1)),

@@ -16,7 +16,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
-from kinefit.exporters.skeletons.tubes import SkinnedMesh, body_mesh
+from kinefit.exporters.skeletons.tubes import TubeMesh, body_mesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion, rotation_between_up
 
@@ -151,7 +151,7 @@ def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor
     return animation
 
 
-def _mesh(stage: Any, content: SkinnedMesh, T_skeleton_root: NDArray, factor: float, skeleton: Any) -> None:
+def _mesh(stage: Any, content: TubeMesh, T_skeleton_root: NDArray, factor: float, skeleton: Any) -> None:
     from pxr import Sdf, UsdGeom, UsdSkel, Vt
 
     R = T_skeleton_root[:3, :3]

@@ -42,7 +42,7 @@ def exchanges_in_gaps(
     mean, deviation : (K, K) [m] of distances
     least : [m] by which a label is off its own place, at least
     """
-    places, found = _Places(positions, deviation), list[Exchange]()
+    places, found = _ExpectedPlaces(positions, deviation), list[Exchange]()
     taken = np.zeros(positions.shape[:2], bool)
     for a, first, last in _spans(positions, least):
         rows = slice(first, last + 1)
@@ -60,7 +60,7 @@ def exchanges_in_gaps(
     return found
 
 
-def _goes(places: _Places, a: int, b: int, rows: slice, least: float = 0.0) -> bool:
+def _goes(places: _ExpectedPlaces, a: int, b: int, rows: slice, least: float = 0.0) -> bool:
     """Whether a label is off its own place by more than `least` in all frames, and much nearer to another's."""
     own, across = np.array([*places.off(a, a, rows, b)]), np.array([*places.off(a, b, rows)])
     return bool(own.min() > least and across.max() < min(BETTER * own.min(), _MAX_ACROSS))
@@ -84,7 +84,7 @@ def _spans(positions: NDArray, least: float) -> list[tuple[int, int, int]]:
     return sorted(out, key=lambda span: (span[1] - span[2], span))
 
 
-class _Places:
+class _ExpectedPlaces:
     """Where labels should be: carried by the markers around them from the nearest frames that show them.
 
     Parameters

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.identification.frame.polish import Explanation, apart, carried, cost_of, labels_of, polish, shared
-from kinefit.identification.frame.search import Frame, Search
+from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.identification.frame.tables import segment_tables
 from kinefit.identification.model.model import MarkerModel
 
@@ -75,7 +75,7 @@ class Solution:
     others : what searches from other segments led to
     """
 
-    search: Search
+    search: LabelSearch
     chosen: Explanation
     labels: NDArray
     cost: float
@@ -94,7 +94,7 @@ class Solution:
         return int((self.labels != other.labels).sum()) <= FEW * len(self.labels)
 
 
-def explain(model: MarkerModel, frame: Frame, finest: float, coarsest: float, searches: int = 60) -> Solution:
+def explain(model: MarkerModel, frame: UnlabelledFrame, finest: float, coarsest: float, searches: int = 60) -> Solution:
     """The cheapest explanation of a frame, found by so many searches from several segments and noise levels."""
     race = Race(model, frame)
     for many, budget, quota, share in RUNGS:
@@ -123,7 +123,7 @@ class Race:
     begun : what was made of explanations before, by noise level and labels
     """
 
-    def __init__(self, model: MarkerModel, frame: Frame):
+    def __init__(self, model: MarkerModel, frame: UnlabelledFrame):
         self.model, self.frame = model, frame
         self.most = min(len(frame.points), len(model))
         self.reached: dict[tuple[int, float], Solution] = {}
@@ -139,7 +139,7 @@ class Race:
     def run(self, root: int, scale: float, before: Solution | None) -> Solution:
         """One search and what it led to, or what it makes of what was found at the noise level `before`."""
         tables = segment_tables(self.model, root)
-        search = Search(tables, self.frame, scale, *self.means)
+        search = LabelSearch(tables, self.frame, scale, *self.means)
         chosen = search.decode(search.node(tables[0], None, -1))
         if search.cut or shared(search, chosen).any():
             found = self.improved(solution(search, apart(search, chosen), len(self.model)))
@@ -178,7 +178,7 @@ class Race:
         return replace(best, others=others, settled=sure and fits)
 
 
-def solution(search: Search, chosen: Explanation, count: int) -> Solution:
+def solution(search: LabelSearch, chosen: Explanation, count: int) -> Solution:
     """An explanation with its cost, noise and labels."""
     squares, freedom = 0.0, 0
     for node, c in chosen:
@@ -190,9 +190,9 @@ def solution(search: Search, chosen: Explanation, count: int) -> Solution:
     return Solution(search, chosen, labels_of(chosen, count), cost_of(search, chosen), noise)
 
 
-def at_level(found: Solution, frame: Frame, scale: float) -> Solution:
+def at_level(found: Solution, frame: UnlabelledFrame, scale: float) -> Solution:
     """A solution at another noise level, or with other thoughts of what is missing."""
-    search = Search(found.search.tables, frame, scale)
+    search = LabelSearch(found.search.tables, frame, scale)
     search.cut = True  # nothing but this explanation and its neighbours is looked at
     chosen = polish(search, apart(search, carried(search, found.chosen)))
     return solution(search, chosen, len(found.labels))
@@ -221,7 +221,7 @@ def _cost(found: Solution) -> float:
     return found.cost
 
 
-def _starts(model: MarkerModel, frame: Frame, finest: float, coarsest: float) -> Iterator[tuple[int, float]]:
+def _starts(model: MarkerModel, frame: UnlabelledFrame, finest: float, coarsest: float) -> Iterator[tuple[int, float]]:
     """Segments to begin with and noise levels, finest level first.
 
     The finest is that at which the largest segments, each on its own, are explained almost whole; else the model's
@@ -237,7 +237,7 @@ def _starts(model: MarkerModel, frame: Frame, finest: float, coarsest: float) ->
     held: list[tuple[int, float]] = []
     later: list[tuple[int, float]] = []
     while scale <= coarsest:
-        search = Search(tables, frame, scale)
+        search = LabelSearch(tables, frame, scale)
         if not tried:  # mostly one of these is enough
             order, _, share = _ranked(search, large)
             tried = scale >= 1.0 or share > WHOLE or _coarser(scale) > coarsest
@@ -255,7 +255,7 @@ def _starts(model: MarkerModel, frame: Frame, finest: float, coarsest: float) ->
     yield from later
 
 
-def _ranked(search: Search, segments: list[int]) -> tuple[list[int], float, float]:
+def _ranked(search: LabelSearch, segments: list[int]) -> tuple[list[int], float, float]:
     """Segments each on its own, the surest first; their cost, and the share of their markers that they explain."""
     found = {s: search.alone(search.by_index[s]) for s in segments}
     order = sorted(segments, key=lambda s: (-min(found[s][2], SURE), found[s][0]))

@@ -14,7 +14,7 @@ from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification.frame.polish import NEAR, labels_of, rivals
 from kinefit.identification.frame.posture import unusual
-from kinefit.identification.frame.search import Frame
+from kinefit.identification.frame.search import UnlabelledFrame
 from kinefit.identification.model.model import MarkerModel
 
 OUTLIERS, OUTLYING = 0.05, 4.0
@@ -113,7 +113,7 @@ def identify(
     box = float(np.prod(np.ptp(at, 0) + 0.3))
     usual = count * (1 - min(max(1 - len(at) / count, settings.miss), 0.5))
     work = np.full(1, SEARCHING * settings.work)
-    frame = Frame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work, beliefs)
+    frame = UnlabelledFrame(at, gaps, box, gain_of(usual, count, len(at), box), settings.gate, work, beliefs)
     best = explain(model, frame, settings.finest, settings.coarsest, settings.searches)
     work += (1 - SEARCHING) * settings.work
     best = refine(model, best)

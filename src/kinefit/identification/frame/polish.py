@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.frame.search import WIDE, Node, Search
+from kinefit.identification.frame.search import WIDE, LabelSearch, Node
 
 Explanation = list[tuple[Node, int]]
 """Nodes and what is chosen in each, parents first."""
@@ -35,7 +35,7 @@ RESTARTS = 4
 """A rival that is cheaper becomes the explanation, so many times at most."""
 
 
-def cost_of(search: Search, chosen: Explanation) -> float:
+def cost_of(search: LabelSearch, chosen: Explanation) -> float:
     """-log likelihood of an explanation; a point that two segments take counts for both."""
     at = {node.table.index: (node, c) for node, c in chosen}
     total = 0.0
@@ -55,7 +55,7 @@ def labels_of(chosen: Explanation, count: int) -> NDArray:
     return labels
 
 
-def shared(search: Search, chosen: Explanation) -> NDArray:
+def shared(search: LabelSearch, chosen: Explanation) -> NDArray:
     """(W,) bits of points that two segments take."""
     twice, once = search.bits[-1].copy(), search.bits[-1].copy()
     for node, c in chosen:
@@ -64,14 +64,14 @@ def shared(search: Search, chosen: Explanation) -> NDArray:
     return twice
 
 
-def apart(search: Search, chosen: Explanation) -> Explanation:
+def apart(search: LabelSearch, chosen: Explanation) -> Explanation:
     """The explanation with every point taken once."""
     found = disentangle(search, chosen, branches(search), {chosen[0][0].table.index})
     assert found is not None  # segments below the root can always choose none
     return found
 
 
-def polish(search: Search, found: Explanation) -> Explanation:
+def polish(search: LabelSearch, found: Explanation) -> Explanation:
     """The explanation, no dearer by the change of any one branch."""
     below = branches(search)
     cost = cost_of(search, found)
@@ -89,7 +89,7 @@ def polish(search: Search, found: Explanation) -> Explanation:
     return found
 
 
-def carried(search: Search, chosen: Explanation) -> Explanation:
+def carried(search: LabelSearch, chosen: Explanation) -> Explanation:
     """An explanation as another search has it, at another noise level; points that it thinks too far off are left."""
     every = np.bitwise_or.reduce(search.bits, 0)
     at: dict[int, tuple[Node, int]] = {}
@@ -102,7 +102,7 @@ def carried(search: Search, chosen: Explanation) -> Explanation:
 
 
 def disentangle(
-    search: Search, chosen: Explanation, below: dict[int, list[int]], fixed: set[int], limit: float = np.inf
+    search: LabelSearch, chosen: Explanation, below: dict[int, list[int]], fixed: set[int], limit: float = np.inf
 ) -> Explanation | None:
     """The explanation with every point taken once; of two segments that want one the cheaper gives way.
 
@@ -122,7 +122,7 @@ def disentangle(
     return chosen
 
 
-def branches(search: Search) -> dict[int, list[int]]:
+def branches(search: LabelSearch) -> dict[int, list[int]]:
     """For each segment itself and all below it."""
     found: dict[int, list[int]] = {}
     for t in reversed(search.tables):
@@ -130,7 +130,7 @@ def branches(search: Search) -> dict[int, list[int]]:
     return found
 
 
-def anew(search: Search, chosen: Explanation, branch: list[int]) -> Explanation:
+def anew(search: LabelSearch, chosen: Explanation, branch: list[int]) -> Explanation:
     """The explanation with a branch (a segment and all below it) searched again, without others' points."""
     kept = [(node, c) for node, c in chosen if node.table.index not in branch]
     table = search.by_index[branch[0]]
@@ -143,7 +143,7 @@ def anew(search: Search, chosen: Explanation, branch: list[int]) -> Explanation:
     return kept + local.decode(local.node(table, *above), above)
 
 
-def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple[float, Explanation]], set[int]]:
+def rivals(search: LabelSearch, chosen: Explanation) -> tuple[Explanation, list[tuple[float, Explanation]], set[int]]:
     """The cheapest explanation near one, by how much others are dearer, up to NEAR, and segments that were looked at.
 
     These are all, unless the frame's work was used up before.
@@ -163,7 +163,7 @@ def rivals(search: Search, chosen: Explanation) -> tuple[Explanation, list[tuple
     return chosen, [(now - cost, rival) for now, rival in found if now < cost + NEAR], seen
 
 
-def _others(search: Search, chosen: Explanation, seen: set[int]) -> Iterator[Explanation]:
+def _others(search: LabelSearch, chosen: Explanation, seen: set[int]) -> Iterator[Explanation]:
     """Explanations in which one segment chooses otherwise, and others make room for that; adds to `seen`."""
     below, free = branches(search), search.beside(search.bits[-1], WIDE)
     at = {node.table.index: (node, c) for node, c in chosen}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.identification.frame._kernels_posture import turn_costs
-from kinefit.identification.frame.search import Search
+from kinefit.identification.frame.search import LabelSearch
 from kinefit.identification.frame.tables import segment_tables
 from kinefit.identification.model.model import MarkerModel
 
@@ -22,7 +22,7 @@ MOST = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class Posture:
+class PostureModel:
     """A model's segments, parents first, in this `order`, as the kernel wants them: see `turn_costs`."""
 
     order: NDArray
@@ -38,7 +38,7 @@ class Posture:
 
 
 @lru_cache(maxsize=64)
-def posture_of(model: MarkerModel) -> Posture | None:
+def posture_of(model: MarkerModel) -> PostureModel | None:
     """The tables of a model; None where no motion taught it any joint's turns."""
     joints = {j.child: j for j in model.joints}
     if all(j.turn is None for j in model.joints):
@@ -53,7 +53,7 @@ def posture_of(model: MarkerModel) -> Posture | None:
         if joint is not None and joint.turn is not None and joint.give is not None:
             middle[i], give[i] = joint.turn, joint.give
     zero = np.zeros(3)
-    return Posture(
+    return PostureModel(
         order, np.concatenate([[0], np.cumsum([len(t.markers) for t in tables])]),
         np.concatenate([t.markers for t in tables]), np.concatenate([t.x for t in tables]),
         np.array([place.get(t.parent, -1) for t in tables]),
@@ -63,7 +63,7 @@ def posture_of(model: MarkerModel) -> Posture | None:
     )  # fmt: skip
 
 
-def unusual(model: MarkerModel, search: Search, labels: NDArray) -> NDArray:
+def unusual(model: MarkerModel, search: LabelSearch, labels: NDArray) -> NDArray:
     """(E,) what the posture costs under explanations (E, M), -log likelihood; 0 where no motion taught the model."""
     known, out = posture_of(model), np.zeros(len(labels))
     if known is not None:

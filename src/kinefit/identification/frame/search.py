@@ -28,7 +28,7 @@ WIDE = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class UnlabelledFrame:
     """Points to be named, and what is thought of missing and strange ones.
 
     Parameters
@@ -105,7 +105,7 @@ class Node:
     allowed: float = -np.inf
 
 
-class Search:
+class LabelSearch:
     """One frame at one noise level. Limbs that do not hang on each other may take the same point: see `polish`.
 
     Parameters
@@ -117,7 +117,7 @@ class Search:
     """
 
     def __init__(
-        self, tables: tuple[SegmentTable, ...], frame: Frame, scale: float, budget: int = 0, quota: int = 0,
+        self, tables: tuple[SegmentTable, ...], frame: UnlabelledFrame, scale: float, budget: int = 0, quota: int = 0,
         share: float = 1.0,
     ):
         self.tables, self.frame, self.scale = tables, frame, scale
@@ -137,7 +137,7 @@ class Search:
         self.budget, self.each, self.quota = budget, quota, quota
         self.allow(share)
 
-    def beside(self, outside: NDArray, slack: float = SLACK) -> Search:
+    def beside(self, outside: NDArray, slack: float = SLACK) -> LabelSearch:
         """The same search, nothing of it known yet, without the points `outside` (W,) bits."""
         local = copy(self)
         local.slack = slack

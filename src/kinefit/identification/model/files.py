@@ -20,7 +20,7 @@ _TABLES = ("mean", "deviation", "low", "high")
 _UPPER = np.triu_indices(3)
 
 
-class _Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class _JointEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     parent: int
     child: int
     in_parent: tuple[float, float, float]
@@ -38,13 +38,13 @@ class _Segment(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     markers: list[str]
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class _ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     format: str
     name: str
     labels: list[str]
     reference: list[tuple[float, float, float]]
     segments: list[_Segment]
-    joints: list[_Joint]
+    joints: list[_JointEntry]
     distances: dict[str, list[list[float]]]
     gaps: list[str] = []
 
@@ -59,13 +59,13 @@ def save_model(model: MarkerModel, path: str | PathLike[str]) -> None:
     """
     upper = np.triu_indices(len(model), 1)
     rows = np.split(np.arange(len(upper[0])), np.cumsum(np.arange(len(model) - 1, 1, -1)))
-    record = _File(
+    record = _ModelFile(
         format=FORMAT, name=model.name, labels=list(model.labels), reference=_rounded(model.reference),
         segments=[
             _Segment(name=n, markers=[model.labels[m] for m in s]) for n, s in zip(model.names, model.segments)
         ],
         joints=[
-            _Joint(
+            _JointEntry(
                 parent=int(j.parent), child=int(j.child), in_parent=tuple(_rounded(j.in_parent)),
                 in_child=tuple(_rounded(j.in_child)), spread=float(j.spread),
                 marker=None if j.marker is None else model.labels[j.marker], exercised=float(j.exercised),
@@ -102,7 +102,7 @@ def load_model(path: str | PathLike[str]) -> MarkerModel:
     path = Path(path)
     remedy = "Make one with `kinefit markers learn`."
     try:
-        record = msgspec.json.decode(path.read_bytes(), type=_File)
+        record = msgspec.json.decode(path.read_bytes(), type=_ModelFile)
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror or error})", file=path, remedy=remedy) from error
     except msgspec.ValidationError as error:
@@ -119,7 +119,7 @@ def load_model(path: str | PathLike[str]) -> MarkerModel:
         raise FileError(f"contradicts itself: {error}", file=path, remedy=remedy) from error
 
 
-def _model(record: _File) -> MarkerModel:
+def _model(record: _ModelFile) -> MarkerModel:
     number = {label: i for i, label in enumerate(record.labels)}
     count, segments = len(record.labels), len(record.segments)
     unknown = {m for s in record.segments for m in s.markers} - set(number)

@@ -32,7 +32,7 @@ _MOTIONS = {
 
 
 @dataclass(frozen=True)
-class Finding:
+class TrainingFinding:
     """One thing to know of a training take.
 
     Parameters
@@ -54,7 +54,9 @@ class Finding:
 
 
 @checked
-def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet | None = None) -> list[Finding]:
+def training_gate(
+    markers: Markers, model: MarkerModel, *, marker_set: MarkerSet | None = None
+) -> list[TrainingFinding]:
     """What the training take leaves open, worst first; empty if nothing.
 
     Parameters
@@ -75,56 +77,56 @@ def training_gate(markers: Markers, model: MarkerModel, *, marker_set: MarkerSet
     return unknown + _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
 
 
-def _unknown(model: MarkerModel) -> list[Finding]:
+def _unknown(model: MarkerModel) -> list[TrainingFinding]:
     """Labels that no set knows: their segments are what held its distances in training, body parts or not."""
     sizes = sorted(zip((len(s) for s in model.segments), model.names), reverse=True)
     text = f"no set of the catalogue knows the labels; {len(sizes)} segments are from motion alone, the largest with "
     text += f"{sizes[0][0]} markers ({sizes[0][1]})"
     remedy = "Write a set: `kinefit markers set TAKE -o set.toml`, put it right, and learn with --set set.toml"
-    return [Finding("unknown", model.name, text, remedy)]
+    return [TrainingFinding("unknown", model.name, text, remedy)]
 
 
-def _twice(model: MarkerModel) -> list[Finding]:
+def _twice(model: MarkerModel) -> list[TrainingFinding]:
     """Labels that the file had twice: its reader told them apart by a suffix."""
     parts = [(label, *label.rpartition("_")) for label in model.labels]
     again = [(label, base) for label, base, _, n in parts if n.isdigit() and base in model.labels]
     text, remedy = "the file has the label {} twice", "Delete one of the two in the recording"
-    return [Finding("twice", label, text.format(base), remedy) for label, base in again]
+    return [TrainingFinding("twice", label, text.format(base), remedy) for label, base in again]
 
 
-def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> Finding:
+def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> TrainingFinding:
     name, parent = model.names[joint.child], model.names[joint.parent]
     degrees = [f"{np.degrees(r):.0f}" for r in joint.ranges]
     motion = _MOTIONS.get(name.removesuffix("_r").removesuffix("_l").replace("_", ""), "turn it about all its axes")
     side = " (right)" if name.endswith("_r") else " (left)" if name.endswith("_l") else ""
-    return Finding(
+    return TrainingFinding(
         "still", name, f"turned against {parent} by {degrees[0]}, {degrees[1]} and {degrees[2]} degrees about three "
         f"axes, of about {np.degrees(full):.0f} about the first", f"Record: {motion}{side}",
     )
 
 
-def _merged(model: MarkerModel) -> list[Finding]:
+def _merged(model: MarkerModel) -> list[TrainingFinding]:
     """Segments longer than a thigh or a trunk of anybody: several that were held together."""
     out = []
     for name, members in zip(model.names, model.segments):
         length = float(model.mean[np.ix_(members, members)].max())
         if length > 0.75:  # [m] trunk, shoulder to hip, of a very tall man (ANSUR II, 99th percentile and more)
             text = f"its {len(members)} markers lie up to {length:.2f} m apart: probably several segments in one"
-            out.append(Finding("merged", name, text, "Put the marker set right, or record all joints moving"))
+            out.append(TrainingFinding("merged", name, text, "Put the marker set right, or record all joints moving"))
     return out
 
 
-def _seldom(markers: Markers, model: MarkerModel) -> list[Finding]:
+def _seldom(markers: Markers, model: MarkerModel) -> list[TrainingFinding]:
     index = {name: i for i, name in enumerate(markers.names)}
     out = []
     for label in model.gaps:
         share = np.isfinite(markers.positions[:, index[label], 0]).mean() if label in index else 0.0
         text = f"seen in {100 * share:.0f} % of the frames" + ("" if label in model.labels else "; not in the model")
-        out.append(Finding("seldom", label, text, "Record it, or leave the label out"))
+        out.append(TrainingFinding("seldom", label, text, "Record it, or leave the label out"))
     return out
 
 
-def _few(model: MarkerModel) -> list[Finding]:
+def _few(model: MarkerModel) -> list[TrainingFinding]:
     """Segments whose pose three markers, or two and the joint, do not tell."""
     out = []
     joints = {j.child: j.in_child for j in model.joints}
@@ -134,11 +136,11 @@ def _few(model: MarkerModel) -> list[Finding]:
         flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if len(points) < 3 or flat[1] < 0.02:  # [m] beside one line
             text = f"{len(members)} markers" + (", nearly on one line with its joint" if len(points) > 2 else "")
-            out.append(Finding("few", name, text, "Add a marker off the line, or expect doubtful names there"))
+            out.append(TrainingFinding("few", name, text, "Add a marker off the line, or expect doubtful names there"))
     return out
 
 
-def _alike(model: MarkerModel) -> list[Finding]:
+def _alike(model: MarkerModel) -> list[TrainingFinding]:
     """Segments (left and right) with the same distances: only the body around them tells which is which."""
     out = []
     for a in range(len(model.segments)):
@@ -151,5 +153,5 @@ def _alike(model: MarkerModel) -> list[Finding]:
             if np.abs(d).max() < ALIKE:
                 text = f"same shape as {model.names[b]} within {1e3 * np.abs(d).max():.0f} mm"
                 remedy = "Move one marker by 3 cm, or wear one more on a side"
-                out.append(Finding("alike", model.names[a], text, remedy))
+                out.append(TrainingFinding("alike", model.names[a], text, remedy))
     return out

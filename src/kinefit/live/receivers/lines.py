@@ -8,7 +8,7 @@ from typing import BinaryIO
 
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 
 
 class JsonLines:
@@ -32,7 +32,7 @@ class JsonLines:
         """One line."""
         self._write(packet)
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """One line."""
         self._write(packet)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 
 
 class Lsl:
@@ -42,7 +42,7 @@ class Lsl:
         joints += [(f"{name} std", unit) for name, unit in joints]
         self._outlets = [self._outlet(kind, columns) for kind, columns in (("angles", angles), ("joints", joints))]
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """One sample of each stream."""
         r = posed.result
         if r is None:

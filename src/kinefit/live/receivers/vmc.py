@@ -18,7 +18,7 @@ from kinefit.bodies.joint_names import SIDES
 from kinefit.errors import BodyError, ExportError
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.geometry import se3
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 from kinefit.live.receivers import osc
 from kinefit.motion import rotation_between_up
 
@@ -83,7 +83,7 @@ class Vmc:
         ]
         self._segments, self._above = np.array(kept), np.array(lowest)
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Send a pose; where the network is busy, it is left out and counted in `unsent`."""
         if posed.result is None or self._rest is None:
             self._send(osc.bundle([osc.message("/VMC/Ext/OK", 0)]))

@@ -13,7 +13,7 @@ import msgspec
 from websockets.exceptions import ConnectionClosed
 
 from kinefit.bodies import Body
-from kinefit.live.packets import Posed
+from kinefit.live.packets import PosePacket
 from kinefit.live.receivers.page import live_page
 from kinefit.live.wishes import Answer
 from kinefit.serving.access import Access
@@ -93,7 +93,7 @@ class WebSockets:
         self._hello = packet
         self._server.call(self._spread, packet, True)
 
-    def pose(self, posed: Posed, packet: bytes) -> None:
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Put a pose into every receiver's slot."""
         if self._clients:
             self._server.call(self._spread, packet, False)

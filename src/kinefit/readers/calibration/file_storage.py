@@ -15,7 +15,7 @@ _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{2}|.)", re.DOTALL)
 _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "0": "\0"}
 
 
-class _Bounded(ElementTree.TreeBuilder):
+class _BoundedTree(ElementTree.TreeBuilder):
     """Elements of XML, no deeper than a calibration's."""
 
     depth = 0
@@ -37,7 +37,7 @@ def parse_xml(text: str) -> ElementTree.Element:
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a document type (<!DOCTYPE ...>), which no calibration has")
-    return ElementTree.fromstring(text, ElementTree.XMLParser(target=_Bounded()))
+    return ElementTree.fromstring(text, ElementTree.XMLParser(target=_BoundedTree()))
 
 
 def storage_of_xml(text: str) -> Any:

@@ -12,7 +12,7 @@ _BRACKET = re.compile(rf"#[^\n]*|{_STRING}|[\[\]{{}}]")
 _LEAD = re.compile(r"\s*(!!opencv-[\w-]+|\{|\[)?")
 
 
-class Span(NamedTuple):
+class ValueSpan(NamedTuple):
     """Place of one value.
 
     `start:stop` are the brackets of its numbers, `after` is behind the whole value (an OpenCV matrix has more than its
@@ -26,7 +26,7 @@ class Span(NamedTuple):
     matrix: bool
 
 
-def value_span(text: str, key: str, occurrence: int) -> Span | None:
+def value_span(text: str, key: str, occurrence: int) -> ValueSpan | None:
     """Span of the list or matrix that the n-th `key` of a text has; None where it is written otherwise."""
     for token in _TOKEN.finditer(text):
         if token[2] and _name(token[1]) == key:
@@ -40,7 +40,7 @@ def _name(text: str) -> str:
     return json.loads(text) if text[0] == '"' else text.strip("'")
 
 
-def _span(text: str, token: re.Match) -> Span | None:
+def _span(text: str, token: re.Match) -> ValueSpan | None:
     indent = text[text.rfind("\n", 0, token.start()) + 1 : token.start()]
     lead = _LEAD.match(text, token.end())
     kind = lead[1] if lead else None
@@ -48,23 +48,23 @@ def _span(text: str, token: re.Match) -> Span | None:
         return _block(text, token.end(), indent)
     if kind == "[":
         stop = _closing(text, lead.end() - 1)
-        return Span(lead.end() - 1, stop, stop, indent, False) if stop else None
+        return ValueSpan(lead.end() - 1, stop, stop, indent, False) if stop else None
     for inner in _TOKEN.finditer(text, lead.end()):
         if inner[2] and _name(inner[1]) == "data":
             start = text.find("[", inner.end())
             stop = _closing(text, start) if start >= 0 else None
             after = _closing(text, lead.end() - 1) if kind == "{" else stop
-            return Span(start, stop, after, indent, True) if stop and after else None
+            return ValueSpan(start, stop, after, indent, True) if stop and after else None
     return None
 
 
-def _block(text: str, start: int, indent: str) -> Span | None:
+def _block(text: str, start: int, indent: str) -> ValueSpan | None:
     """Span of a YAML block sequence: the lines below its key that are indented more."""
     rest = re.compile(rf"[ \t]*\r?\n(?:{' ' * len(indent)}[ \t]+[^\n]*(?:\n|$))+").match(text, start)
     if rest is None or not rest[0].lstrip().startswith("-"):
         return None
     stop = start + len(rest[0].rstrip())
-    return Span(start, stop, stop, indent, False)
+    return ValueSpan(start, stop, stop, indent, False)
 
 
 def _closing(text: str, start: int) -> int | None:

@@ -29,7 +29,7 @@ _MOST = 200_000_000  # points; more is a broken header
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class FileCloud:
     """A cloud as a file holds it.
 
     Parameters
@@ -47,7 +47,7 @@ class Cloud:
     T_file_sensor: NDArray
 
 
-def read_cloud(path: str | PathLike[str]) -> Cloud:
+def read_cloud(path: str | PathLike[str]) -> FileCloud:
     """Read a PCD or PLY file.
 
     Raises
@@ -67,7 +67,7 @@ def read_cloud(path: str | PathLike[str]) -> Cloud:
     raise FileError("neither PCD nor PLY", file=path, remedy=_REMEDY)
 
 
-def _pcd(data: bytes, path: Path) -> Cloud:
+def _pcd(data: bytes, path: Path) -> FileCloud:
     header: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in header:
@@ -109,7 +109,7 @@ def _pcd(data: bytes, path: Path) -> Cloud:
     tx, ty, tz, *q = [float(v) for v in header.get("VIEWPOINT", "0 0 0 1 0 0 0".split())]
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = _rotation(np.array(q)), (tx, ty, tz)
-    return Cloud(points, (height, width) if height > 1 else None, T)
+    return FileCloud(points, (height, width) if height > 1 else None, T)
 
 
 def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
@@ -122,7 +122,7 @@ def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
     return out
 
 
-def _ply(data: bytes, path: Path) -> Cloud:
+def _ply(data: bytes, path: Path) -> FileCloud:
     end = data.find(b"\n", data.find(b"end_header"))
     if b"end_header" not in data or end < 0:
         raise FileError("a PLY header without end_header", file=path, remedy=_CUT)
@@ -147,7 +147,7 @@ def _ply(data: bytes, path: Path) -> Cloud:
         points = np.stack([table[f"f{w}"].astype(float) for w in where], axis=1)
     else:
         raise FileError(f"format {kind or 'not told'}", file=path, remedy=_REMEDY)
-    return Cloud(points, None, np.eye(4))
+    return FileCloud(points, None, np.eye(4))
 
 
 def _place(axis: str, names: list[str], path: Path) -> int:
@@ -185,20 +185,20 @@ def _rotation(q: NDArray) -> NDArray:
     ])  # fmt: skip
 
 
-def depth_of(cloud: Cloud) -> NDArray:
+def depth_of(cloud: FileCloud) -> NDArray:
     """(H, W) depth of an organised cloud along its sensor's axis, in its unit; 0 where it has no point."""
     assert cloud.shape is not None
     z = in_sensor(cloud)[:, 2].reshape(cloud.shape)
     return np.where(z > 0.0, z, 0.0)
 
 
-def in_sensor(cloud: Cloud) -> NDArray:
+def in_sensor(cloud: FileCloud) -> NDArray:
     """(N, 3) points of a cloud in its sensor's frame, in its unit."""
     T = inverse(cloud.T_file_sensor)
     return cloud.points @ T[:3, :3].T + T[:3, 3]
 
 
-def camera_of(cloud: Cloud, name: str, path: str | PathLike[str] | None = None) -> Camera:
+def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = None) -> Camera:
     """The pinhole camera, at the origin, that an organised cloud was seen with: fitted to its points.
 
     Raises

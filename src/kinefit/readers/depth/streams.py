@@ -23,7 +23,7 @@ _AZURE_MODES = {(320, 288): (512, (96, 90)), (640, 576): (1024, (192, 180)), (51
 _GREY = ("gray16le", "gray16be", "gray12le", "gray10le", "gray14le")
 
 
-class _Track:
+class _StreamTrack:
     """Frames of one track of a container by number, in order of time."""
 
     def __init__(self, path: Path, index: int, raw: bool, times: list[int]) -> None:
@@ -95,7 +95,7 @@ def track_source(path: Path, name: str) -> DepthSource:
         raise FileError("its depth track has no frames", file=path, remedy="Was the recording stopped at once?")
     seconds = np.array(times) * base
     return DepthSource(
-        len(times), _Track(path, index, raw, times), size, 0.001, camera is not None, seconds - seconds[0],
+        len(times), _StreamTrack(path, index, raw, times), size, 0.001, camera is not None, seconds - seconds[0],
         camera, rate,
     )  # fmt: skip
 

@@ -21,6 +21,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, read_calibration
 from kinefit.readers.guess.names import natural
 from kinefit.readers.image_folders import ENDINGS, ImageFolder
+from kinefit.readers.keypoints import decode_openpose
 from kinefit.readers.ros.recordings import inside
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
@@ -248,21 +249,12 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
     return found, remarks
 
 
-class _Person(msgspec.Struct):
-    pose_keypoints_2d: list[float]
-
-
-class _Frame(msgspec.Struct):
-    people: list[_Person]
-
-
 def _openpose_points(numbered: list[Path]) -> int | None:
     """Points of a person in json files of numbered names; 0: nobody in them; None: no files of OpenPose."""
-    decode = msgspec.json.Decoder(_Frame).decode
     there = False
     for path in numbered:
         try:
-            people = decode(path.read_bytes()).people
+            people = decode_openpose(path.read_bytes()).people
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
             if not there:
                 return None

@@ -222,7 +222,7 @@ def reading(path: Path) -> Iterator[Any]:
             remedy="pip install 'kinefit[ros]'",
         ) from None  # fmt: skip
     try:
-        with _Bounded(io.FileIO(path)) as file:
+        with _BoundedReader(io.FileIO(path)) as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
             _check_chunks(reader, file, path)
             yield reader
@@ -265,7 +265,7 @@ def _zstd_size(frame: bytes) -> int:
     return int.from_bytes(frame[start : start + length], "little") + (256 if code == 1 else 0)
 
 
-class _Bounded(io.BufferedReader):
+class _BoundedReader(io.BufferedReader):
     """A file from which no more is asked than there is: a damaged length would else be room in memory first."""
 
     def read(self, size: int | None = -1, /) -> bytes:

@@ -24,7 +24,7 @@ _HEAD_TO_ANKLE = 0.85  # length of the chain of bones from the head's joint to t
 
 
 @dataclass(frozen=True)
-class _Joint:
+class _BvhJoint:
     name: str
     parent: int
     offset: tuple[float, ...]
@@ -92,12 +92,12 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     )
 
 
-def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
+def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
     """Joints and end sites in the order of the file, parents first."""
     tokens = [(word, n) for n, line in enumerate(text.split("\n"), 1) for word in re.findall(r"[{}]|[^\s{}]+", line)]
     if not tokens or tokens[0][0].upper() != "HIERARCHY":
         raise FileError("does not begin with HIERARCHY", file=path, place="line 1", remedy="Give a BVH file.")
-    joints: list[_Joint] = []
+    joints: list[_BvhJoint] = []
     open_joints: list[dict] = []  # the nesting of braces: name, parent, and what is known so far
     at = 1
 
@@ -132,7 +132,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
             case "OFFSET" if open_joints and open_joints[-1]["index"] is None:
                 offset = tuple(parse_numbers(take(3), file=path, line=line))
                 open_joints[-1]["index"] = len(joints)
-                joints.append(_Joint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
+                joints.append(_BvhJoint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
             case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
                 count = take(1)[0]
                 channels = tuple(word.lower() for word in take(int(count) if re.fullmatch(r"\d{1,3}", count) else 0))
@@ -143,7 +143,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_Joint]:
                 ):
                     raise fault(f"CHANNELS {count} {' '.join(channels)} is not a list of that many channels", line)
                 joint = joints[open_joints[-1]["index"]]
-                joints[open_joints[-1]["index"]] = _Joint(joint.name, joint.parent, joint.offset, channels)
+                joints[open_joints[-1]["index"]] = _BvhJoint(joint.name, joint.parent, joint.offset, channels)
             case "}" if open_joints and open_joints[-1]["index"] is not None:
                 open_joints.pop()
             case _:
@@ -216,7 +216,7 @@ def _exact_rate(frame_time: float, printed: str) -> float:
     return 1.0 / frame_time
 
 
-def _local_poses(joints: Sequence[_Joint], values: NDArray) -> NDArray:
+def _local_poses(joints: Sequence[_BvhJoint], values: NDArray) -> NDArray:
     """(F, J, 4, 4) pose of every joint in its parent's frame, lengths in the file's unit."""
     Ts_parent_joint = np.zeros((len(values), len(joints), 4, 4))
     Ts_parent_joint[..., 3, 3] = 1.0
@@ -243,7 +243,7 @@ def _is_added(positions: NDArray, offset: NDArray) -> bool:
     return bool(from_origin <= np.median(np.linalg.norm(positions - offset, axis=1)))
 
 
-def _root_shift(root: _Joint, values: NDArray, up: str) -> NDArray:
+def _root_shift(root: _BvhJoint, values: NDArray, up: str) -> NDArray:
     """(3,) the root's OFFSET where its position channels are to be added to it, else zero."""
     shift = np.zeros(3)
     height = [k for k, channel in enumerate(root.channels) if channel == f"{up}position"]

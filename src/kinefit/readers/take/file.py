@@ -56,7 +56,7 @@ __all__ = [
 ]
 
 
-class _File(_Entry, frozen=True, kw_only=True):
+class _TakeFile(_Entry, frozen=True, kw_only=True):
     take: _Head = _Head()
     session: SessionEntry = SessionEntry()
     start: StartEntry | None = None
@@ -164,7 +164,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     _name_topics(raw, path)
     folder = path.parent
     try:
-        content = msgspec.convert(raw, _File, dec_hook=_path_in(folder))
+        content = msgspec.convert(raw, _TakeFile, dec_hook=_path_in(folder))
     except msgspec.ValidationError as error:
         raise wrong_value(error, TABLES, path) from error
     head = content.take
