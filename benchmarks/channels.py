@@ -94,7 +94,7 @@ def scores(motion: Motion) -> tuple[float, float]:
 def lasting(motion: Motion, sensor: str) -> float:
     """[m] standard deviation of what lasts of a sensor's errors, from channel to channel."""
     told = motion.provenance["sensor noise"][sensor]
-    return float(np.hypot(told.get("bias [m]", 0.0), told["drift [m]"]))
+    return float(np.hypot(told["bias [m]"], told["drift [m]"]))
 
 
 def markers(draw: int, kind: str) -> tuple[float, float]:
@@ -114,7 +114,7 @@ def markers(draw: int, kind: str) -> tuple[float, float]:
 
 
 def ranged(draw: int) -> tuple[float, float, float]:
-    """Bias that is found of a range [m], the wrist's bar [m] and its error [m], RMS over frames and axes."""
+    """Bias that is found of a range [m]; the wrist's bar and its error [m], RMS over what is observed of it."""
     random = np.random.default_rng(draw)
     x, names = seen(BODY.markers(SET)), BODY.markers(SET).names
     beyond = np.isin(BODY.markers(SET).segments, [BODY.tree.segment(n) for n in ("forearm_r", "hand_r")])
@@ -124,10 +124,10 @@ def ranged(draw: int) -> tuple[float, float, float]:
     motion = motion_of(x, names, SET, 0.003, far)
     s = BODY.tree.segment(WRIST[1])
     at = np.array([motion.body.positions(motion.state(i), BODY.landmarks.select(WRIST[:1]))[0] for i in range(FRAMES)])
-    std = motion.joint_std[:, s]
+    std, away = motion.joint_std[:, s], at - wrist
+    known = np.isfinite(std)  # an infinite bar says that nothing observes the wrist along that axis
     told = motion.provenance["sensor noise"]["range"]
-    bias = float(np.max(told["shift [m]"])) if "bias [m]" not in told else told["bias [m]"]
-    return bias, float(np.sqrt(np.mean(std**2))), float(np.sqrt(np.mean(np.square(at - wrist))))
+    return told["bias [m]"], float(np.sqrt(np.mean(std[known] ** 2))), float(np.sqrt(np.mean(away[known] ** 2)))
 
 
 def run() -> None:

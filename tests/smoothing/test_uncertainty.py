@@ -8,13 +8,13 @@ import pytest
 from kinefit.bodies import PointSet, load_body
 from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting
 from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.variance_components import VarianceComponents
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
@@ -58,7 +58,8 @@ def covariance(scene, noise, Sigma=None, cameras=None):
 def noise_of(channels, drift=0.0, shift=None):
     count = len(channels.column)
     shift = np.zeros((4, 2)) if shift is None else shift
-    return DetectorNoise(np.zeros(count), np.full(count, drift), 0.3, shift)
+    none = np.zeros(count)
+    return VarianceComponents(none, np.full(count, drift), none, shift, 0.3, none, np.zeros((0, count), bool))
 
 
 def test_drift_moves_the_pose_as_refitting_does(scene):

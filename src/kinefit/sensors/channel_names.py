@@ -41,7 +41,8 @@ class ChannelNames:
         """
         sensor, names = matched.sensor, matched.channels
         if not matched.of_points:
-            return [[(k,) for k in (r.segment if isinstance(r, Rows) else np.zeros(len(r), int))] for r in parts]
+            of = (getattr(r, "segment", None) for r in parts)
+            return [[(int(k),) for k in (np.zeros(len(r)) if s is None else s)] for r, s in zip(parts, of)]
         self.check_names(matched)
         out, used = [], set[str]()
         for k, rows in enumerate(parts):

@@ -1,38 +1,35 @@
-"""How any sensor errs: jitter, drift of every channel, and a shift of the whole sensor, from what a fit left over.
-
-A channel is what errs alike for a while: one axis of a marker, the surface of one segment along its normals. What its
-mean residual has that is not new in every frame lasts; what all residuals of a sensor have in common is a shift.
-"""
+"""Errors of all sensors but the keypoints: their variance components, and how what lasts of them pushes the pose."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences.closures import every_closure
+from kinefit.frame.results import ANYWHERE
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
+from kinefit.sensors.channel_residuals import ChannelResiduals
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers.equations import design
+from kinefit.solvers.border_frames import gram
+from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
+from kinefit.solvers.variance_components import VarianceComponents, variance_components
 
-_MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
 _RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0
-_FEW = 5  # frames of a channel, with fewer of which it says nothing of what lasts
+_LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
 
 
-@dataclass(eq=False)
-class _Channel:
-    """Mean residual [m] of a channel frame by frame, and the variance [m²] that it should have."""
-
-    values: list[float] = field(default_factory=list)
-    expected: list[float] = field(default_factory=list)
+_Push = tuple[str, NDArray, NDArray, NDArray]
+"""Of rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,36 +39,53 @@ class OtherNoise:
     Parameters
     ----------
     information : (T, n (n + 1) / 2) of every frame's rows, the upper triangle of each
-    lasting : the same of Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e
-    drift : {sensor: standard deviation [m]}
-    shift : {sensor: (3,) [m]} in the world
+    lasting : the same of Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e, with s the mean over the frames
+        that motion ties to each frame
+    components : {sensor: VarianceComponents [m]}
     """
 
     information: NDArray
     lasting: NDArray
-    drift: dict[str, float]
-    shift: dict[str, NDArray]
+    components: dict[str, VarianceComponents]
 
     def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
-        """(n, n) information and lasting, each the mean over so many frames to either side."""
-        near, n = slice(max(f - half, 0), f + half + 1), int(np.sqrt(2.0 * self.information.shape[1]))
-        out = np.empty((2, n, n))
-        upper = np.triu_indices(n)
-        for square, values in zip(out, (self.information, self.lasting)):
-            square[upper] = square.T[upper] = values[near].mean(axis=0)
-        return out[0], out[1]
+        """(n, n) information, the mean over so many frames to either side, and lasting."""
+        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.lasting[f])
 
     def as_told(self) -> dict[str, Any]:
         """The same in a few numbers, by sensor."""
-        return {
-            name: {"drift [m]": round(d, 4), "shift [m]": np.round(self.shift.get(name, np.zeros(3)), 4).tolist()}
-            for name, d in self.drift.items()
-        }
+        return {name: found.summary("m", 4) for name, found in self.components.items()}
+
+
+def covariance_alone(body: Body, state: BodyState, information: NDArray) -> NDArray:
+    """(n, n) covariance of one frame on its own, closures and prior included; zero for a root that is fixed."""
+    tree = body.tree
+    if body.closures:
+        information = information + normal_equations(body, state, every_closure(body, state)).matrix
+    free = slice(0 if tree.root_free else 6, tree.n_dofs)
+    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
+    out = np.zeros_like(information)
+    out[free, free] = inverse((information + prior)[free, free])
+    return out
+
+
+def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
+    """(R,) share of the variance of each row's error that a fit takes from its residual.
+
+    Of errors e of equal variance the fit leaves r = (I − J P Jᵀ W) e; what others' errors add is negative.
+
+    Parameters
+    ----------
+    J, pushed : (R, n) derivatives by the pose, and W J
+    alone : (n, n) covariance P of the frame on its own
+    """
+    left = np.eye(len(J)) - product(product(J, alone), pushed.T)
+    return np.asarray(1.0 - np.sum(left**2, axis=1))
 
 
 def other_noise(
     body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
-    *, surfaces: bool = True,
+    pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True,
 ) -> OtherNoise:  # fmt: skip
     """Noise of all sensors but the keypoints, from their residuals at fitted states.
 
@@ -79,84 +93,93 @@ def other_noise(
     ----------
     matched : T lists of matches
     roots, angles : (T, 4, 4), (T, D) fitted
+    pixels : frame -> (n, n) information of its keypoints
+    half : frames to either side that motion ties to a frame
     surfaces : whether errors of surfaces as wholes count
     """
-    T, n = len(roots), body.tree.n_dofs
-    pushes, shifts = Spool[list[tuple[str, float, NDArray]]](), Spool[list[tuple[str, NDArray]]]()
-    upper = np.triu_indices(n)
-    information, lasting = np.zeros((T, len(upper[0]))), np.zeros((T, len(upper[0])))
-    channels: dict[str, dict[tuple[int, int], _Channel]] = {}
-    normal: dict[str, tuple[NDArray, NDArray]] = {}
-    counts: dict[str, list[int]] = {}
+    T = len(roots)
+    upper = np.triu_indices(body.tree.n_dofs)
+    information, skins, lasting = np.zeros((3, T, len(upper[0])))
+    residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
+    hidden, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
+    looked_at = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
     for f in range(T):
-        push, moved = list[tuple[str, float, NDArray]](), list[tuple[str, NDArray]]()
-        scene = others.scene(f, roots, angles)
-        surface: list[Rows] = []
+        scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
         for m in matched[f]:
             scale = others.scale.get(m.sensor, 1.0)
-            for part, rows in enumerate(rows_at(m, scene)):
-                if not isinstance(rows, Rows | DofRows) or not len(rows):
-                    continue
-                if not m.of_points and isinstance(rows, Rows):
-                    surface.append(rows.weaker(scale))
-                    continue
-                J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1] / scale**2
-                weighted = J * w[:, None]
-                information[f] += (J.T @ weighted)[upper]
-                names = np.arange(len(rows))
-                counts.setdefault(m.sensor, []).append(len(np.unique(names)))
-                mine = channels.setdefault(m.sensor, {})
-                for c in np.unique(names):
-                    of = names == c
-                    total = float(w[of].sum())
-                    if total > 0.0:
-                        channel = mine.setdefault((part, int(c)), _Channel())
-                        channel.values.append(float(w[of] @ rows.residual[of]) / total)
-                        channel.expected.append(1.0 / total)
-                        stated = float(np.sqrt(m.lasts * np.mean(1.0 / rows.weight[of])))
-                        push.append((m.sensor, stated, weighted[of].sum(axis=0)))
-                if isinstance(rows, Rows):
-                    d = rows.direction
-                    A, b = normal.get(m.sensor, (np.zeros((3, 3)), np.zeros(3)))
-                    normal[m.sensor] = A + d.T @ (d * w[:, None]), b + d.T @ (w * rows.residual)
-                    moved += [(m.sensor, weighted.T @ d)]
+            made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
+            points = [r for r in made if m.of_points or isinstance(r, DofRows)]
+            surface += [r.weaker(scale) for r in made if isinstance(r, Rows) and not m.of_points]
+            weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
+            for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
+                felt = w > 0.0
+                J, w, at = design(body, scene.state, rows)[felt], w[felt], at[:, felt]
+                information[f] += gram(J, w[:, None] * J)[upper]
+                pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
+                stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[felt]]))
         if surface:
             settings = others.settings  # also where the fit takes surfaces for exact
             beside = max(settings.skin_shift, _EXACT), settings.skin_turn
             skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
             information[f] += skin.information[upper]
             if surfaces:
-                lasting[f] += (skin.pushes.T @ skin.pushes)[upper]
-        pushes.append(push)
-        shifts.append(moved)
-    shift = {
-        name: np.abs(np.linalg.solve(A + 1e-9 * (np.trace(A) + 1.0) * np.eye(3), b)) for name, (A, b) in normal.items()
-    }
-    drift = {
-        name: _drift(list(mine.values()), min(n / max(float(np.mean(counts[name])), 1.0), _MOST_HIDDEN))
-        for name, mine in channels.items()
-    }
-    for f in range(T):
-        for name, stated, s in pushes[f]:
-            lasting[f] += max(drift[name], stated) ** 2 * np.outer(s, s)[upper]
-        for name, S in shifts[f]:
-            moved_by = S * shift[name]
-            lasting[f] += (moved_by @ moved_by.T)[upper]
-    return OtherNoise(information, lasting, drift, shift)
+                skins[f] += gram(skin.pushes, skin.pushes)[upper]
+        if f in looked_at:
+            alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
+            for sensor, at, push, weight in pushed:
+                hidden[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
+        pushes.append(pushed)
+    found, variance = {}, {}
+    for sensor, (values, _) in residuals.arrays(T).items():
+        leverage = _means(hidden[sensor], values.shape[1:]).mean(axis=1)
+        one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
+        stated_here = _means(stated[sensor], values.shape[1:])
+        found[sensor], variance[sensor] = one, np.maximum(one.lasting[:, None] ** 2, stated_here)
+    for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
+        pushed_by = [skins[near].mean(axis=0)]
+        for sensor, mean in sums.items():
+            shared = found[sensor].shared[0][:, None] * mean.sum(axis=0)
+            both = np.concatenate([(np.sqrt(variance[sensor])[..., None] * mean).reshape(-1, mean.shape[2]), shared])
+            pushed_by.append(gram(both, both)[upper])
+        lasting[f] = np.sum(pushed_by, axis=0)
+    return OtherNoise(information, lasting, found)
 
 
-def _drift(channels: list[_Channel], hidden: float) -> float:
-    """[m] standard deviation of what lasts, pooled over a sensor's channels.
+def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Each channel and axis (2, R) of N rows once, with the sums of the rows' pushes (R, n) and weights (R,)."""
+    at, index = np.unique(at, axis=1, return_inverse=True)
+    index, out = index.ravel(), np.zeros((at.shape[1], push.shape[1]))
+    np.add.at(out, index, push)
+    return at, out, np.bincount(index, weight, at.shape[1])
 
-    Parameters
-    ----------
-    hidden : share of a channel's own error that the fit follows, and so hides from its residual
-    """
-    lasting, frames = 0.0, 0
-    for channel in channels:
-        values = np.array(channel.values)
-        if len(values) >= _FEW:
-            new = min(0.5 * float(np.mean(np.diff(values) ** 2)), float(np.mean(values**2)))
-            lasting += len(values) * (float(np.mean(values**2)) - new)
-            frames += len(values)
-    return float(np.sqrt(lasting / max(frames, 1) / (1.0 - hidden)))
+
+def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
+    """(C, A) means of entries (3, R), channel, axis and value; the mean of all where there are none."""
+    channel, axis, value = np.concatenate([np.zeros((3, 0)), *entries], axis=1)
+    count, total = np.zeros(shape), np.zeros(shape)
+    at = channel.astype(np.int64), axis.astype(np.int64)
+    np.add.at(count, at, 1.0)
+    np.add.at(total, at, value)
+    return np.where(count > 0, total / np.maximum(count, 1), np.mean(value) if len(value) else 0.0)
+
+
+def _window_means(
+    pushes: Spool[list[_Push]], half: int, channels: Mapping[str, NDArray], n: int
+) -> Iterator[tuple[slice, dict[str, NDArray]]]:
+    """Of every frame those so near that motion ties them to it, and each sensor's mean pushes (C, A, n) over them."""
+    T, sums = len(pushes), {sensor: np.zeros((*of.shape, n)) for sensor, of in channels.items()}
+    for last in range(T + half):
+        for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
+            for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():
+                sums[sensor][at[0], at[1]] += sign * push
+        if last >= half:
+            near = slice(max(last - 2 * half, 0), min(last + 1, T))
+            yield near, {sensor: total / (near.stop - near.start) for sensor, total in sums.items()}
+
+
+def _square(packed: NDArray) -> NDArray:
+    """(n, n) of its upper triangle."""
+    out = np.empty((int(np.sqrt(2.0 * len(packed))),) * 2)
+    upper = np.triu_indices(len(out))
+    out[upper] = out.T[upper] = packed
+    return out

@@ -21,18 +21,18 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
-from kinefit.frame.results import ANYWHERE, FrameResult
-from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
+from kinefit.frame.results import FrameResult
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
-from kinefit.smoothing.sensor_noise import OtherNoise
+from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.border_frames import gram
-from kinefit.solvers.equations import block_diagonal, inverse, joint_moves, product
+from kinefit.solvers.equations import block_diagonal, joint_moves, product
+from kinefit.solvers.variance_components import VarianceComponents, variance_components
 from kinefit.solvers.whitened import PoseScrews, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
@@ -43,10 +43,11 @@ from kinefit.subject.subject import Subject
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 """(frames, covariance of each on its own) -> what an uncertain shape adds to them."""
 
-_MOST_HIDDEN = 0.75  # share of its errors that a fit may be thought to follow
+TIED = 0.1
+"""[s] within which motion ties a frame to another: an acceleration lasts about twice that."""
+
 _STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames tell it
-_APART = 200  # frames: more than residuals are followed over, at up to 400 Hz
-_TIED = 0.1  # [s] within which motion ties a frame to another: an acceleration lasts about twice that
+_APART = 800  # frames: more than residuals are followed over, at up to 400 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
     cameras: tuple[float, float] | None = None, shared: SharedErrors | None = None,
-) -> tuple[Iterator[FrameResult], DetectorNoise]:  # fmt: skip
+) -> tuple[Iterator[FrameResult], VarianceComponents]:  # fmt: skip
     """The same results, one by one, with the deviations that lasting errors and the shape add; the detectors' noise.
 
     Parameters
@@ -85,18 +86,28 @@ def with_lasting_errors(
     """
     body, channels = subject.body, take.channels
     shared = shared or SharedErrors.none(len(channels.column))
-    values, factor = _left_over(take)
-    seen = float(np.mean(np.sum(factor > 0, axis=1))) if factor.size else 0.0
-    hidden = np.full(factor.shape[1], min(body.tree.n_dofs / max(2.0 * seen, 1.0), _MOST_HIDDEN))
+    layout = Layout(channels.with_points(body), body)
+    half, n = round(TIED * rate), body.tree.n_dofs
+    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
+    hidden, seen = np.zeros((2, len(channels.column)))
+    for f in sampled:
+        rows, J, pushed = pixel_columns(layout, results[f].state, weight[f], shared)
+        whole = gram(J, pushed) + (0.0 if others is None else others.pooled(f, half)[0])
+        felt = rows.weight > 0.0
+        followed = leverages(J[felt], pushed[felt], covariance_alone(body, results[f].state, whole))
+        hidden += np.bincount(rows.group[felt], followed, len(hidden))
+        seen += np.bincount(rows.group[felt], minlength=len(seen))
+    hidden = np.where(seen > 0, hidden / np.maximum(seen, 1), hidden.sum() / max(seen.sum(), 1))
     if channels.view_followed is not None:
         hidden = 1.0 - (1.0 - hidden) * (1.0 - channels.view_followed)
-    noise = estimate_noise(channels, values, factor, rate, leverage=hidden)
-    del values, factor
+    values = _left_over(take)
+    noise = variance_components(
+        values, np.arange(len(values)) / rate, leverage=hidden, jitter_leverage=hidden / (2 * half + 1),
+        pool=np.minimum(channels.column, channels.column[channels.partner]), group=channels.source,
+    )  # fmt: skip
+    del values
     known = Known.of(subject, channels, cameras)
-    layout = Layout(channels.with_points(body), body)
-    half, n = round(_TIED * rate), body.tree.n_dofs
     nothing = np.zeros((n, n)), np.zeros((n, n))
-    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
 
     def lasts(f: int) -> Lasting:
         more = nothing if others is None else others.pooled(f, half)
@@ -122,20 +133,18 @@ def with_lasting_errors(
     return surer_no_more(), noise
 
 
-def _left_over(take: SmoothTake) -> tuple[NDArray, NDArray]:
-    """Residuals (F, N, 2) [px] and robust factors (F, N); of long takes in stretches, with unseen frames between."""
-    channels, parts = take.channels, stretches(len(take.roots))
+def _left_over(take: SmoothTake) -> NDArray:
+    """Residuals (F, N, 2) [px], NaN where unseen; of long takes in stretches, with unseen frames between."""
+    parts = stretches(len(take.roots))
     chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, _STRETCHES).astype(int))]
-    values, factors = [], []
+    values = []
     for some in chosen:
         part = take.part(some)
-        fitted = part.fitted(part.roots, part.angles)
-        values.append(part.uv - fitted)
-        factors.append(part.factors(channels.sigma, fitted))
+        seen = part.confidence > 0
+        values.append(np.where(seen[..., None], part.uv - part.fitted(part.roots, part.angles), np.nan))
         if len(parts) > _STRETCHES:  # as many frames as residuals are followed over
             values.append(np.full((_APART, *values[0].shape[1:]), np.nan))
-            factors.append(np.zeros((_APART, factors[0].shape[1])))
-    return np.concatenate(values), np.concatenate(factors)
+    return np.concatenate(values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +201,41 @@ class Known:
         return by, joints
 
 
+def pixel_columns(
+    layout: Layout, state: BodyState, weight: NDArray, shared: SharedErrors
+) -> tuple[Rows, NDArray, NDArray]:
+    """Keypoints of one frame with weights (N,) [1/px²], two rows each.
+
+    Returns
+    -------
+    rows, J (2 N, n) [px] how they move with the pose, and W J (2 N, n) [1/px] how an error of each pushes the pose
+    """
+    own = weight / (1.0 - shared.share)
+    rows = targets.fill(
+        _kernels.pixel_rows, 2, layout.body, state, layout.points, layout.channels.rig.packed, layout.channels.camera,
+        np.zeros((len(weight), 2)), np.ascontiguousarray(own),
+    )  # fmt: skip
+    root = np.sqrt(own[rows.group])[:, None]
+    whitened = columns(rows, PoseScrews.of(layout.body, state))
+    twice = shared.whitened(shared.whitened(whitened, own, rows.group), own, rows.group)
+    return rows, whitened / np.where(root > 0.0, root, 1.0), root * twice
+
+
+def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | None) -> Callable[[int], NDArray]:
+    """Function of a frame: the information (n, n) of its keypoints with weights (F, N) [1/px²]."""
+    layout = Layout(take.channels.with_points(take.body), take.body)
+    shared = shared or SharedErrors.none(weight.shape[1])
+
+    def information(f: int) -> NDArray:
+        _, J, pushed = pixel_columns(layout, BodyState(take.roots[f], take.angles[f]), weight[f], shared)
+        return gram(J, pushed)
+
+    return information
+
+
 def lasting(
     known: Known, layout: Layout, state: BodyState, weight: NDArray,
-    noise: DetectorNoise, shared: SharedErrors, other_information: NDArray, other_lasting: NDArray,
+    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, other_lasting: NDArray,
 ) -> Lasting:  # fmt: skip
     """Covariance of one frame's pose from drift, shifts of sensors and shape.
 
@@ -207,36 +248,26 @@ def lasting(
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     n = tree.n_dofs
-    weight = weight / (1.0 - shared.share)  # of what is its own
-    rows = targets.fill(
-        _kernels.pixel_rows, 2, body, state, layout.points, channels.rig.packed, channels.camera,
-        np.zeros((len(weight), 2)), np.ascontiguousarray(weight),
-    )  # fmt: skip
+    rows, J, pushed = pixel_columns(layout, state, weight, shared)
     frames, _ = tree.forward(state.T_world_root, state.angles)
-    by_pose, Sigma = columns(rows, PoseScrews.of(body, state)), known.covariance
     by_shape, stretch = known.columns(layout, rows, tree, frames)
-    by_pose, by_shape = (shared.whitened(one, weight, rows.group) for one in (by_pose, by_shape))
+    Sigma = known.covariance
     if body.closures:
         closed = closed_at(body, state)
         w = closed.rows().weight
-        other_information = other_information + closed.jacobian.T @ (w[:, None] * closed.jacobian)
         soft = (w * ~closed.hard)[:, None] * closed.jacobian
         other_lasting = other_lasting + soft.T @ closed.jacobian
-    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
-    free = slice(0 if tree.root_free else 6, n)  # a root that is fixed answers to nothing
-    alone = np.zeros((n, n))
-    seen = gram(by_pose, by_pose)
-    alone[free, free] = inverse((seen + other_information + prior)[free, free])
-    pushed = np.sqrt(weight[rows.group])[:, None] * shared.whitened(by_pose, weight, rows.group)
+    alone = covariance_alone(body, state, gram(J, pushed) + other_information)
     source, axis = channels.source[rows.group], np.arange(len(rows)) % 2
-    sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shift))]
-    push = np.concatenate([np.empty((0, n)), *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shift))])
-    last, share = (v[rows.group][:, None] * pushed for v in (noise.drift * np.sqrt(1.0 - shared.share),
-                                                            noise.drift * np.sqrt(shared.share)))
+    sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shared))]
+    push = np.concatenate([np.empty((0, n)), *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shared))])
+    last, share = (v[rows.group][:, None] * pushed for v in (noise.lasting * np.sqrt(1.0 - shared.share),
+                                                            noise.lasting * np.sqrt(shared.share)))
     together = shared.sums(share, rows.group)
     drift = gram(last, last) + gram(together, together)
     meat = drift + product(push.T, push) + other_lasting
-    pushed_by_shape = gram(by_pose, by_shape)
+    own = (weight / (1.0 - shared.share))[rows.group]
+    pushed_by_shape = gram(pushed, by_shape / np.sqrt(np.where(own > 0.0, own, 1.0))[:, None])
     if known.closing is not None:
         moved_by = known.closing.at(state)
         pushed_by_shape[:, : moved_by.shape[1]] += closed.jacobian.T @ (w[:, None] * moved_by)

@@ -28,7 +28,7 @@ from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results
 from kinefit.smoothing.spool import STRETCH, Spool
-from kinefit.smoothing.uncertainty import with_lasting_errors
+from kinefit.smoothing.uncertainty import TIED, pixel_information, with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
@@ -126,8 +126,9 @@ def motion_of(
     if others is not None and matched is not None:
         # the tracker's own frames hold the surfaces' errors already
         noise_of_others = other_noise(
-            body, others, matched, take.roots, take.angles, surfaces=smooth or lag is not None
-        )
+            body, others, matched, take.roots, take.angles, pixel_information(take, weight, shared),
+            half=round(TIED * rate), surfaces=smooth or lag is not None,
+        )  # fmt: skip
         provenance["sensor noise"] = noise_of_others.as_told()
 
     def weighed(f: int) -> tuple[Scene, list[Matched]]:
@@ -146,7 +147,7 @@ def motion_of(
         cameras=None if elsewhere else settings.camera_std, shared=shared,
     )  # fmt: skip
     if channels.sources:
-        provenance["detector noise"] = detectors.as_told(channels.sources)
+        provenance["detector noise"] = detectors.summary("px", 2, channels.sources)
     if channels.view_bias is not None and subject.view_bias is not None:
         provenance["view bias"] = subject.view_bias.as_told()
     provenance["length_std_m"] = subject.length_std

@@ -1,0 +1,229 @@
+"""Variance components of a sensor's errors: bias, drift and jitter of each channel, and the bias that a group shares.
+
+With e the error of channel c in frame t along one axis, in the sensor's own unit,
+
+    e_c(t) = s + b_c + d_c(t) + j_c(t)
+
+the shared bias s and the bias b_c are constant over the take, the drift d_c has the covariance σ_d² exp(−|Δt| / τ), and
+the jitter j_c is white. The components are estimated by moments: half the mean squared change over a time lag (the
+variogram; Matheron, *Principles of geostatistics*, 1963) is σ_j² + σ_d² (1 − exp(−Δt / τ)), and the mean square is the
+sum of all components.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_NORMAL_MAD = 0.6745  # median |x| of a standard normal variable
+_OUTLIER_QUANTILE = 3.72  # standard normal quantile of probability 0.9999
+_PRIOR_SAMPLES = 10.0  # samples of a channel that count as much as the scale of its pool
+_MIN_PAIRS = 30  # pairs of frames of a pool; one with fewer takes the jitter and drift of the others
+_MAX_LAG_S = 2.0
+_LAGS = 12
+_MIN_LAGS = 3  # with fewer, drift cannot be distinguished
+_TIME_CONSTANTS = 40  # that are tried
+_UNTOLD = 0.1  # share of an error's variance left in the residuals, below which they do not tell its size
+
+
+@dataclass(frozen=True, eq=False)
+class VarianceComponents:
+    """Standard deviations of the errors of C channels along A axes, in the unit of the residuals.
+
+    Parameters
+    ----------
+    bias : (C,) of the constant part of each channel
+    drift : (C,) of the part that is correlated in time
+    jitter : (C,) of the white part
+    shared : (G, A) constant part that all channels of a group have in common
+    drift_time : [s] time constant of the drift, in which its correlation falls to 1/e
+    bias_error : (C,) square root of the standard error of bias², of what jitter and drift leave uncertain
+    outlier : (F, C) bool, residuals that were excluded
+    """
+
+    bias: NDArray
+    drift: NDArray
+    jitter: NDArray
+    shared: NDArray
+    drift_time: float
+    bias_error: NDArray
+    outlier: NDArray
+
+    @property
+    def lasting(self) -> NDArray:
+        """(C,) standard deviation of what does not average out over neighbouring frames."""
+        return np.asarray(np.sqrt(self.bias**2 + self.drift**2 + self.bias_error**2))
+
+    def summary(self, unit: str, digits: int, groups: Sequence[str] = ()) -> dict[str, Any]:
+        """The same in a few numbers, medians over the channels, with the shared bias by the names of the groups."""
+        parts = (("bias", self.bias), ("drift", self.drift), ("jitter", self.jitter))
+        shared = self.shared.round(digits).tolist()
+        return {f"{name} [{unit}]": round(float(np.median(value)), digits) for name, value in parts} | {
+            "drift time [s]": round(self.drift_time, 2),
+            f"shared [{unit}]": dict(zip(groups, shared)) if groups else shared[0],
+        }
+
+
+def variance_components(
+    residuals: NDArray, times: NDArray | None = None, *, leverage: NDArray | None = None,
+    jitter_leverage: NDArray | None = None, pool: NDArray | None = None, group: NDArray | None = None,
+) -> VarianceComponents:  # fmt: skip
+    """Estimate bias, drift and jitter from the residuals of a fit.
+
+    Parameters
+    ----------
+    residuals : (F, C, A) measured minus fitted, NaN where unseen
+    times : (F,) [s], increasing; None for frames so far apart that no drift connects them: it then counts as jitter.
+    leverage : (C,) share of the variance of each channel's bias and drift that the fit takes from the residuals;
+        below 0 where it adds errors of other channels; default 0
+    jitter_leverage : (C,) the same of its jitter, of which a fit that smooths follows less; default `leverage`
+    pool : (C,) int, channels of one number have the same standard deviations; default all
+    group : (C,) int from 0, channels of one number share a bias; default all
+    """
+    C = residuals.shape[1]
+    pool = np.zeros(C, np.int64) if pool is None else np.unique(pool, return_inverse=True)[1]
+    group = np.zeros(C, np.int64) if group is None else group
+    outlier = _outliers(residuals, pool)
+    r = np.where(outlier[..., None], np.nan, residuals)
+    shared, centre = _shared(_means(r), group)
+    r = r - centre
+    mean, seen = _means(r), np.isfinite(r)
+    count, axes = seen.sum(axis=(0, 2)), np.any(seen, axis=0).sum(axis=1)
+    bias2 = np.nansum(mean**2, axis=1) / np.maximum(axes, 1)
+    clipped = np.minimum(bias2, _bias_limit(bias2, axes, pool))
+    within = _mean_of_pools(np.nansum((r - mean) ** 2, axis=(0, 2)) / np.maximum(count, 1), count, pool)
+    square = within + _mean_of_pools(clipped, count, pool)
+    jitter2, drift2, drift_time = _jitter_and_drift(r, times, pool, square)
+    lasting2 = np.maximum(square - jitter2, 0.0)
+    drift2 = np.minimum(drift2, lasting2)
+    of_mean = np.maximum(jitter2 + drift2 - within, 0.0)  # variance that a channel's mean has by jitter and drift
+    error2 = of_mean * np.sqrt(2.0 / np.maximum(np.bincount(pool, axes), 1))
+    lasting = np.zeros(C) if leverage is None else leverage
+    back, jitter_back = (
+        _counted_back(1.0 - _mean_of_pools(hidden, count, pool))
+        for hidden in (lasting, lasting if jitter_leverage is None else jitter_leverage)
+    )
+    pooled2, drift2, error2 = ((v * back)[pool] for v in (lasting2 - drift2, drift2, error2))
+    jitter2 = (jitter2 * jitter_back)[pool]
+    bias2 = pooled2 + (bias2 - clipped)
+    bias, drift, jitter, error = (np.sqrt(v) for v in (bias2, drift2, jitter2, error2))
+    return VarianceComponents(bias, drift, jitter, shared, drift_time, error, outlier)
+
+
+def _counted_back(kept: NDArray) -> NDArray:
+    """Factor on variances of which a fit leaves so much in the residuals: 1 / kept, but 0 where it leaves nothing."""
+    return np.asarray(np.where(kept > 0.0, kept * (1.0 + _UNTOLD**2) / (kept**2 + _UNTOLD**2), 0.0))
+
+
+def _outliers(residuals: NDArray, pool: NDArray) -> NDArray:
+    """(F, C) bool: residuals that the channel's own jitter in time does not explain."""
+    seen = np.isfinite(residuals)
+    square = (residuals - _medians(residuals, axis=0)) ** 2
+    scale2, count = _medians(square, axis=(0, 2)) / _NORMAL_MAD**2, seen.sum(axis=(0, 2))
+    of_pool = _median_of_pools(scale2, pool)
+    scale2 = (count * np.nan_to_num(scale2) + _PRIOR_SAMPLES * of_pool) / (count + _PRIOR_SAMPLES)
+    limit = np.where(scale2 > 0.0, scale2 * _chi_square(seen.sum(axis=2), _OUTLIER_QUANTILE), np.inf)
+    return np.asarray(np.nansum(square, axis=2) > limit)
+
+
+def _shared(mean: NDArray, group: NDArray) -> tuple[NDArray, NDArray]:
+    """(G, A) bias that each group shares, shrunk by its variance; (C, A) that of each channel's group, with sign."""
+    shared, centre = np.zeros((int(group.max(initial=-1)) + 1, mean.shape[1])), np.zeros(mean.shape)
+    for g in range(len(shared)):
+        own = mean[group == g]
+        away2 = (own - _medians(own, axis=0)) ** 2
+        alike = away2 <= _chi_square(np.ones(1), _OUTLIER_QUANTILE) * _medians(away2, axis=0) / _NORMAL_MAD**2
+        count, own = alike.sum(axis=0), np.where(alike, own, 0.0)
+        middle = own.sum(axis=0) / np.maximum(count, 1)
+        spread2 = np.where(alike, own - middle, 0.0) ** 2
+        variance = spread2.sum(axis=0) / np.maximum(count - 1, 1) / np.maximum(count, 1)
+        shared2 = np.where(count > 1, np.maximum(middle**2 - variance, 0.0), 0.0)
+        shared[g] = np.sqrt(shared2)
+        centre[group == g] = shared2 / np.where(middle == 0.0, 1.0, middle)
+    return shared, centre
+
+
+def _bias_limit(bias2: NDArray, axes: NDArray, pool: NDArray) -> NDArray:
+    """(C,) squared bias per axis, beyond which a channel's bias says nothing of the others of its pool."""
+    scale2 = np.where(axes > 0, bias2 * axes / _chi_square(axes, 0.0), np.nan)
+    return _median_of_pools(scale2, pool) * _chi_square(axes, _OUTLIER_QUANTILE) / np.maximum(axes, 1)
+
+
+def _jitter_and_drift(
+    r: NDArray, times: NDArray | None, pool: NDArray, square: NDArray
+) -> tuple[NDArray, NDArray, float]:
+    """Variances (P,) of jitter and drift, and the drift's time constant [s], from each pool's variogram.
+
+    The mean square (P,) of a pool counts as its jitter where no pool has enough pairs of frames.
+    """
+    F, P = len(r), len(square)
+    lags = np.unique(np.round(np.geomspace(1, max(F // 2, 1), _LAGS)).astype(int))
+    lags = lags[lags < F]
+    dt = np.array([np.median(times[k:] - times[:-k]) if times is not None else np.inf for k in lags])
+    near = dt <= max(_MAX_LAG_S, dt.min(initial=np.inf))
+    lags, dt, gamma, pairs = lags[near], dt[near], np.zeros((near.sum(), P)), np.zeros((near.sum(), P))
+    for k, lag in enumerate(lags):
+        change = r[lag:] - r[:-lag]
+        gamma[k] = 0.5 * np.bincount(pool, np.nansum(change**2, axis=(0, 2)), P)
+        pairs[k] = np.bincount(pool, np.isfinite(change).sum(axis=(0, 2)), P)
+    gamma, known = gamma / np.maximum(pairs, 1), pairs.sum(axis=0) >= _MIN_PAIRS
+    if not known.any():
+        return square, np.zeros(P), _MAX_LAG_S
+    weight = pairs / lags[:, None]  # of pairs that do not overlap
+    taus = np.full(1, _MAX_LAG_S)
+    if times is not None and len(dt) >= _MIN_LAGS:  # a drift that is gone in two frames is jitter
+        taus = np.geomspace(2.0 * dt[0], 2.0 * dt[-1], _TIME_CONSTANTS)
+    fits = [_fitted(gamma, weight, -np.expm1(-dt / tau)) for tau in taus]
+    scale = np.maximum((weight * gamma**2).sum(axis=0), 1e-300)
+    best = int(np.argmin([np.sum((loss / scale)[known]) for _, _, loss in fits]))
+    jitter2, drift2 = (np.where(known, v, np.median(v[known])) for v in fits[best][:2])
+    return jitter2, drift2, float(taus[best])
+
+
+def _fitted(gamma: NDArray, weight: NDArray, rise: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Variances (P,) of jitter and drift, neither below 0, that fit γ (L, P) ≈ σ_j² + σ_d² rise (L,); squares left."""
+    g, y = rise[:, None], gamma
+    w, wg, wgg, wy, wgy = (np.sum(weight * v, axis=0) for v in (1.0, g, g * g, y, g * y))
+    drift = np.maximum((w * wgy - wg * wy) / np.maximum(w * wgg - wg**2, 1e-9 * w * w + 1e-300), 0.0)
+    jitter = (wy - drift * wg) / np.maximum(w, 1e-300)
+    drift = np.where(jitter < 0.0, wgy / np.maximum(wgg, 1e-300), drift)
+    jitter = np.maximum(jitter, 0.0)
+    return jitter, drift, np.sum(weight * (y - jitter - drift * g) ** 2, axis=0)
+
+
+def _chi_square(dof: NDArray, quantile: float) -> NDArray:
+    """χ² of so many degrees of freedom at a standard normal quantile (Wilson and Hilferty, 1931)."""
+    spread = 2.0 / (9.0 * np.maximum(dof, 1))
+    return np.asarray(np.maximum(dof, 1) * (1.0 - spread + quantile * np.sqrt(spread)) ** 3)
+
+
+def _mean_of_pools(values: NDArray, weight: NDArray, pool: NDArray) -> NDArray:
+    """(P,) weighted mean of values (C,) in each pool, 0 without any."""
+    return np.asarray(np.bincount(pool, values * weight) / np.maximum(np.bincount(pool, weight), 1e-300))
+
+
+def _median_of_pools(values: NDArray, pool: NDArray) -> NDArray:
+    """(C,) median of the values (C,) in each channel's pool, 0 without any."""
+    out = np.zeros(len(values))
+    for p in range(int(pool.max(initial=-1)) + 1):
+        known = values[(pool == p) & np.isfinite(values)]
+        out[pool == p] = np.median(known) if len(known) else 0.0
+    return out
+
+
+def _means(r: NDArray) -> NDArray:
+    """(C, A) means over frames, NaN where nothing is seen."""
+    count = np.isfinite(r).sum(axis=0)
+    return np.where(count > 0, np.nansum(r, axis=0) / np.maximum(count, 1), np.nan)
+
+
+def _medians(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
+    """Medians along axes without NaN, NaN where nothing is seen."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=axis))
