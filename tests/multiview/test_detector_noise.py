@@ -16,9 +16,9 @@ def residuals(**errors):
     """Channels, and measured minus true pixels (F, N, 2)."""
     seen = simulate_keypoints(MOTION, RIG, **{"outliers": 0.0, "missing": 0.1, **errors})
     body = load_body("humanoid")
-    channels = make_channels(body, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [3.0] * 4)
+    channels = make_channels(body, RIG, seen, [3.0] * 4)
     true = simulate_keypoints(MOTION, RIG, noise_px=0.0, outliers=0.0, missing=0.0)
-    exact = make_channels(body, RIG, true, [np.zeros(len(MOTION), int)] * 4, [3.0] * 4)
+    exact = make_channels(body, RIG, true, [3.0] * 4)
     return channels, channels.uv - exact.uv
 
 
