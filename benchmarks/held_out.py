@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit import Keypoints, Motion, Recording, Rig
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.sensors.keypoints import Layout, projected
+from kinefit.sensors.layout import Layout, projected
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.view_bias import ViewBias
@@ -20,15 +20,13 @@ _SIGMA = 8.0  # [px] at which sides count as exchanged, as for a take that state
 
 def persons(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Keypoints]:
     """Records of the one who is followed, among all who were detected."""
-    whole = Recording.of_keypoints(rig, keypoints)
-    return [record.of_one(chosen) for record, chosen in zip(whole.keypoints, whole.people, strict=True)]
+    return list(Recording.of_keypoints(rig, keypoints).keypoints)
 
 
 def sides_right(motion: Motion, rig: Rig, people: Sequence[Keypoints]) -> tuple[Channels, NDArray]:
     """Keypoints of one person as channels with left and right as the motion has them, and (F, N, 2) [px] where it has
     each of them, bias by view included."""
-    nobody_else = [np.zeros(len(one), np.int64) for one in people]
-    channels = make_channels(motion.body, rig, people, nobody_else, [_SIGMA] * len(people))
+    channels = make_channels(motion.body, rig, people, [_SIGMA] * len(people))
     channels = ViewBias.from_told(motion.provenance.get("view bias", {})).known_to(channels)
     layout, groups = Layout(channels, motion.body), limb_groups(motion.body, channels)
     fitted = np.empty(channels.uv.shape)

@@ -73,8 +73,7 @@ def played(recording: Recording, frames: int) -> Recording:
     times = np.arange(frames) / RATE
     steps = lambda i: [replace(f, time=float(times[i])) for f in recording.steps(int(order[i]))]
     keypoints = [replace(k, points=k.points[order], confidence=k.confidence[order]) for k in recording.keypoints]
-    people = tuple(p[order] for p in recording.people)
-    return replace(recording, times=times, steps=steps, keypoints=tuple(keypoints), people=people)
+    return replace(recording, times=times, steps=steps, keypoints=tuple(keypoints))
 
 
 def _recording(folder: Path, name: str, body: Body) -> tuple[Recording, Body]:

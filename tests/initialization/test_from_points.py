@@ -33,7 +33,7 @@ def channels_of(x, noise=0.0, seed=0, spoil=None):
         uv = camera.project(x) + noise * random.normal(size=(*x.shape[:2], 2))
         uv = spoil(c, uv) if spoil else uv
         records.append(Keypoints(camera.name, SET, POINTS.names, 25.0, uv[:, None], np.ones((len(x), 1, len(POINTS)))))
-    return make_channels(BODY, RIG, records, [np.zeros(len(x), int)] * len(RIG), [8.0] * len(RIG))
+    return make_channels(BODY, RIG, records, [8.0] * len(RIG))
 
 
 FRAMES = np.stack([BODY.positions(near_origin(k), POINTS) for k in range(6)])

@@ -18,7 +18,7 @@ class Scene:
         self.motion = cut(squat_and_wave(), 0, FRAMES)
         self.rig = studio_rig(self.motion)
         self.keypoints = simulate_keypoints(self.motion, self.rig, "BODY_25B")
-        self.recording = Recording.of_keypoints(self.rig, self.keypoints, up=self.motion.up)
+        self.recording = Recording(self.motion.times, self.motion.rate, self.rig, up=self.motion.up)
 
     def tracker(self):
         return Tracker(self.motion.body, self.rig, rate=self.motion.rate, up=UP_AXES[self.motion.up])

@@ -6,6 +6,7 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, ObservationError
+from kinefit.multiview.association import person_records
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import exchange, fitted_pixels, joined, make_channels, mirror_name
 
@@ -39,7 +40,7 @@ def test_every_catalogue_point_has_its_partner_in_the_set():
 def test_every_measurement_becomes_a_channel():
     a, b = record("cam1"), record("cam3", "BODY_25B", seed=1)
     people = [np.array([0, 1, -1]), np.array([1, 1, 0])]
-    channels = make_channels(BODY, RIG, [a, b], people, [3.0, 7.0])
+    channels = make_channels(BODY, RIG, person_records([a, b], people), [3.0, 7.0])
     k, m = len(BODY.keypoints("COCO_17")), len(BODY.keypoints("BODY_25B"))
     assert channels.uv.shape == (3, k + m, 2) and channels.sources == ("cam1", "cam3")
     assert channels.sets == {"COCO_17": slice(0, k), "BODY_25B": slice(k, k + m)}
@@ -56,7 +57,7 @@ def test_every_measurement_becomes_a_channel():
 
 
 def test_partners_are_the_other_side_of_the_same_source():
-    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [np.zeros(3, int)] * 2, [8.0, 8.0])
+    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [8.0, 8.0])
     partner = channels.partner
     np.testing.assert_array_equal(partner[partner], np.arange(len(partner)))
     np.testing.assert_array_equal(channels.source[partner], channels.source)
@@ -65,15 +66,13 @@ def test_partners_are_the_other_side_of_the_same_source():
 
 
 def test_two_cameras_share_the_points_of_one_set():
-    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [np.zeros(3, int)] * 2, [8.0, 8.0])
+    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [8.0, 8.0])
     assert len(channels.points) == 17 and len(channels.column) == 34
     np.testing.assert_array_equal(channels.column[:17], channels.column[17:])
 
 
 def test_two_detectors_on_one_camera_are_told_apart():
-    channels = make_channels(
-        BODY, RIG, [record("cam1"), record("cam1", "BODY_25B")], [np.zeros(3, int)] * 2, [8.0, 8.0]
-    )
+    channels = make_channels(BODY, RIG, [record("cam1"), record("cam1", "BODY_25B")], [8.0, 8.0])
     assert channels.sources == ("cam1 COCO_17", "cam1 BODY_25B")
 
 
@@ -84,14 +83,14 @@ def test_weights():
     points[1, 0, 4] = np.nan
     confidence[0, 0, 2] = np.nan
     spoilt = Keypoints("cam1", "COCO_17", source.names, 25.0, points, confidence)
-    channels = make_channels(BODY, RIG, [spoilt], [np.zeros(3, int)], [4.0])
+    channels = make_channels(BODY, RIG, [spoilt], [4.0])
     assert channels.weight[1, 4] == 0 and channels.weight[0, 2] == 0
     assert channels.weight[0, 5] == pytest.approx(confidence[0, 0, 5] / 16.0)
     assert np.all(np.isfinite(channels.weight))
 
 
 def test_exchange_of_sides_in_one_source():
-    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [np.zeros(3, int)] * 2, [8.0, 8.0])
+    channels = make_channels(BODY, RIG, [record("cam1"), record("cam2")], [8.0, 8.0])
     uv = channels.uv[0]
     turned = exchange(channels, uv, np.array([False, True]))
     np.testing.assert_array_equal(turned[:17], uv[:17])
@@ -100,14 +99,14 @@ def test_exchange_of_sides_in_one_source():
 
 
 def test_points_of_another_body():
-    channels = make_channels(BODY, RIG, [record()], [np.zeros(3, int)], [8.0])
+    channels = make_channels(BODY, RIG, [record()], [8.0])
     larger = channels.with_points(BODY.scaled(np.full(len(BODY.scale_groups), 1.2)))
     np.testing.assert_allclose(larger.points.points, 1.2 * channels.points.points)
     assert larger.points.names == channels.points.names
 
 
 def test_fitted_pixels_are_the_projections():
-    channels = make_channels(BODY, RIG, [record("cam3"), record("cam1")], [np.zeros(3, int)] * 2, [8.0, 8.0])
+    channels = make_channels(BODY, RIG, [record("cam3"), record("cam1")], [8.0, 8.0])
     state = posture(BODY, 0, 0.3)
     x = BODY.positions(state, channels.points)
     expected = np.concatenate([RIG["cam3"].project(x), RIG["cam1"].project(x)])
@@ -122,23 +121,23 @@ def test_joined_points():
 
 
 def test_what_cannot_be_used_is_told():
-    nobody = [np.zeros(3, int)]
     with pytest.raises(ObservationError, match="no keypoints"):
-        make_channels(BODY, RIG, [], [], [])
+        make_channels(BODY, RIG, [], [])
     with pytest.raises(ObservationError, match=r"no camera 'cam9'; there are: cam1, cam2, cam3"):
-        make_channels(BODY, RIG, [record("cam9")], nobody, [8.0])
+        make_channels(BODY, RIG, [record("cam9")], [8.0])
     strange = Keypoints("cam1", "COCO_17", ("a", "b"), 25.0, np.zeros((3, 1, 2, 2)), np.ones((3, 1, 2)))
     with pytest.raises(ObservationError, match="none of the points of COCO_17"):
-        make_channels(BODY, RIG, [strange], nobody, [8.0])
+        make_channels(BODY, RIG, [strange], [8.0])
     unknown = Keypoints("cam1", "COCO_18", ("a", "b"), 25.0, np.zeros((3, 1, 2, 2)), np.ones((3, 1, 2)))
     with pytest.raises(KinefitError, match="COCO_18"):
-        make_channels(BODY, RIG, [unknown], nobody, [8.0])
+        make_channels(BODY, RIG, [unknown], [8.0])
 
 
 def test_a_camera_that_saw_nobody_at_all():
     """Its record has room for no person: a camera more, but no measurement."""
     empty = record("cam2", people=0)
-    channels = make_channels(BODY, RIG, [record("cam1"), empty], [np.zeros(3, int), np.full(3, -1)], [8.0, 8.0])
+    alone = person_records([record("cam1"), empty], [np.zeros(3, int), np.full(3, -1)])
+    channels = make_channels(BODY, RIG, alone, [8.0, 8.0])
     assert np.all(np.isnan(channels.uv[:, 17:])) and not channels.confidence[:, 17:].any()
 
 
@@ -153,7 +152,7 @@ def test_a_camera_that_is_late_by_part_of_a_frame_is_brought_into_step(late):
         points = 100.0 + (frames + offset)[:, None, None, None] * speed + np.zeros_like(one.points)
         points[2, 0, 4] = np.nan
         records.append(Keypoints(camera, one.keypoint_set, one.names, 25.0, points, one.confidence, offset / 25.0))
-    channels = make_channels(BODY, RIG, records, [np.zeros(6, int)] * 3, [8.0] * 3)
+    channels = make_channels(BODY, RIG, person_records(records, [np.zeros(6, int)] * 3), [8.0] * 3)
     inner = channels.uv[1:-1]
     expected = 100.0 + frames[1:-1, None, None] * speed + np.zeros_like(inner)
     seen = np.isfinite(inner)

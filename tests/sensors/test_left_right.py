@@ -27,7 +27,7 @@ def scene(seed=0, noise=3.0):
         uv = camera.project(BODY.positions(state, BODY.keypoints(SET)))
         uv = uv + noise * random.normal(size=uv.shape)
         records.append(Keypoints(camera.name, SET, NAMES, 25.0, uv[None, None], np.ones((1, 1, len(NAMES)))))
-    channels = make_channels(BODY, RIG, records, [np.zeros(1, int)] * 4, [8.0] * 4)
+    channels = make_channels(BODY, RIG, records, [8.0] * 4)
     return channels, np.array(channels.uv[0]), channels.weight[0].copy(), fitted_pixels(BODY, channels, state)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 from kinefit.bodies import load_body
 from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout, projected
+from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
+from kinefit.sensors.layout import Layout, projected
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias, beside, directions, trunks
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
@@ -20,7 +21,7 @@ RIG = studio_rig(MOTION)
 
 def channels_of(noise_px=1.0):
     seen = simulate_keypoints(MOTION, RIG, noise_px=noise_px, seed=0)
-    return make_channels(BODY, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [8.0] * 4)
+    return make_channels(BODY, RIG, seen, [8.0] * 4)
 
 
 def test_a_limbs_trunk_is_the_first_segment_of_neither_side():

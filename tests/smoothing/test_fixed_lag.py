@@ -56,8 +56,7 @@ def error(states):
 
 def whole(tracker, results, noise):
     """The whole take, smoothed with the same noise: states and covariances."""
-    channels, matches = one_layout(BODY, tracker.rig, results, RATE)
-    alone = [replace(r, matched=m) for r, m in zip(results, matches, strict=True)]
+    channels, alone = one_layout(BODY, tracker.rig, results, RATE)
     take = pixels_of_track(BODY, channels, alone, RATE, STILL)
     kept = tuple(KeptFrame.of(r, tracker.scene_of(r.state, r.time)).measurements for r in results)
     if any(kept):

@@ -21,7 +21,7 @@ BODY = load_body("humanoid")
 @pytest.fixture(scope="module")
 def channels():
     seen = simulate_keypoints(MOTION, RIG, noise_px=1.0, outliers=0.0, missing=0.0)
-    return make_channels(BODY, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [3.0] * 4)
+    return make_channels(BODY, RIG, seen, [3.0] * 4)
 
 
 def test_points_of_one_segment_and_view_are_a_group(channels):

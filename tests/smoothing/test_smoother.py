@@ -14,7 +14,6 @@ from kinefit import Motion, Recording, load_body, track
 from kinefit.bodies.charts import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
-from kinefit.sensors.channels import make_channels
 from kinefit.sensors.observability import levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
@@ -23,6 +22,7 @@ from kinefit.smoothing.smoother import smooth_results, swapped_channels
 from kinefit.smoothing.unwrap import boxes, unwrap
 from kinefit.subject.subject import Subject
 from kinefit.tracking.run import run
+from kinefit.tracking.session import one_layout
 
 BODY = load_body("humanoid")
 TREE = BODY.tree
@@ -119,14 +119,10 @@ def squats():
     return truth, rig, simulate_keypoints(truth, rig, "BODY_25B", noise_px=4.0, seed=1)
 
 
-def channels_of(truth, rig, keypoints, sigma):
-    people = [np.zeros(len(k), int) for k in keypoints]
-    return make_channels(BODY, rig, keypoints, people, [sigma] * 4).with_points(truth.body)
-
-
-def followed(truth, channels):
-    """The frames of channels as tracked."""
-    return run(Recording(truth.times, truth.rate, channels.rig), truth.body, channels, DEFAULT)
+def followed(truth, rig, keypoints, sigma=8.0):
+    """Channels of keypoints, and the frames as tracked."""
+    tracked = run(Recording.of_keypoints(rig, keypoints, sigma=sigma), truth.body, DEFAULT)
+    return one_layout(truth.body, rig, tracked.results, truth.rate)[0], tracked
 
 
 def smoothed_of(truth, channels, tracked, settings=DEFAULT, count=None, **options):
@@ -140,8 +136,7 @@ def smoothed_of(truth, channels, tracked, settings=DEFAULT, count=None, **option
 @pytest.fixture(scope="module")
 def tracked(squats):
     """Channels of it, and the frames as tracked."""
-    channels = channels_of(*squats, 8.0)
-    return channels, followed(squats[0], channels)
+    return followed(*squats)
 
 
 def as_motion(truth, results) -> Motion:
@@ -197,13 +192,11 @@ def test_windows_agree_with_all_at_once(squats, tracked):
         np.testing.assert_allclose(a.joint_std[known], b.joint_std[known], rtol=0.02)
 
 
-def test_person_hidden_for_a_while_is_bridged(squats, tracked):
-    truth, _, _ = squats
-    channels, _ = tracked
-    uv = np.array(channels.uv)
-    uv[25:40] = np.nan
-    hidden = replace(channels, uv=uv)
-    smoothed, _ = smoothed_of(truth, hidden, followed(truth, hidden))
+def test_person_hidden_for_a_while_is_bridged(squats):
+    truth, rig, keypoints = squats
+    gap = (np.arange(len(truth)) >= 25) & (np.arange(len(truth)) < 40)
+    hidden = [replace(k, points=np.where(gap[:, None, None, None], np.nan, k.points)) for k in keypoints]
+    smoothed, _ = smoothed_of(truth, *followed(truth, rig, hidden))
     after = as_motion(truth, smoothed)
     std = after.joint_std[:, TREE.segment("shank_r")].max(axis=1)
     assert std[24] < std[27] < std[32] and std[32] > std[37] > std[40]
@@ -217,8 +210,8 @@ def test_person_hidden_for_a_while_is_bridged(squats, tracked):
 def test_exchanged_sides_stay_put_right(squats):
     truth, rig, _ = squats
     keypoints = simulate_keypoints(truth, rig, "BODY_25B", noise_px=3.0, outliers=0.0, swaps=0.15, seed=2)
-    channels = channels_of(truth, rig, keypoints, 5.0)
-    smoothed, _ = smoothed_of(truth, channels, followed(truth, channels))
+    channels, frames = followed(truth, rig, keypoints, 5.0)
+    smoothed, _ = smoothed_of(truth, channels, frames)
     swaps = swapped_channels(channels, smoothed)
     assert 0.1 < swaps.mean() < 0.2
     assert joint_errors(truth, as_motion(truth, smoothed)).mean() < 0.02

@@ -9,7 +9,7 @@ from kinefit.bodies import PointSet, load_body
 from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.keypoints import Layout
+from kinefit.sensors.layout import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting
@@ -28,7 +28,7 @@ SIGMA = 3.0
 def scene():
     seen = simulate_keypoints(MOTION, RIG, noise_px=1.0, outliers=0.0, missing=0.0)
     body = load_body("humanoid")
-    channels = make_channels(body, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [SIGMA] * 4)
+    channels = make_channels(body, RIG, seen, [SIGMA] * 4)
     subject = fit_subject(body, channels)
     channels = channels.with_points(subject.body)
     weight = channels.weight[20]

@@ -26,7 +26,7 @@ RIG = studio_rig(MOTION)
 
 def channels_of(motion, noise_px, seed=0):
     seen = simulate_keypoints(motion, RIG, noise_px=noise_px, drift_px=noise_px, outliers=0.05, missing=0.05, seed=seed)
-    return make_channels(BODY, RIG, seen, [np.zeros(len(motion), int)] * 4, [8.0] * 4)
+    return make_channels(BODY, RIG, seen, [8.0] * 4)
 
 
 def spread(subject):
@@ -98,7 +98,7 @@ def people(scales, noise, count=20, shifts=None, unseen=()):
         uv = camera.project(x)[:, None]
         uv = uv + noise * random.normal(size=uv.shape)
         records.append(Keypoints(camera.name, "BODY_25B", points.names, 30.0, uv, seen))
-    return make_channels(BODY, rig, records, [np.zeros(count, int)] * 4, [max(noise, 0.5)] * 4), x
+    return make_channels(BODY, rig, records, [max(noise, 0.5)] * 4), x
 
 
 @pytest.mark.parametrize(("shifted", "within"), [(False, 0.04), (True, 0.06)])
@@ -148,8 +148,7 @@ def test_a_worse_detector_beside_a_better_one_does_no_harm():
                 k for s, noise in detectors
                 for k in simulate_keypoints(MOTION, RIG, s, noise_px=noise, outliers=0.0, missing=0.0, seed=seed)
             ]  # fmt: skip
-            people = [np.zeros(len(MOTION), int)] * len(seen)
-            subject = fit_subject(BODY, make_channels(BODY, RIG, seen, people, [8.0] * len(seen)))
+            subject = fit_subject(BODY, make_channels(BODY, RIG, seen, [8.0] * len(seen)))
             errors.append(np.abs(subject.scales / SCALES - 1.0).mean())
         return np.mean(errors)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from kinefit.bodies import load_body
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.keypoints import Layout
+from kinefit.sensors.layout import Layout
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
@@ -24,7 +24,7 @@ TRUE = ViewBias({"BODY_25B": {"RHip": HIP, "LHip": HIP * MIRRORED}})
 def frames_of(bias: ViewBias, cameras: int = 4, noise_px: float = 1.0) -> SeenFrames:
     rig = RIG.select(RIG.names[:cameras])
     seen = simulate_keypoints(MOTION, rig, noise_px=noise_px, seed=0)
-    channels = make_channels(BODY, rig, seen, [np.zeros(len(MOTION), int)] * cameras, [8.0] * cameras)
+    channels = make_channels(BODY, rig, seen, [8.0] * cameras)
     states = [MOTION.state(f) for f in range(len(MOTION))]
     uv = np.array(channels.uv)
     if bias.sets:

@@ -36,7 +36,7 @@ def test_cameras_are_sought_from_their_calibration_and_begin_where_they_were_fou
         Keypoints(name, "MEDIAPIPE_33", ("nose",), 10.0, np.zeros((4, 1, 1, 2)), np.ones((4, 1, 1)))
         for name in CALIBRATED.names[:3]
     )  # fmt: skip
-    recording = replace(a_recording(), rig=moved, keypoints=seen, people=(np.zeros(4, int),) * 3)
+    recording = replace(a_recording(), rig=moved, keypoints=seen)
     unknown = of_points(recording, BODY, SIZED, None, None, calibrated=CALIBRATED, cameras=(0.003, 0.002))
     assert kinds(unknown) == [SegmentScales, PointOffsets, CameraExtrinsics]
     assert unknown.world.rig is CALIBRATED and unknown.parameters[2].free == CALIBRATED.names[:3]

@@ -144,7 +144,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
 
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
-    from kinefit.multiview.association import choose_people
+    from kinefit.multiview.association import choose_people, person_records
     from kinefit.multiview.followed import follow
     from kinefit.readers.take.pictures import TakePictures
     from kinefit.sensors.channels import make_channels
@@ -160,7 +160,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
         _screen.note(f"Only cameras are shown: {error.problem}.")
         return None
     sigma = [entry.sigma for entry in take.keypoints]
-    channels = make_channels(load_body(take.body), seen.rig, keypoints, people, sigma)
+    channels = make_channels(load_body(take.body), seen.rig, person_records(keypoints, people), sigma)
     return triangulated(channels, np.arange(len(channels.uv)))
 
 

@@ -18,9 +18,8 @@ from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, judged, to
 from kinefit.frame.skin import skin_of
 from kinefit.frame.trust import forgotten, holding, leapt, left_out, levered, moving, observed, unseen
 from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of, rows_at
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_step, on_null_space
@@ -254,12 +253,12 @@ class FrameFit:
         Keypoints observe no joint that hardly moves them, see `SHORTEST`: others must.
         """
         seen = observed(self.body.tree, now)
-        pixels = [m for m in matched if isinstance(m, KeypointMatched)]
+        pixels = pixels_of(matched)
         if not pixels:
             return seen
         short = seen[6:] & ~levered(scene, pixels) & ~looped(self.body)
         if short.any():
-            others = [k for k, m in enumerate(matched) if not isinstance(m, KeypointMatched)]
+            others = [k for k, m in enumerate(matched) if m.pixels is None]
             if others:
                 off = without and [without[k] for k in others]
                 rows = self.rows(scene, None, [matched[k] for k in others], without=off)

@@ -12,7 +12,6 @@ from kinefit.bodies import BodyState
 from kinefit.correspondences.closures import closed_at
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
@@ -71,8 +70,8 @@ def _of_keypoints(
     scene: Scene, held: tuple[BodyState, NDArray], matched: Sequence[Matched], most: int, tolerance: float
 ) -> Minimum | None:
     """Without rows in between, where keypoints alone were measured of a body whose joints stay where they are."""
-    one = matched[0] if len(matched) == 1 else None
-    if not isinstance(one, KeypointMatched) or one.hidden or scene.body.closures or np.ndim(one.loss.scale):
+    one = matched[0].pixels if len(matched) == 1 else None
+    if one is None or one.hidden or scene.body.closures or np.ndim(one.loss.scale):
         return None
     if scene.morphing is not None or scene.at_time(one.time) is not scene:
         return None

@@ -38,6 +38,7 @@ from kinefit.sensors.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.silhouette import SilhouetteSensor
+from kinefit.sensors.view_bias import ViewBias
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 1e4
 """[m] or [px] of a sensor: finer than any marker system, and wider than any image. A weight is 1 / sigma²."""
@@ -67,6 +68,7 @@ class Sensors:
     Attributes
     ----------
     stated : {depth camera: (H, W) [m]} of the empty scene, as `know_background` was told
+    view_bias : of the keypoints' detectors, see `KeypointSensor`; None for none
     """
 
     def __init__(
@@ -88,6 +90,7 @@ class Sensors:
         self._own = frozenset(self._sensors)
         self._backgrounds: dict[str, Background | None] = {rig[name].name: None for name in on_body}
         self.stated: dict[str, NDArray] = {}
+        self.view_bias: ViewBias | None = None
         self._made_of: dict[str, tuple[str, str]] = {}  # of built-in sensors the kind and the name of their frames
         self._channels = ChannelNames()
         self._makers: dict[type, Callable[[str], Sensor]] = {
@@ -189,9 +192,10 @@ class Sensors:
             self.stated[camera.name] = np.asarray(depth)
 
     def anew(self) -> Sensors:
-        """The same sensors for another run over the take, which know the same backgrounds."""
+        """The same sensors for another run over the take, which know the same backgrounds and layouts of keypoints."""
         out = Sensors(self.rig, self.rate, self.sigma, self.settings, self.own)
-        out._backgrounds, out.stated = self._backgrounds, self.stated
+        out._backgrounds, out.stated, out.view_bias = self._backgrounds, self.stated, self.view_bias
+        out._sensors[KEYPOINTS] = self.keypoints
         return out
 
     def save_state(self) -> dict[str, Any]:
@@ -220,7 +224,7 @@ class Sensors:
 
     def _keypoints(self, name: str) -> KeypointSensor:
         s = self.settings
-        return KeypointSensor(self.rig, self.sigma, s.pixel, s.loss, s.near)
+        return KeypointSensor(self.rig, self.sigma, s.pixel, s.loss, s.near, self.view_bias)
 
     def _markers(self, name: str) -> MarkerSensor:
         s = self.settings

@@ -21,7 +21,7 @@ class Replay:
 
     Parameters
     ----------
-    recording : Recording, whose keypoints are those of `keypoints`
+    recording : Recording of all sensors but the keypoints' detectors
     keypoints : records of all people in view, of as many frames as the recording has steps
     speed : float, 1 for the recording's own; 0 as fast as steps are taken, and none is dropped
     """

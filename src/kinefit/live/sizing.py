@@ -20,7 +20,7 @@ from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, Lifte
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.warm import warm_keypoints
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.sizing import channels_of, fitted_to_person
+from kinefit.tracking.sizing import fitted_to_person
 
 _STEPS, _BETWEEN, _SEEN = 40, 0.2, 0.5  # steps that are kept, [s] between them, quality of a frame that counts
 
@@ -122,7 +122,7 @@ def fitted_body(
     recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
     settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
     person = fitted_to_person(
-        recording, body, channels_of(recording, body), settings, subject=None, trial=None, height=height, size=True,
+        recording, body, settings, subject=None, trial=None, height=height, size=True,
         frames=None, progress=None,
     )  # fmt: skip
     return person.subject.body

@@ -85,9 +85,8 @@ def live_session(
 def _recorded(take: Take, body: Body, speed: float) -> Opened:
     """Everything that a take recorded, step by step."""
     seen = with_names(take, load_observations(take))
-    recording, body = recording_of(take, seen, body)
-    others = recording if recording.alone is None else replace(recording, steps=lambda i: ())
-    return Opened(recording, body, (Replay(others, seen.keypoints, speed=speed),))
+    recording, body = recording_of(take, replace(seen, keypoints=()), body)
+    return Opened(recording, body, (Replay(recording, seen.keypoints, speed=speed),))
 
 
 def _videos(take: Take, body: Body, speed: float, threads: int, tell: Tell) -> Opened:

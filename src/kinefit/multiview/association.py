@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import kept
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.multiview.boxes import same_people
 from kinefit.multiview.medians import medians
 from kinefit.observations import Keypoints
+from kinefit.observations.arrays import sealed
 
 _ENOUGH = 4  # points of a person that must be seen
 _SOME = 13  # points, spread over the set, that decide whether two detections are of one person
@@ -23,6 +25,7 @@ SPEED = 3.0  # [m/s] people do not go further while they are unseen
 _SWITCH = 1.0  # [s] going on with somebody else must show that much more of a person, seen by all cameras
 _SWAY = 0.1  # frames of the same that a leap of one stride must show more: of two who stand close, the same one
 _PATHS = 16  # how many people and gaps are borne in mind at a time
+_CLOCK = 0.01  # frames, below the resolution of any clock
 _AGREE = 0.04  # two views of one person differ by less than this share of the person's height in the picture
 
 
@@ -59,6 +62,56 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     out = [chosen[q] for q in range(len(keypoints))]
     if all(np.all(c < 0) for c in out):
         raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
+    return out
+
+
+def person_records(keypoints: Sequence[Keypoints], people: Sequence[NDArray]) -> tuple[Keypoints, ...]:
+    """Records of one person alone, all of them at the times of one clock.
+
+    A camera whose frames lie between those times has its points interpolated, linearly between two frames that both
+    show the point.
+
+    Parameters
+    ----------
+    keypoints : Q records of the same number of frames F
+    people : Q arrays (F,) int, which person of each record, -1 for none; see `choose_people`
+    """
+    start = common_start(keypoints)
+    return tuple(_at_times(_alone(record, p), start) for record, p in zip(keypoints, people, strict=True))
+
+
+def _alone(record: Keypoints, person: NDArray) -> Keypoints:
+    if record.points.shape[1] == 1 and np.all(person == 0):
+        return record
+    one = record.of_one(person)
+    return replace(one, points=sealed(kept(one.points)), confidence=sealed(kept(one.confidence)))
+
+
+def _at_times(record: Keypoints, start: float) -> Keypoints:
+    late = float(start - record.times[0]) * record.rate if len(record) else 0.0
+    if abs(late) < _CLOCK or len(record) < 2:
+        return record
+    lifted = None if record.lifted is None else between_frames(record.lifted, late)
+    points, confidence = (between_frames(v, late) for v in (record.points, record.confidence))
+    return replace(
+        record, points=sealed(kept(points)), confidence=sealed(kept(np.nan_to_num(confidence))), lifted=lifted,
+        time_offset=start,
+    )  # fmt: skip
+
+
+def common_start(keypoints: Sequence[Keypoints]) -> float:
+    """Time [s] of the first frame of all records together: the step of the common time next to most of them."""
+    rate = keypoints[0].rate
+    return float(np.round(np.median([k.times[0] for k in keypoints if len(k)] or [0.0]) * rate) / rate)
+
+
+def between_frames(values: NDArray, late: float) -> NDArray:
+    """Values (F, ...) of frames `late` frames later, a fraction, linear between neighbours; NaN beside unseen ones."""
+    at = np.clip(np.arange(len(values)) + late, 0, len(values) - 1)
+    before = np.minimum(at.astype(int), len(values) - 2)
+    share = (at - before).reshape(-1, *[1] * (values.ndim - 1))
+    a, b = values[before], values[before + 1]
+    out: NDArray = np.where(share == 0, a, np.where(share == 1, b, (1 - share) * a + share * b))
     return out
 
 

@@ -81,7 +81,8 @@ class Keypoints:
     def of_one(self, chosen: NDArray) -> Keypoints:
         """One person's; chosen (F,) is who it is in each frame, -1 for nobody."""
         if self.points.shape[1] == 0:
-            return self
+            shape = len(self), 1, len(self.names)
+            return replace(self, points=np.full((*shape, 2), np.nan), confidence=np.zeros(shape), lifted=None)
         frames, one, there = np.arange(len(self)), np.maximum(chosen, 0), (chosen >= 0)[:, None]
         points = np.where(there[..., None], self.points[frames, one], np.nan)
         confidence = np.where(there, self.confidence[frames, one], 0.0)

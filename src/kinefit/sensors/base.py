@@ -14,7 +14,7 @@ surface's own coordinates.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,7 @@ from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 
 if TYPE_CHECKING:
+    from kinefit.sensors.keypoints import KeypointMatched
     from kinefit.sensors.occlusion import DepthSeen
 
 
@@ -117,6 +118,14 @@ class Matched(ABC):
     turns: Mapping[int, NDArray] = MappingProxyType({})
     places: Sequence[tuple[str, str]] | None = None
     cameras: NDArray | None = None
+
+    @property
+    def pixels(self) -> KeypointMatched | None:
+        """The same points of the body in images as one packed block, which the compiled fits take without rows.
+
+        None, the default, for everything else. Smoothing takes such a block exactly, at every step of its solver.
+        """
+        return None
 
     @property
     def key(self) -> bytes:
@@ -264,6 +273,11 @@ class RowsOf(Matched):
         """As the function makes them."""
         made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
         return [made] if isinstance(made, AnyRows) else made
+
+
+def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
+    """The packed blocks of those matches that offer one."""
+    return [block for m in matched if (block := m.pixels) is not None]
 
 
 def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:

@@ -14,8 +14,6 @@ from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 
-_CLOCK = 0.01  # frames, below the resolution of any clock
-
 
 @dataclass(frozen=True, eq=False)
 class Channels:
@@ -105,19 +103,8 @@ def mirror_name(name: str) -> str:
     return name.replace("right", "left")
 
 
-def make_channels(
-    body: Body, rig: Rig, keypoints: Sequence[Keypoints], people: Sequence[NDArray], sigma: Sequence[float]
-) -> Channels:
-    """Channels of one person.
-
-    Parameters
-    ----------
-    keypoints : Q records, all with the same frames.
-    people : Q arrays (F,) int, which person of each record; -1 for none.
-    sigma : (Q,) [px] standard deviation of each record.
-    """
-    if not keypoints:
-        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[str, list[str]]:
+    """{keypoint set: points of the body that some record has}; errors as of `make_channels`."""
     names: dict[str, list[str]] = {}
     for record in keypoints:
         if record.camera not in rig:
@@ -125,10 +112,32 @@ def make_channels(
         known = known_points(body, record.keypoint_set).names
         used = names.setdefault(record.keypoint_set, [])
         used += [n for n in dict.fromkeys(record.names) if n in known and n not in used]
-    sets, parts, start = {}, [], 0
     for name, chosen in names.items():
         if not chosen:
             raise ObservationError(f"body '{body.name}' has none of the points of {name}")
+    return names
+
+
+def make_channels(
+    body: Body, rig: Rig, keypoints: Sequence[Keypoints], sigma: Sequence[float]
+) -> Channels:
+    """Channels of one person.
+
+    Parameters
+    ----------
+    keypoints : Q records of the person alone, all of the same frames; see `multiview.association.person_records`.
+    sigma : (Q,) [px] standard deviation of each record.
+
+    Raises
+    ------
+    ObservationError, BodyError
+        No keypoints; a camera that the rig does not have; a keypoint set that the body does not know.
+    """
+    if not keypoints:
+        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+    names = known_names(body, rig, keypoints)
+    sets, parts, start = {}, [], 0
+    for name, chosen in names.items():
         parts.append(known_points(body, name).select(tuple(chosen)))
         sets[name] = slice(start, start := start + len(chosen))
     source: list[int] = []
@@ -139,7 +148,7 @@ def make_channels(
     columns_of_all = sum(len(names[record.keypoint_set]) for record in keypoints)
     uv = room((len(keypoints[0]), columns_of_all, 2))
     confidence = room(uv.shape[:2])
-    for q, (record, person) in enumerate(zip(keypoints, people, strict=True)):
+    for q, record in enumerate(keypoints):
         span, chosen = sets[record.keypoint_set], names[record.keypoint_set]
         first = len(source)
         mine = slice(first, first + len(chosen))
@@ -151,17 +160,8 @@ def make_channels(
         spread += [float(sigma[q])] * len(chosen)
         lacking = np.array([n not in record.names for n in chosen], bool)
         columns = [0 if none else record.names.index(n) for n, none in zip(chosen, lacking)]
-        if record.points.shape[1] == 0:  # nobody was ever seen there
-            uv[:, mine] = np.nan
-            continue
-        frames, one = np.arange(len(record)), np.maximum(person, 0)
-        there = (np.asarray(person) >= 0)[:, None]
-        there = there & ~lacking
-        seen = np.where(there[..., None], record.points[frames, one][:, columns], np.nan)
-        trust = np.where(there, record.confidence[frames, one][:, columns], 0.0)
-        late = float(common_start(keypoints) - record.times[0]) * record.rate
-        uv[:, mine] = between_frames(seen, late)
-        confidence[:, mine] = np.nan_to_num(between_frames(trust, late))
+        uv[:, mine] = np.where(lacking[:, None], np.nan, record.points[:, 0, columns])
+        confidence[:, mine] = np.where(lacking, 0.0, np.nan_to_num(record.confidence[:, 0, columns]))
         release(record.points, record.confidence, uv, confidence)
     twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
     labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
@@ -169,24 +169,6 @@ def make_channels(
         rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
         np.array(spread), uv, confidence,
     )  # fmt: skip
-
-
-def common_start(keypoints: Sequence[Keypoints]) -> float:
-    """Time [s] of the first frame of all records together: the step of the common time next to most of them."""
-    rate = keypoints[0].rate
-    return float(np.round(np.median([k.times[0] for k in keypoints if len(k)] or [0.0]) * rate) / rate)
-
-
-def between_frames(values: NDArray, late: float) -> NDArray:
-    """Values (F, ...) of frames `late` frames later, a fraction, linear between neighbours; NaN beside unseen ones."""
-    if abs(late) < _CLOCK or len(values) < 2:
-        return values
-    at = np.clip(np.arange(len(values)) + late, 0, len(values) - 1)
-    before = np.minimum(at.astype(int), len(values) - 2)
-    share = (at - before).reshape(-1, *[1] * (values.ndim - 1))
-    a, b = values[before], values[before + 1]
-    out: NDArray = np.where(share == 0, a, np.where(share == 1, b, (1 - share) * a + share * b))
-    return out
 
 
 def fitted_pixels(body: Body, channels: Channels, state: BodyState) -> NDArray:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body
 from kinefit.correspondences import _kernels
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
@@ -21,94 +19,17 @@ from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
-from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.layout import Layout, projected
+from kinefit.sensors.left_right import find_swaps
 from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.triangulation import rays, triangulated_frame
-from kinefit.sensors.view_bias import beside, trunks
+from kinefit.sensors.view_bias import ViewBias
 
 NAME = "keypoints"
 
-
-@dataclass(frozen=True, eq=False)
-class Layout:
-    """Which points of which cameras a body's keypoints are, frame after frame; see `Channels`.
-
-    Parameters
-    ----------
-    channels : Channels, of which the measurements are not used
-    body : Body
-    """
-
-    channels: Channels
-    body: Body
-
-    @cached_property
-    def points(self) -> PointSet:
-        """A point of the body for every channel (N,)."""
-        return self._of(self.channels)
-
-    @cached_property
-    def groups(self) -> NDArray:
-        """(N,) channels that change sides together."""
-        return limb_groups(self.body, self.channels)
-
-    @cached_property
-    def informs(self) -> NDArray:
-        """(S, N) 0 or 1: channels that show where a segment is."""
-        return informing(self.body, self.channels)
-
-    @cached_property
-    def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
-        """Of each source its label, its channels, and their names and segments."""
-        points, sources = self.points, self.channels.sources
-        of = [np.flatnonzero(self.channels.source == q) for q in range(len(sources))]
-        return [(s, k, tuple(points.names[i] for i in k), points.segments[k]) for s, k in zip(sources, of)]
-
-    @cached_property
-    def trunk(self) -> NDArray:
-        """(N,) segment in whose axes a channel's bias by view is."""
-        return trunks(self.body.tree)[self.points.segments]
-
-    def beside(self, scene: Scene) -> NDArray | None:
-        """(N, 2) [px] how far beside its point each keypoint is seen at a scene's state; None for nothing known."""
-        bias = self.channels.view_bias
-        if bias is None:
-            return None
-        x = scene.positions(self.points_of(scene.body))
-        return beside(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
-
-    def points_of(self, body: Body) -> PointSet:
-        """The same of another body of this make; those of the body that was asked for last are kept."""
-        if body is self.body:
-            return self.points
-        if self._latest.get("body") is not body:
-            self._latest.update(body=body, points=self._of(self.channels.with_points(body)))
-        return self._latest["points"]
-
-    @cached_property
-    def _latest(self) -> dict[str, Any]:
-        return {}
-
-    @cached_property
-    def places(self) -> tuple[tuple[str, str], ...]:
-        """(N,) keypoint set and name of every channel's point."""
-        c = self.channels
-        known = [(name, point) for name, span in c.sets.items() for point in c.points.names[span]]
-        return tuple(known[k] for k in c.column)
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """(N,) source and point of every channel."""
-        return tuple(f"{self.channels.sources[q]} {name}" for q, name in zip(self.channels.source, self.points.names))
-
-    @staticmethod
-    def _of(channels: Channels) -> PointSet:
-        if not len(channels.column):
-            return channels.points
-        names = tuple(channels.points.names[c] for c in channels.column)
-        owner, place = channels.points.segments, channels.points.points
-        return PointSet(names, owner[channels.column], place[channels.column])
+Stream = tuple[str, str, tuple[str, ...]]
+"""Camera, keypoint set and names of the keypoints that one detector gives frame after frame."""
 
 
 class KeypointSensor(Sensor):
@@ -117,16 +38,21 @@ class KeypointSensor(Sensor):
     Parameters
     ----------
     rig : Rig
-    sigma : {camera: standard deviation [px] of a keypoint with confidence 1}
+    sigma : {camera: standard deviation [px] of a keypoint with confidence 1}; "CAMERA SET" for one of several detectors
     usual : float [px] default, of a camera that none is given for
     loss : Loss of a keypoint, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
+    view_bias : bias of the detectors by direction of view, as a subject fit estimated it; default: none
     """
 
     name = NAME
 
-    def __init__(self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float) -> None:
+    def __init__(
+        self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float,
+        view_bias: ViewBias | None = None,
+    ) -> None:  # fmt: skip
         self.rig, self.sigma, self.usual, self.loss, self.near = rig, sigma, usual, loss, near
+        self.view_bias = view_bias or ViewBias()
         self._layouts: dict[tuple[object, ...], tuple[Layout, list[tuple[int, NDArray]]]] = {}
 
     def prepare(self, frame: KeypointFrame | Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
@@ -138,34 +64,37 @@ class KeypointSensor(Sensor):
             A keypoint set that the body does not have, a camera that the rig does not have.
         """
         frames = [frame] if isinstance(frame, KeypointFrame) else list(frame)
-        layout, columns = self._layout(scene.body, frames)
+        layout, columns = self.layout(scene.body, [(f.sensor, f.keypoint_set, f.names) for f in frames])
         parts = [(frames[k], c, c >= 0) for k, c in columns]
         uv = np.concatenate([np.zeros((0, 2)), *(np.where(has[:, None], f.uv[c], np.nan) for f, c, has in parts)])
         confidence = np.concatenate([np.zeros(0), *(np.where(has, f.confidence[c], 0.0) for f, c, has in parts)])
         time = float(np.mean([f.time for f in frames]))
         return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
 
-    def _layout(self, body: Body, frames: Sequence[KeypointFrame]) -> tuple[Layout, list[tuple[int, NDArray]]]:
-        """Channels of some frames; and of each frame that has any the places of their names in it, -1 for none."""
-        key = (id(body), *((f.sensor, f.keypoint_set, f.names) for f in frames))
+    def layout(self, body: Body, streams: Sequence[Stream]) -> tuple[Layout, list[tuple[int, NDArray]]]:
+        """The layout of frames of these streams, made once.
+
+        And of each stream whose points the body knows its number, and the places of the points in its names, -1 for
+        none.
+        """
+        key = (id(body), *streams)
         if key not in self._layouts:
             used, records = [], []
-            for k, f in enumerate(frames):
-                self.rig.index(f.sensor)
-                if set(f.names) & set(known_points(body, f.keypoint_set).names):
-                    empty = np.zeros((1, 1, len(f.names)))
+            for k, (camera, keypoint_set, names) in enumerate(streams):
+                self.rig.index(camera)
+                if set(names) & set(known_points(body, keypoint_set).names):
                     used.append(k)
-                    uv = np.zeros((*empty.shape, 2))
-                    records.append(Keypoints(f.sensor, f.keypoint_set, f.names, 1.0, uv, empty))
-            sigma = [self.sigma.get(r.camera, self.usual) for r in records]
+                    empty = np.zeros((1, 1, len(names)))
+                    records.append(Keypoints(camera, keypoint_set, names, 1.0, np.zeros((*empty.shape, 2)), empty))
             channels = Channels.none(self.rig, 1)
             if records:
-                channels = make_channels(body, self.rig, records, [np.zeros(1, np.int64)] * len(records), sigma)
+                sigma = keypoint_sigma(records, self.sigma, self.usual)
+                channels = self.view_bias.known_to(make_channels(body, self.rig, records, sigma))
             columns = []
             for q, k in enumerate(used):
-                names = [channels.points.names[c] for c in channels.column[channels.source == q]]
-                has = frames[k].names
-                columns.append((k, np.array([has.index(n) if n in has else -1 for n in names], np.int64)))
+                has = streams[k][2]
+                points = [channels.points.names[c] for c in channels.column[channels.source == q]]
+                columns.append((k, np.array([has.index(n) if n in has else -1 for n in points], np.int64)))
             if len(self._layouts) > 16:
                 self._layouts.clear()
             self._layouts[key] = Layout(channels, body), columns
@@ -240,6 +169,11 @@ class KeypointMatched(Matched):
     beside: NDArray | None = None
 
     sensor = NAME
+
+    @property
+    def pixels(self) -> KeypointMatched:
+        """Itself."""
+        return self
 
     @property
     def places(self) -> Sequence[tuple[str, str]] | None:  # type: ignore[override]
@@ -325,26 +259,6 @@ class KeypointMatched(Matched):
         return out if out.any() else None
 
 
-def projected(scene: Scene, layout: Layout) -> NDArray:
-    """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
-    return scene.once(
-        layout, lambda: scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
-    )
-
-
-def informing(body: Body, channels: Channels) -> NDArray:
-    """(S, N) 0 or 1: channels that show where a segment is: those on it and those at its children's joints.
-
-    A segment without any is known through its children.
-    """
-    tree = body.tree
-    owner, place = channels.points.segments[channels.column], channels.points.points[channels.column]
-    near = np.linalg.norm(place, axis=1) < 0.05
-    out = np.zeros((len(tree.segments), len(owner)))
-    for s in range(len(tree.segments)):
-        out[s] = (owner == s) | (near & (tree.parents[owner] == s))
-    for s in range(len(tree.segments) - 1, 0, -1):
-        if not out[s].any():
-            children = [c for c in range(len(tree.segments)) if tree.parents[c] == s]
-            out[s] = np.max([out[c] for c in children], axis=0) if children else 0.0
-    return out
+def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], usual: float) -> list[float]:
+    """[px] of each record, where {camera: standard deviation} or {"CAMERA SET": standard deviation} are given."""
+    return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, usual)) for k in keypoints]

@@ -14,7 +14,7 @@ from kinefit.correspondences.closures import every_closure, looped
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched, Measurement, matched_by
+from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.sensors.scene import Scene
@@ -96,9 +96,8 @@ class FrameCosts:
             measurements, matched = result.measurements, list(result.matched)
         else:
             reach = self.tracker.settings.near
-            matched = [m for m in result.matched if isinstance(m, KeypointMatched)]
             scene = scene.at(result.state, measurements=tuple(measurements))
-            matched += [matched_by(m, scene, reach) for m in measurements]
+            matched = [*pixels_of(result.matched), *(matched_by(m, scene, reach) for m in measurements)]
         loose = {m.sensor for m in measurements if not m.settled}
         points = tuple(m for m in matched if m.sensor not in loose)
         surfaces = tuple(m for m in matched if m.sensor in loose)
@@ -107,8 +106,8 @@ class FrameCosts:
     def told(self, frames: Sequence[LagFrame], f: int) -> NDArray:
         """(D,) bool: coordinates of which a frame tells on its own."""
         frame, scene, tree = frames[f], self.scene(frames, f), self.body.tree
-        pixels = [m for m in frame.points if isinstance(m, KeypointMatched)]
-        others = [m for m in (*frame.points, *frame.surfaces) if not isinstance(m, KeypointMatched)]
+        pixels = pixels_of(frame.points)
+        others = [m for m in (*frame.points, *frame.surfaces) if m.pixels is None]
         told = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         closed = every_closure(self.body, scene.state)
@@ -143,7 +142,7 @@ class FrameCosts:
 
     def _rows(self, matched: Sequence[Matched], scene: Scene, beside: Sequence[Matched] = ()) -> list[AnyRows]:
         """Rows of matches, beside points that are no part of them."""
-        known = [self._known(m) if isinstance(m, KeypointMatched) else m for m in matched]
+        known = [m if m.pixels is None else self._known(m.pixels) for m in matched]
         points = rows_of_points(scene, [m for m in beside if m not in matched])
         return rows_of(scene, known, self.tracker.settings, self.noise.scale, points=points)
 

@@ -14,9 +14,8 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
 from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.frame.trust import adrift
-from kinefit.sensors.base import Matched
+from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.settings import TrackSettings
@@ -115,7 +114,7 @@ def smooth_results(
                 m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
                 beside=m.measurement.layout.beside(scene),
             )
-            for m in result.matched if isinstance(m, KeypointMatched)
+            for m in pixels_of(result.matched)
         )  # fmt: skip
         more = () if others_matched is None else others_matched[f]
         covariance[packed] = covariance.T[packed] = covariances[f]
@@ -156,9 +155,8 @@ def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDAr
     """(F, N) bool: channels that the track exchanged with their partner."""
     out = np.zeros((len(results), len(channels.column)), bool)
     for f, result in enumerate(results):
-        for m in result.matched:
-            if isinstance(m, KeypointMatched):
-                out[f] = m.swapped
+        for m in pixels_of(result.matched):
+            out[f] = m.swapped
     return out
 
 

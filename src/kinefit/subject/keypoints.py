@@ -13,7 +13,8 @@ from kinefit.errors import TrackingError
 from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.sensors.keypoints import NAME, KeypointMeasurement, KeypointSensor, Layout
+from kinefit.sensors.keypoints import NAME, KeypointMeasurement, KeypointSensor
+from kinefit.sensors.layout import Layout
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.triangulation import triangulated

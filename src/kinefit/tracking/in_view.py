@@ -66,7 +66,7 @@ class InView:
         number = choose(self.people, person)
         if len(self.people) < 2:
             return recording
-        shared = self.depth or any(len(recording.steps(i)) for i in range(min(len(recording), 100)))
+        shared = self.depth or recording.sees_more
         if not shared:
             return recording
         motions = [self._motion(k, recording, body, settings) for k in range(len(self.people))]

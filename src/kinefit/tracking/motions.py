@@ -15,9 +15,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at
+from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import FixedLag
@@ -135,7 +134,7 @@ def motion_of(
         """The same with keypoints as they took part."""
         scene, several = seen(f)
         pixels = {"weight": weight[f], "loss": SQUARED}
-        return scene, [replace(m, **pixels) if isinstance(m, KeypointMatched) else m for m in several]
+        return scene, [m if m.pixels is None else replace(m.pixels, **pixels) for m in several]
 
     scale = None if others is None else others.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
@@ -188,9 +187,8 @@ def _behind(
 
     def take(late: list[FrameResult]) -> None:
         for r in late:
-            pixels = tuple(m for m in r.matched if isinstance(m, KeypointMatched))
-            matched.append(tuple(m for m in r.matched if not isinstance(m, KeypointMatched)))
-            out.append(replace(r, matched=pixels, measurements=()))
+            matched.append(tuple(m for m in r.matched if m.pixels is None))
+            out.append(replace(r, matched=tuple(pixels_of(r.matched)), measurements=()))
 
     for result, measurements in zip(frames.results, frames.measurements):
         take(behind.add(result, measurements, ahead=1))

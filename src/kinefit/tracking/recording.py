@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from numbers import Real
 from typing import Any, get_args
 
@@ -15,7 +16,7 @@ from kinefit.bodies import BodyState
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
-from kinefit.multiview.association import choose_people
+from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.multiview.one_camera import lifted_alone
 from kinefit.multiview.people import PersonTrack
@@ -34,6 +35,7 @@ from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Sensor
 from kinefit.sensors.checks import of_kind
 
+_FIRST_STEPS = 100  # in which every sensor that takes part is expected to see something
 _PARTS = ("keypoint_set", "marker_set", "segment")  # of which one sensor may have several frames at one time
 
 Steps = Callable[[int], Sequence[Any]]
@@ -49,11 +51,11 @@ class Recording:
     times : (F,) [s] of the steps
     rate : float [Hz]
     rig : Rig of all cameras
-    steps : what all sensors but the keypoints' detectors saw at each step
-    keypoints : of F frames each, of one or several people
-    people : (F,) int each, which of them is followed in each frame, -1 for none
-    followed : who of several people that is, where keypoints show others
-    sigma : {sensor: standard deviation}, [px] of cameras' keypoints and of "silhouette CAMERA", else [m]
+    steps : what all sensors saw at each step
+    keypoints : records of the person's keypoints among what the steps show, whole, for the subject fit
+    followed : who of several people that is, where the cameras see others
+    sigma : {sensor: standard deviation}, [px] of cameras' keypoints ("CAMERA SET" of one of several detectors) and of
+        "silhouette CAMERA", else [m]
     sensors : of one's own, see `kinefit.sensors.base`
     markers : labelled recordings among what the steps show, whole, for the subject fit
     marker_sets : of each, its marker set on the body, and how far [m] each marker may sit elsewhere; None for nowhere
@@ -72,10 +74,8 @@ class Recording:
     rig: Rig
     steps: Steps = lambda i: ()
     keypoints: tuple[Keypoints, ...] = ()
-    people: tuple[NDArray, ...] = ()
     followed: PersonKeypoints | None = None
     sigma: Mapping[str, float] = field(default_factory=dict)
-    keypoint_sigma: tuple[float, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     markers: tuple[Markers, ...] = ()
     marker_sets: tuple[tuple[str, NDArray | None], ...] = ()
@@ -149,12 +149,20 @@ class Recording:
             raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
         sigmas = _sigmas(sigma, len(keypoints))
         one = follow(rig, keypoints, person, people)
-        whose = tuple(choose_people(rig, one.keypoints))
-        steps = _lifted_steps(lifted_alone(one.keypoints), one.keypoints, whose)
-        return cls(
-            keypoints[0].times, keypoints[0].rate, rig, keypoints=one.keypoints, people=whose, followed=one,
-            keypoint_sigma=sigmas, **{"steps": steps, **more},
-        )  # fmt: skip
+        records, times = person_records(one.keypoints, choose_people(rig, one.keypoints)), keypoints[0].times
+        stated = {k.camera: s for k, s in zip(keypoints, sigmas)}
+        several = {f"{k.camera} {k.keypoint_set}": s for k, s in zip(keypoints, sigmas) if s != stated[k.camera]}
+        known: dict[str, Any] = {"steps": partial(_seen_in, records, times), "sigma": stated | several}
+        return cls(times, keypoints[0].rate, rig, keypoints=records, followed=one, **known | more)
+
+    @property
+    def sees_more(self) -> bool:
+        """Whether in the first steps any other sensor than the keypoints' detectors sees something."""
+        return any(len(self.steps(i)) > len(self.keypoints_at(i)) for i in range(min(len(self), _FIRST_STEPS)))
+
+    def keypoints_at(self, i: int) -> list[KeypointFrame]:
+        """The keypoints among what is seen at a step: a frame of every record, or none where no point is seen."""
+        return keypoint_frames(self.keypoints, i, float(self.times[i]))
 
     @property
     def alone(self) -> Camera | None:
@@ -204,13 +212,12 @@ class Recording:
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = _records(steps, times, rate)
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
-        sigmas = tuple(sigma.get(r.camera, KEYPOINT_SIGMA) for r in records)
         worn = _marker_records(steps, rate)
         known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
         return cls(
-            times, rate, rig, steps=lambda i: others[i], keypoints=records,
-            people=tuple(np.where((r.confidence > 0).any(axis=(1, 2)), 0, -1) for r in records),
-            keypoint_sigma=sigmas, sigma=sigma, depth=_first_depth(steps, rate), **{**known, **more},
+            times, rate, rig, keypoints=records, sigma=sigma,
+            steps=lambda i: [*others[i], *keypoint_frames(records, i, float(times[i]))],
+            depth=_first_depth(steps, rate), **{**known, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -218,24 +225,25 @@ class Recording:
         first = range(len(self))[frames].start
         return replace(
             self, times=self.times[frames], steps=lambda i: self.steps(i + first),
-            keypoints=tuple(_cut(k, frames) for k in self.keypoints), people=tuple(p[frames] for p in self.people),
+            keypoints=tuple(_cut(k, frames) for k in self.keypoints),
         )  # fmt: skip
 
 
-def _lifted_steps(record: Keypoints | None, keypoints: Sequence[Keypoints], people: Sequence[NDArray]) -> Steps:
-    """What a network lifted of the person who is followed, at each step; nothing of no record."""
-    if record is None or record.lifted is None:
-        return lambda i: ()
-    lifted, chosen = record.lifted, people[keypoints.index(record)]
+def keypoint_frames(keypoints: Sequence[Keypoints], i: int, time: float) -> list[KeypointFrame]:
+    """A frame of every record of one person, at the i-th time [s]; none where no record shows any point then."""
+    if not any((k.confidence[i, 0] > 0).any() for k in keypoints):
+        return []
+    seen = [(k, k.points[i, 0], k.confidence[i, 0]) for k in keypoints]
+    return [KeypointFrame(k.camera, time, k.names, uv, sure, k.keypoint_set) for k, uv, sure in seen]
 
-    def steps(i: int) -> Sequence[Any]:
-        p = int(chosen[i])
-        if p < 0:
-            return ()
-        x, uv = lifted[i, p], record.points[i, p]
-        return (LiftedFrame(record.camera, float(record.times[i]), record.names, x, uv, record.keypoint_set),)
 
-    return steps
+def _seen_in(records: Sequence[Keypoints], times: NDArray, i: int) -> Sequence[Any]:
+    """Frames of records of one person at a step, and of what a network lifted of it, where it is the only camera."""
+    time, one = float(times[i]), lifted_alone(records)
+    seen: list[Any] = []
+    if one is not None and one.lifted is not None and (one.confidence[i] > 0).any():
+        seen.append(LiftedFrame(one.camera, time, one.names, one.lifted[i, 0], one.points[i, 0], one.keypoint_set))
+    return [*seen, *keypoint_frames(records, i, time)]
 
 
 def _check_names(step: int, seen: Sequence[Any]) -> None:

@@ -13,9 +13,8 @@ from kinefit.bodies import Body
 from kinefit.errors import TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement
-from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMeasurement, Layout
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.view_bias import ViewBias
 from kinefit.smoothing.spool import Spool
 from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoint import Checkpoint
@@ -56,7 +55,7 @@ class TrackedSteps:
 class _Frames:
     """What is kept of all steps done, in the order in which they were done; in a file that stays, with a checkpoint."""
 
-    def __init__(self, checkpoint: Checkpoint | None) -> None:
+    def __init__(self, checkpoint: Checkpoint | None, recording: Recording) -> None:
         store = None if checkpoint is None else checkpoint.frames
         places = [()] * len(KINDS) if store is None else store.places
         self.results, self.measurements, self.leftovers = (
@@ -64,6 +63,7 @@ class _Frames:
         )
         self.place = {step: k for k, step in enumerate(() if store is None else store.steps)}
         self.written = 0  # rows of the table
+        self.streams = [(k.camera, k.keypoint_set, k.names) for k in recording.keypoints]
 
     def add(self, i: int, one: KeptFrame) -> None:
         count = len(self.place)
@@ -79,11 +79,17 @@ class _Frames:
     def go_on(self, checkpoint: Checkpoint, state: Any, tracker: Tracker) -> Tracker:
         """A tracker that was made anew, in a state that was kept."""
         restore_tracker(tracker, state)
-        checkpoint.frames.name_sensors(tracker.sensors)
+        self.name(checkpoint, tracker)
         new = list(self.place)[self.written :]
         append_rows(checkpoint.rows, tracker.body, ((step, self.results[self.place[step]]) for step in new))
         self.written = len(self.place)
         return tracker
+
+    def name(self, checkpoint: Checkpoint, tracker: Tracker) -> None:
+        """Names for what the records of all frames refer to."""
+        layout, _ = tracker.sensors.keypoints.layout(tracker.body, self.streams)
+        checkpoint.frames.name(body=tracker.body, layout=layout)
+        checkpoint.frames.name_sensors(tracker.sensors)
 
     def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> TrackedSteps:
         """In the order of time; `steps` of the whole recording."""
@@ -96,30 +102,30 @@ class _Frames:
 
 
 def tracker_of(
-    recording: Recording, body: Body, settings: TrackSettings, *, values: Any = None
+    recording: Recording, body: Body, settings: TrackSettings, *, values: Any = None, view_bias: ViewBias | None = None
 ) -> Tracker:
     """A tracker for all sensors of a recording, which knows what it states of them; arguments as of `run`."""
-    sigma = {**{k.camera: s for k, s in zip(recording.keypoints, recording.keypoint_sigma)}, **recording.sigma}
     tracker = Tracker(
-        body, recording.rig, rate=recording.rate, sigma=sigma, up=recording.up_axis,
+        body, recording.rig, rate=recording.rate, sigma=recording.sigma, up=recording.up_axis,
         on_body=recording.on_body, settings=settings, sensors=deepcopy(recording.sensors), values=values,
     )  # fmt: skip
+    tracker.sensors.view_bias = view_bias
     for name, depth in recording.backgrounds.items():
         tracker.know_background(name, depth)
     return tracker
 
 
 def run(
-    recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *,
-    start: Any = None, values: Any = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
+    recording: Recording, body: Body, settings: TrackSettings, *, start: Any = None, values: Any = None,
+    view_bias: ViewBias | None = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrackedSteps:  # fmt: skip
     """Track all steps of a recording, each from those before it.
 
     Parameters
     ----------
-    channels : the person's keypoints on this body
     start : step and state to begin with; default: the first that the tracker finds by itself.
     values : {sensor: {name: value}} of the sensors' own unknowns
+    view_bias : of the keypoints' detectors; default: none
     checkpoint : where it goes on from, and what is done is kept
 
     Raises
@@ -127,25 +133,21 @@ def run(
     TrackingError
         The body is found in none of the first steps.
     """
-    anew = partial(tracker_of, recording, body, settings, values=values)
-    tracker, layout, times, begin = anew(), Layout(channels, body), recording.times, 0
+    anew = partial(tracker_of, recording, body, settings, values=values, view_bias=view_bias)
+    tracker, times, begin = anew(), recording.times, 0
     if start is not None:
         begin, state = start
         tracker.start_at(state)
-    frames, at = _Frames(checkpoint), begin
+    frames, at = _Frames(checkpoint, recording), begin
     others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
     if checkpoint is not None:
-        checkpoint.frames.name(layout=layout, body=body)
+        frames.name(checkpoint, tracker)
         if checkpoint.frames.at is not None:
             at = checkpoint.frames.at
             tracker = frames.go_on(checkpoint, checkpoint.frames.state, anew())
 
     def step(tracker: Tracker, i: int, time: float) -> bool:
-        seen = list(recording.steps(i))
-        if len(layout.points) and (channels.confidence[i] > 0).any():
-            pixels = channels.uv[i], channels.confidence[i]
-            seen.append(KeypointMeasurement(tracker.sensors.keypoints, layout, *pixels, time))
-        found = tracker.update(seen, time, others=others.at(time))
+        found = tracker.update(recording.steps(i), time, others=others.at(time))
         if found is not None:
             moving = {"measurements": found.measurements, "velocity": tracker.speed}
             frames.add(i, KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving)))
@@ -155,7 +157,7 @@ def run(
     try:
         for i in range(at, len(times)):
             if i > at and (i - begin) % _EVERY == 0:
-                release(channels.uv, channels.confidence)
+                release(*(array for k in recording.keypoints for array in (k.points, k.confidence)))
                 if checkpoint is not None:
                     tracker = frames.keep(checkpoint, tracker, i, anew)
             found = step(tracker, i, float(times[i])) or frames.place

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._mapped import release, room
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
@@ -15,12 +16,13 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import numbers
-from kinefit.sensors.base import Leftover, Measurement, leftovers_at
+from kinefit.sensors.base import Leftover, Measurement, leftovers_at, pixels_of
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
+from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement
+from kinefit.sensors.layout import Layout
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
-from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.spool import STRETCH, Spool
 from kinefit.tracking.motions import TrackedFrames
 
 _Key = tuple[str, str, int]  # camera, keypoint set, and which of a layout's records of these
@@ -44,10 +46,11 @@ class KeptFrame:
     @classmethod
     def of(cls, result: FrameResult, scene: Scene) -> KeptFrame:
         """Of a result as a tracker gives it; the scene is at its state, with its measurements and velocity."""
-        pixels = tuple(m for m in result.matched if isinstance(m, KeypointMatched))
+        pixels = tuple(pixels_of(result.matched))
+        packed = {m.sensor for m in pixels}
         return cls(
             replace(result, matched=pixels, measurements=()),
-            tuple(m.compact() for m in result.measurements if not isinstance(m, KeypointMeasurement)),
+            tuple(m.compact() for m in result.measurements if m.sensor not in packed),
             tuple(rest for m in result.matched for rest in leftovers_at(m, scene)),
         )  # fmt: skip
 
@@ -109,11 +112,10 @@ class Session:
 
     def frames(self, body: Body, rig: Rig, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
         """All of them, with the keypoints of whatever cameras as one list of channels."""
-        results = self._results
-        channels, matches = one_layout(body, rig, results, self.rate)
+        channels, results = one_layout(body, rig, self._results, self.rate)
         return TrackedFrames(
-            channels, [replace(r, matched=m) for r, m in zip(results, matches)], self._measurements[:],
-            self._leftovers[:], np.array([r.time for r in results]), self.rate, scene_of, apart,
+            channels, results, self._measurements[:], self._leftovers[:], np.array([r.time for r in results]),
+            self.rate, scene_of, apart,
         )  # fmt: skip
 
 
@@ -128,19 +130,42 @@ def unseen(last: FrameResult, time: float) -> FrameResult:
 
 def one_layout(
     body: Body, rig: Rig, results: Sequence[FrameResult], rate: float
-) -> tuple[Channels, list[tuple[KeypointMatched, ...]]]:
-    """Keypoints of F results, of whatever cameras took part in each, as channels of all of them, and their matches.
+) -> tuple[Channels, Sequence[FrameResult]]:
+    """Keypoints of F results, of whatever cameras took part in each, as channels of all of them.
 
     Parameters
     ----------
-    results : F frames
+    results : F frames, with the matches of keypoints alone
     rate : float [Hz]
 
     Returns
     -------
-    channels of the F frames, and of each frame its keypoints matched in these channels, or nothing
+    channels of the F frames, and the results with their keypoints matched in these channels
     """
-    matches = [[m for m in r.matched if isinstance(m, KeypointMatched)] for r in results]
+    F, uv, confidence = len(results), np.zeros((0, 0, 2)), np.zeros((0, 0))
+    layout: Layout | None = None
+    for f, r in enumerate(results):
+        if f % STRETCH == 0:
+            release(uv, confidence)
+        pixels = pixels_of(r.matched)
+        if layout is None and pixels:
+            layout = pixels[0].measurement.layout
+            uv, confidence = room((F, len(layout.points), 2)), room((F, len(layout.points)))
+            uv[:] = np.nan
+        if len(pixels) > 1 or any(m.measurement.layout is not layout for m in pixels):
+            return _of_several(body, rig, results, rate)
+        for m in pixels:
+            uv[f], confidence[f] = m.measurement.uv, m.measurement.confidence
+    if layout is None:
+        return Channels.none(rig, F), results
+    return replace(layout.channels, uv=uv, confidence=confidence), results
+
+
+def _of_several(
+    body: Body, rig: Rig, results: Sequence[FrameResult], rate: float
+) -> tuple[Channels, list[FrameResult]]:
+    """Of results in several layouts: of a session in which cameras come and go."""
+    matches = [pixels_of(r.matched) for r in results]
     names: dict[_Key, dict[str, int]] = {}
     sigma: dict[_Key, float] = {}
     keys: dict[int, list[tuple[_Key, str]]] = {}
@@ -151,8 +176,6 @@ def one_layout(
             for (key, name), s in zip(keys[id(layout)], layout.channels.sigma):
                 names.setdefault(key, {}).setdefault(name, len(names[key]))
                 sigma.setdefault(key, float(s))
-    if not names:
-        return Channels.none(rig, len(results)), [()] * len(results)
     values = {k: np.full((len(results), 1, len(n), 2), np.nan) for k, n in names.items()}
     trust = {k: np.zeros((len(results), 1, len(n))) for k, n in names.items()}
     for f, several in enumerate(matches):
@@ -162,15 +185,14 @@ def one_layout(
                 if confidence > 0.0:
                     values[key][f, 0, names[key][name]], trust[key][f, 0, names[key][name]] = uv, confidence
     records = [Keypoints(k[0], k[1], tuple(n), rate, values[k], trust[k]) for k, n in names.items()]
-    people = [np.zeros(len(results), np.int64)] * len(records)
-    channels = make_channels(body, rig, records, people, list(sigma.values()))
+    channels = make_channels(body, rig, records, list(sigma.values()))
     layout, order = Layout(channels, body), list(names)
     place = {(order[q], channels.points.names[c]): k for k, (q, c) in enumerate(zip(channels.source, channels.column))}
     columns = {one: np.array([place[k] for k in own], np.int64) for one, own in keys.items()}
-    out: list[tuple[KeypointMatched, ...]] = []
-    for f, several in enumerate(matches):
-        out.append(() if not several else (_together(several, columns, layout, f, results[f].time),))
-    return channels, out
+    return channels, [
+        replace(r, matched=(_together(several, columns, layout, f, r.time),) if several else ())
+        for f, (r, several) in enumerate(zip(results, matches))
+    ]
 
 
 def _together(

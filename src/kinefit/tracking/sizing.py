@@ -17,8 +17,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
-from kinefit.sensors.channels import Channels, make_channels
-from kinefit.sensors.keypoints import KeypointMeasurement, Layout
+from kinefit.sensors.channels import Channels, known_names, make_channels
+from kinefit.sensors.keypoints import keypoint_sigma
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
@@ -48,7 +48,6 @@ class SizedPerson:
     ----------
     recording : Recording
     subject : Subject with the body
-    channels : the person's keypoints on this body
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
     told : what there is to report of it, for `Motion.provenance`
@@ -58,7 +57,6 @@ class SizedPerson:
 
     recording: Recording
     subject: Subject
-    channels: Channels
     start: Start | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
@@ -66,18 +64,17 @@ class SizedPerson:
     calibrated: Rig = field(default_factory=lambda: Rig(()))
 
 
-def channels_of(recording: Recording, body: Body) -> Channels:
-    """The keypoints of a recording on a body; of no points where there are none."""
-    if not recording.keypoints:
-        return Channels.none(recording.rig, len(recording))
-    return make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
+def channels_of(recording: Recording, body: Body, settings: TrackSettings) -> Channels:
+    """The keypoints of a recording on a body, whole."""
+    sigma = keypoint_sigma(recording.keypoints, recording.sigma, settings.pixel)
+    return make_channels(body, recording.rig, recording.keypoints, sigma)
 
 
 def fitted_to_person(
-    recording: Recording, body: Body, channels: Channels, settings: TrackSettings, *, subject: Subject | None,
+    recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None,
     trial: Subject | None, height: float | None, size: bool, frames: int | None, progress: Progress | None,
 ) -> SizedPerson:  # fmt: skip
-    """The body in the person's size and shape; `channels` on the body as it is, other arguments as of `track`.
+    """The body in the person's size and shape; arguments as of `track`.
 
     Raises
     ------
@@ -87,8 +84,8 @@ def fitted_to_person(
     KinefitError
         What the fits raise.
     """
-    cameras = len({k.camera for k in recording.keypoints})
-    others = _others(recording)
+    known_names(body, recording.rig, recording.keypoints)
+    cameras, others = len({k.camera for k in recording.keypoints}), recording.sees_more
     if cameras == 1 and not (others or recording.start):
         name = recording.keypoints[0].camera
         problem = f"the keypoints are of one camera only, {name}"
@@ -103,15 +100,15 @@ def fitted_to_person(
             problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
             raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
     subject_as_is = Subject(body, np.ones(len(body.scale_groups)))
-    person = SizedPerson(recording, subject_as_is, channels, recording.start, calibrated=recording.rig)
+    person = SizedPerson(recording, subject_as_is, recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None or not size:
         person = person if subject is None else _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         found = fit_subject(
-            body, channels, frames=frames or 25, height=height, trial=trial, cameras=settings.camera_std,
-            view_bias=settings.view_bias and not others, progress=progress,
+            body, channels_of(recording, body, settings), frames=frames or 25, height=height, trial=trial,
+            cameras=settings.camera_std, view_bias=settings.view_bias and not others, progress=progress,
         )  # fmt: skip
         person = _wearing(person, found, **_gear_of(body, found))
     elif recording.markers and recording.marker_sets[0][0]:
@@ -126,16 +123,8 @@ def fitted_to_person(
     return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
 
 
-def _others(recording: Recording) -> bool:
-    """Whether any sensor but the keypoints' detectors sees something in the first steps."""
-    return any(len(recording.steps(i)) for i in range(min(len(recording), _TRIED)))
-
-
 def _wearing(person: SizedPerson, subject: Subject, **told: Any) -> SizedPerson:
-    channels = person.channels.with_points(subject.body)
-    if subject.view_bias is not None:
-        channels = subject.view_bias.known_to(channels)
-    return replace(person, subject=subject, channels=channels, told={**person.told, **told})
+    return replace(person, subject=subject, told={**person.told, **told})
 
 
 def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
@@ -145,15 +134,6 @@ def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
         return {}
     std = dict(zip(found.fit.names, np.sqrt(np.diag(found.covariance))))
     return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
-
-
-def _seen_by(person: SizedPerson, rig: Rig) -> SizedPerson:
-    """With cameras where a fit found them."""
-    if rig is person.recording.rig:
-        return person
-    return replace(
-        person, recording=replace(person.recording, rig=rig), channels=replace(person.channels, rig=rig)
-    )  # fmt: skip
 
 
 def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> SizedPerson:
@@ -203,9 +183,8 @@ def _by_all(
         counted = lambda what, done, total: progress("shape", done, total)
     try:
         tracked = run(
-            r.part(stretch), body, person.channels.part(range(*stretch.indices(len(r)))), settings, start=start,
-            progress=counted,
-        )  # fmt: skip
+            r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
+        )
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
     shown = [bool(measured) or bool(r.keypoints) for measured in tracked.measurements]
@@ -217,12 +196,7 @@ def _by_all(
     chosen = [good[k] for k in spread(len(good), poses)]
     if not chosen:
         return person
-    layout, sensor = Layout(person.channels, body), tracked.tracker.sensors.keypoints
-    steps: list[list[Measurement]] = []
-    for k in chosen:
-        f, result = first + tracked.steps[k], tracked.results[k]
-        pixels = KeypointMeasurement(sensor, layout, person.channels.uv[f], person.channels.confidence[f], result.time)
-        steps.append([*tracked.measurements[k], *([pixels] if pixels.weight.any() else [])])
+    steps = [[*tracked.measurements[k], *(m.measurement for m in tracked.results[k].matched)] for k in chosen]
     states: Sequence[BodyState] = [tracked.results[k].state for k in chosen]
     times, velocities = [tracked.results[k].time for k in chosen], [_velocity(tracked.results, k) for k in chosen]
 
@@ -265,7 +239,7 @@ def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     person = _wearing(person, replace(subject, body=found.body), shape={**person.told.get("shape", {}), **shape})
     if found.cameras is not None:
-        person = _seen_by(person, found.rig)
+        person = replace(person, recording=replace(person.recording, rig=found.rig))
     values = {**person.values, **found.values}
     return replace(person, values=values, joint=(*person.joint, found))
 

@@ -13,7 +13,7 @@ from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
-from kinefit.multiview.association import choose_people
+from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import follow
 from kinefit.preparing.take import prepared
 from kinefit.readers.motion import read_motion
@@ -88,7 +88,7 @@ def track_take(
         recording = view.recording(recording, body, take.person, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings)
-    findings = input_findings(take, seen, recording.keypoints, body)
+    findings = input_findings(take, seen, recording.followed.keypoints if recording.followed else (), body)
     try:
         motion = track(
             recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
@@ -138,5 +138,5 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     assert seen.rig is not None
     sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
     keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
-    channels = make_channels(body, seen.rig, keypoints, choose_people(seen.rig, keypoints), sigma)
+    channels = make_channels(body, seen.rig, person_records(keypoints, choose_people(seen.rig, keypoints)), sigma)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

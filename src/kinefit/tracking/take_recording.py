@@ -113,8 +113,8 @@ def recording_of(
             rig, keypoints, sigma=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
-            recording, keypoints=pixels.keypoints, people=pixels.people, followed=pixels.followed,
-            keypoint_sigma=pixels.keypoint_sigma, steps=pixels.steps if bare else steps,
+            recording, keypoints=pixels.keypoints, followed=pixels.followed, sigma={**recording.sigma, **pixels.sigma},
+            steps=lambda i: [*steps(i), *pixels.steps(i)],
         )  # fmt: skip
     return recording, body
 

@@ -16,7 +16,8 @@ from kinefit.tracking.interrupted import TrackingInterrupted
 from kinefit.tracking.motions import TrackedFrames, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
-from kinefit.tracking.sizing import channels_of, fitted_to_person
+from kinefit.tracking.session import one_layout
+from kinefit.tracking.sizing import fitted_to_person
 
 
 @checked
@@ -85,23 +86,23 @@ def track(
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     settings = settings or TrackSettings()
-    channels = channels_of(recording, body)
     foreign = [sensor for sensor in recording.sensors if type(sensor).__module__.partition(".")[0] != "kinefit"]
     if checkpoint is not None and foreign:
         problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
         raise ObservationError(problem, remedy="Leave the checkpoint out.")
     person = fitted_to_person(
-        recording, body, channels, settings, subject=subject, trial=trial, height=height, size=size,
-        frames=shape_frames, progress=progress,
+        recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
+        progress=progress,
     )  # fmt: skip
     tracked = run(
-        person.recording, person.subject.body, person.channels, settings, start=person.start, values=person.values,
-        progress=progress, checkpoint=checkpoint,
+        person.recording, person.subject.body, settings, start=person.start, values=person.values,
+        view_bias=person.subject.view_bias, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     steps, tracker = tracked.steps, tracked.tracker
+    channels, results = one_layout(tracker.body, tracker.rig, tracked.results, recording.rate)
     frames = TrackedFrames(
-        person.channels.part(steps), tracked.results, tracked.measurements, tracked.leftovers,
-        recording.times[steps], recording.rate, tracker.scene_of, tracker.apart,
+        channels, results, tracked.measurements, tracked.leftovers, recording.times[steps], recording.rate,
+        tracker.scene_of, tracker.apart,
     )  # fmt: skip
     others = {} if recording.followed is None else recording.followed.as_told()
     told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}

@@ -27,9 +27,7 @@ from kinefit.observations import DepthFrame, MarkerFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.sensors.base import Measurement
-from kinefit.sensors.channels import make_channels
 from kinefit.sensors.displaced import AXES, Displaced, displacement
-from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.fit import fit_subject
@@ -39,6 +37,7 @@ from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
+from kinefit.tracking.sizing import channels_of
 from kinefit.tracking.take_recording import marker_sensor, recording_of
 from kinefit.tracking.video import track
 
@@ -89,9 +88,10 @@ def fit_sensors(
         seen = replace(seen, rig=Rig(tuple(cameras)))
     seen = with_names(take, seen)
     recording, body = recording_of(replace(take, start=None), seen, load_body(take.body))
-    alone = replace(recording, steps=lambda i: (), markers=(), marker_sets=(), depth={}, on_body=(), backgrounds={})
-    channels = make_channels(body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma)
-    person = fit_person(body, channels, height=take.height, progress=progress)
+    alone = replace(
+        recording, steps=recording.keypoints_at, markers=(), marker_sets=(), depth={}, on_body=(), backgrounds={}
+    )  # fmt: skip
+    person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
     origins = {name: recording.rig[name].centre_world for name in depth}
     origins |= {marker_sensor(take, k): entry.T_world_file[:3, 3] for k, entry in enumerate(take.markers)}
@@ -120,14 +120,8 @@ class _PlacementProblem:
         self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
         self.person, self.origins, self.centre = person, origins, np.zeros(3)
         self.body: Body = motion.body
-        channels = make_channels(
-            self.body, recording.rig, recording.keypoints, recording.people, recording.keypoint_sigma
-        )
-        self.layout = Layout(channels, self.body)
         self.first = round((motion.times[0] - recording.times[0]) * recording.rate)
         self.sensors, self.wide = self.prepared(_SETTINGS), self.prepared(_WIDE)
-        s = self.settings
-        self.pixels = KeypointSensor(recording.rig, {}, s.pixel, s.loss, s.near)
         self.names: tuple[str, ...] = ()
 
     def prepared(self, settings: TrackSettings) -> Sensors:
@@ -264,11 +258,12 @@ class _PlacementProblem:
             out.append(CylinderShape(self.body))
         sets = {name: std for name, std in self.recording.marker_sets if std is not None}
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
-        return out + [PointOffsets(self.body, name, _DETECTOR) for name in self.layout.channels.sets]
+        detected = dict.fromkeys(k.keypoint_set for k in self.recording.keypoints)
+        return out + [PointOffsets(self.body, name, _DETECTOR) for name in detected]
 
     def measured(self, looks: Sequence[_Look], values: Any, sensors: Sensors) -> list[list[Measurement]]:
         """What was measured in each frame, prepared about the body where the sensors' frames have it."""
-        channels, out = self.layout.channels, []
+        out = []
         for look in looks:
             several: list[Measurement] = []
             for frame in look.seen:
@@ -276,10 +271,9 @@ class _PlacementProblem:
                 there = BodyState(se3.inverse(T) @ look.state.T_world_root, look.state.angles)
                 scene = Scene(self.body, there, self.recording.rig, time=look.time, samples=self.settings.samples)
                 several += [Displaced(m, self.centre) for m in sensors.measurements([frame], scene)]
-            k = look.frame + self.first
-            pixels = channels.uv[k], channels.confidence[k]
-            several.append(KeypointMeasurement(self.pixels, self.layout, *pixels, look.time))
-            out.append(several)
+            scene = Scene(self.body, look.state, self.recording.rig, time=look.time)
+            pixels = self.recording.keypoints_at(look.frame + self.first)
+            out.append([*several, *self.sensors.measurements(pixels, scene)])
         return out
 
     def velocity(self, frame: int) -> NDArray:

@@ -21,6 +21,7 @@ from kinefit.calibration.refine.sightings import PersonSighting, Progress
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import CameraPrior, PointPixels
@@ -73,7 +74,8 @@ def calibrate_people(
     check_input(given, keypoints, height, known_length)
     step("first cameras", 0, 2)
     alone = [steady_person(record) for record in keypoints]
-    channels = make_channels(body, given, alone, [np.zeros(len(k), int) for k in alone], [sigma] * len(alone))
+    in_step = person_records(alone, [np.zeros(len(k), int) for k in alone])
+    channels = make_channels(body, given, in_step, [sigma] * len(alone))
     uv = common_pixels(channels)
     rig = first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.multiview.association import choose_people
+from kinefit.multiview.association import choose_people, person_records
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.cameras import PointPixels
@@ -95,7 +95,7 @@ def sight(
 ) -> PersonSighting:  # fmt: skip
     """Track one person with a rig whose cameras' clocks are late by `offsets` [s]."""
     alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
-    channels = make_channels(body, rig, alone, choose_people(rig, alone), [sigma] * len(alone))
+    channels = make_channels(body, rig, person_records(alone, choose_people(rig, alone)), [sigma] * len(alone))
     subject = fit_subject(body, channels)
     recording = Recording.of_keypoints(rig, alone, sigma=sigma, up=up)
     motion = track(recording, body, subject=subject, smooth=False, progress=progress)
