@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from kinefit.bodies import BodyState, parse_body
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.correspondences import morphed_rows, prior_rows
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas

@@ -5,7 +5,7 @@ from kinefit.bodies.files import load_body
 from kinefit.bodies.serial import save_body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
-from kinefit.bodies.toml_files import catalogue, parse_body
+from kinefit.bodies.toml.bodies import catalogue, parse_body
 from kinefit.bodies.tree import KinematicTree
 
 __all__ = [
