@@ -96,7 +96,7 @@ class Stage:
         from kinefit.geometry.camera import Rig
         from kinefit.simulation.movements import movement as moving
         from kinefit.simulation.placing import in_front
-        from kinefit.simulation.sensors import KINECT
+        from kinefit.simulation.rendering.sensors import KINECT
 
         w, h = KINECT.size
         self.motion = moving(movement)
@@ -108,7 +108,7 @@ class Stage:
 
     def depth(self, frame: int, *, room: bool = False) -> NDArray:
         """(H, W) [m] an image of it."""
-        from kinefit.simulation.sensors import simulate_depth
+        from kinefit.simulation.rendering.sensors import simulate_depth
 
         return simulate_depth(self.motion, self.camera, self.sensor, room=room).frame(frame).depth
 

@@ -62,7 +62,7 @@ def camera_in_front(sensor: Any) -> Any:
 
 def seen(body: Any, states: list[Any], camera: Any, sensor: Any, *, room: bool) -> list[NDArray]:
     """The depth image of each state."""
-    from kinefit.simulation.sensors import simulate_depth
+    from kinefit.simulation.rendering.sensors import simulate_depth
 
     video = simulate_depth(_motion(body, states), camera, sensor, room=room)
     return [video.frame(k).depth for k in range(len(states))]
@@ -89,7 +89,7 @@ def joints(body: Any, state: Any) -> NDArray:
 
 def _recovered(body: Any) -> None:
     from kinefit.initialization.from_depth import start_from_points
-    from kinefit.simulation.sensors import KINECT
+    from kinefit.simulation.rendering.sensors import KINECT
 
     camera = camera_in_front(KINECT)
     for room, suffix in ((False, ""), (True, "_room")):
@@ -129,8 +129,8 @@ def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
     """Body, state, camera and depth image of people of all sizes in movements, every fourth at its beginning."""
     from kinefit.simulation.movements import MOVEMENTS, movement, people
     from kinefit.simulation.placing import in_front
-    from kinefit.simulation.scenes import SimulatedScene
-    from kinefit.simulation.sensors import DEPTH_SENSORS, measured_depth
+    from kinefit.simulation.rendering.scenes import SimulatedScene
+    from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, measured_depth
 
     kind, names = DEPTH_SENSORS[sensor], tuple(MOVEMENTS)
     for k in range(count):
@@ -149,7 +149,7 @@ def _size(body: Any) -> None:
 
     from kinefit.bodies.surfaces import TaperedCylinder
     from kinefit.sensors.depth_view import view_of
-    from kinefit.simulation.sensors import KINECT
+    from kinefit.simulation.rendering.sensors import KINECT
     from kinefit.subject.depth import fit_surfaces
 
     camera, before, after = camera_in_front(KINECT), [], []

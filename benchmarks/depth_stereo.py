@@ -17,9 +17,9 @@ from benchmarks.figures import amount, data, figure
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import sample
 from kinefit.correspondences import collision_rows, free_space_rows
-from kinefit.correspondences.collisions import collision_pairs
-from kinefit.correspondences.depth_image import SurfaceSamples
-from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.occupancy.collisions import collision_pairs
+from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images.stereo import StereoRectifier
@@ -95,9 +95,9 @@ def _head() -> None:
         figure("stereo head, depth of the body", None, "px", "<= 0.25", "no recording")
         return
     from kinefit.readers.skeletons.bvh import read_bvh
-    from kinefit.simulation.pictures import STEREO, picture
+    from kinefit.simulation.rendering.pictures import STEREO, picture
+    from kinefit.simulation.rendering.scenes import SimulatedScene
     from kinefit.simulation.retarget import retarget
-    from kinefit.simulation.scenes import SimulatedScene
 
     motion = retarget(read_bvh(sorted(folder.glob("*.bvh"))[0]), rate=2)
     off, found, spent = [], [], 0.0
@@ -136,7 +136,7 @@ def _skin() -> None:
     try:
         from kinefit import assets
         from kinefit.errors import KinefitError
-        from kinefit.images.models import Models
+        from kinefit.images.detectors.models import Models
 
         if folder is None:
             raise FileNotFoundError("no recording")
@@ -156,8 +156,8 @@ def _skin() -> None:
 
 def _gestures(folder: Path, port: int, models: object) -> tuple[NDArray, float]:
     """(N, 2): 0 for the face and 1 for a hand, and how far it is from where the networks see it; NaN for unseen."""
-    from kinefit.images.detection import Follower
-    from kinefit.images.skin import SkinTracker, find_face
+    from kinefit.images.detectors.detection import Follower
+    from kinefit.images.detectors.skin import SkinTracker, find_face
     from kinefit.readers.video import Video
 
     follower, rows, times = Follower(models, 6.0, people=1, masks=False), [], []  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ from kinefit.evaluation.sequences import Inputs, TruthSequence, sequences
 from kinefit.evaluation.voodoo import METHODS, Summary, conclusions, evaluate, voodoo_method
 from kinefit.motion import Motion
 from kinefit.recipes.voodoo import Settings
-from kinefit.simulation.sensors import KINECT, TOF
+from kinefit.simulation.rendering.sensors import KINECT, TOF
 
 KINECT_COUNT = amount(20, 1)  # each movement and each person twice: images of 640 x 480 take long to simulate
 TUNED, HELD_OUT = 2, 1  # seeds of people and errors

@@ -16,7 +16,7 @@ from benchmarks.motions import library
 from kinefit import Keypoints, Motion, Recording, load_body, track
 from kinefit.evaluation import ErrorBarCoverage, coverage_of_groups
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.solvers.shape import mirror_points
+from kinefit.solvers.bundle.shape import mirror_points
 
 SCENES = {
     "usual": {"outliers": 0.1, "missing": 0.1},

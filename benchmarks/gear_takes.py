@@ -19,7 +19,7 @@ from benchmarks.figures import amount
 from benchmarks.gear_scene import GearScene, Light, Thing, clouds
 from benchmarks.gear_things import box, piece
 from kinefit.bodies import load_body
-from kinefit.bodies.toml_files import catalogue_text
+from kinefit.bodies.toml.bodies import catalogue_text
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
 from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
-from kinefit.cli._fit_markers import wearing
+from kinefit.cli.markers._fit import wearing
 from kinefit.exporters import write_markers, write_osim
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import MarkerSubject, fit_marker_subject

@@ -22,10 +22,10 @@ from benchmarks.retarget import validated
 from benchmarks.surface_body import OFF, moving_arm
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import Metaballs, nearest
-from kinefit.bodies.surfaces.body_skin import BodySkin, body_skins
 from kinefit.bodies.surfaces.metaballs import LEVEL
-from kinefit.bodies.surfaces.skin_tubes import field
-from kinefit.bodies.surfaces.subdivision import subdivided
+from kinefit.bodies.surfaces.skins.body_skin import BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.skin_tubes import field
+from kinefit.bodies.surfaces.skins.subdivision import subdivided
 from kinefit.correspondences import surface_rows
 from kinefit.exporters import write_glb
 from kinefit.geometry.camera import Rig

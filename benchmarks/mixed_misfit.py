@@ -41,8 +41,8 @@ from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
-from kinefit.simulation.room import room
-from kinefit.solvers.shape import mirror_points
+from kinefit.simulation.rendering.room import room
+from kinefit.solvers.bundle.shape import mirror_points
 
 TURN, SHIFT = np.radians(2.0), 0.03  # [rad], [m]
 WALK, SECONDS = 2.0, 6.0  # [m], [s]

@@ -44,8 +44,8 @@ from kinefit.simulation import (
     squat_and_wave,
     studio_rig,
 )
-from kinefit.simulation.room import room
-from kinefit.solvers.shape import mirror_points
+from kinefit.simulation.rendering.room import room
+from kinefit.solvers.bundle.shape import mirror_points
 
 RATE, SECONDS, TRAVEL = 30.0, 3.0, 1.5  # [Hz], [s], [m]
 DETECTOR, MARKER_SET, CAMERAS = "MEDIAPIPE_33", "HANIM_45", ("cam01", "cam02", "cam03", "cam04")

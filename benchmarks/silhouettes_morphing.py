@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
-from kinefit.correspondences.morphed import morphed_outline_rows
-from kinefit.correspondences.outlines import outline_pairs
-from kinefit.correspondences.rims import RimFinder
+from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
+from kinefit.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.correspondences.contours.outlines import outline_pairs
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import outline

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure, quick
 from benchmarks.silhouettes_track import CAMERAS, take_text
 from kinefit.bodies import BodyState
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo

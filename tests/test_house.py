@@ -19,7 +19,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LEVELS = [
     {"errors", "_jit"},
     {"_arguments", "_files", "_image_headers", "_mapped", "_records", "_threads", "findings", "serving"},
-    {"geometry", "_pictures", "_kernels_rendering", "_kernels_losses"},
+    {"geometry", "_pictures"},
     {"bodies", "observations", "motion", "motion_columns"},
     {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},
     {"correspondences"},
@@ -38,8 +38,8 @@ LEVELS = [
 ]
 BESIDE = {
     ("motion", "bodies"), ("motion", "motion_columns"), ("motion_columns", "motion"),
-    ("readers", "images"), ("rows", "losses"), ("__main__", "cli"), ("initialization", "subject"),
-    ("subject", "initialization"),
+    ("readers", "images"), ("images", "rendering"), ("rows", "losses"), ("__main__", "cli"),
+    ("initialization", "subject"), ("subject", "initialization"),
 }
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows

@@ -9,8 +9,8 @@ import pytest
 from kinefit import assets
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.anny import NAMES, AnnyFamily, AnnyModel, load_anny
-from kinefit.bodies.anny_files import FACTORS, AnnyData, _targets, nearest_on_triangles, read_anny
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.anny.files import FACTORS, AnnyData, _targets, nearest_on_triangles, read_anny
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import check_triangles
 from kinefit.errors import AssetError, BodyError
 from kinefit.geometry import se3

@@ -7,7 +7,7 @@ from kinefit import BodyState, load_body
 from kinefit.bodies.parts import PartJoint, with_part, without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.bodies.toml_files import parse_body
+from kinefit.bodies.toml.bodies import parse_body
 from kinefit.correspondences import prior_rows
 from kinefit.errors import BodyError
 

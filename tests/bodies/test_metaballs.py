@@ -9,7 +9,7 @@ from tests.oracle import central_differences, design
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.serial import save_body, saved_body
 from kinefit.bodies.surfaces import Metaballs, SurfaceAnchors, nearest
-from kinefit.bodies.surfaces._kernels_metaballs import field
+from kinefit.bodies.surfaces.closest._kernels_metaballs import field
 from kinefit.bodies.surfaces.metaballs import pack_balls
 from kinefit.correspondences import surface_rows
 from kinefit.errors import BodyError

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body, parse_body, save_body
-from kinefit.bodies.morph_files import format_morphs
-from kinefit.bodies.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
+from kinefit.bodies.morphs.morph_files import format_morphs
+from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
+from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.parts import without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
-from kinefit.bodies.steering import Steering
 from kinefit.bodies.surfaces import SkinnedMesh, body_mesh
 from kinefit.errors import BodyError
 

@@ -5,11 +5,11 @@ import pytest
 from tests.oracle import random_body
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies import morphing_cga as printed
-from kinefit.bodies.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
-from kinefit.bodies.steering import WEIGHTS, Steering, weight_function
+from kinefit.bodies.morphs import morphing_cga as printed
+from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
+from kinefit.bodies.morphs.steering import WEIGHTS, Steering, weight_function
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, body_mesh
-from kinefit.correspondences.morphed import morphed_rows
+from kinefit.correspondences.contours.morphed import morphed_rows
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry import cga, lines, se3
 from kinefit.solvers.least_squares import gauss_newton

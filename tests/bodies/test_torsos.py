@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.morphing import Morphing
-from kinefit.bodies.operators import GlobalMorph, LocalMorph
-from kinefit.bodies.steering import Steering
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph
+from kinefit.bodies.morphs.steering import Steering
 
 BODY = load_body("humanoid_morphing")
 REST = Morphing(BODY, operators=())

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.bodies import load_body
-from kinefit.cli._check_refine import free_name, with_calibration, with_keys
-from kinefit.cli.check import check
+from kinefit.cli.checks._refine import free_name, with_calibration, with_keys
+from kinefit.cli.checks.check import check
 from kinefit.errors import KinefitError
 from kinefit.exporters.marker_files import write_markers
 from kinefit.geometry import se3

@@ -13,8 +13,8 @@ from kinefit.cli import main
 from kinefit.cli.detect import detect
 from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.exporters.pictures.detections import write_detections
-from kinefit.images.person_detector import DetectedPerson
-from kinefit.images.pose_model import SIZE, PersonLandmarks
+from kinefit.images.detectors.person_detector import DetectedPerson
+from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 from kinefit.observations import Detections
 from kinefit.preparing import detecting
 from kinefit.preparing.take import ensure_detections, with_detections
@@ -82,7 +82,7 @@ def take(take, white_video):
 
 @pytest.fixture(autouse=True)
 def networks(monkeypatch, tmp_path):
-    monkeypatch.setattr("kinefit.images.models.Models", Networks)
+    monkeypatch.setattr("kinefit.images.detectors.models.Models", Networks)
     monkeypatch.setattr(detecting, "networks", lambda progress, tell: tmp_path)
     monkeypatch.setattr(Networks, "pictures", 0)
     return Networks

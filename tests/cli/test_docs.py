@@ -8,8 +8,9 @@ import msgspec
 import pytest
 
 from kinefit.batch.results import NAMES
-from kinefit.bodies import catalogue, load_body, records
-from kinefit.bodies.toml_files import JOINT_TYPES
+from kinefit.bodies import catalogue, load_body
+from kinefit.bodies.toml import records
+from kinefit.bodies.toml.bodies import JOINT_TYPES
 from kinefit.exporters import tables
 from kinefit.readers.keypoints import KEYPOINT_SETS
 from kinefit.readers.take import file as takes

@@ -5,7 +5,7 @@ import pytest
 
 from kinefit import Markers, read_markers, read_motion
 from kinefit.bodies.marker_sets import placement
-from kinefit.cli._fit_markers import FORMATS, fit_file
+from kinefit.cli.markers._fit import FORMATS, fit_file
 from kinefit.errors import ExportError, FileError
 from kinefit.exporters import write_markers
 from kinefit.simulation import squat_and_wave

@@ -24,13 +24,6 @@ from kinefit.simulation import squat_and_wave
 from kinefit.tracking.take_recording import recording_of
 
 
-@pytest.fixture(autouse=True)
-def wired(monkeypatch):
-    """The command is there, whatever else is."""
-    commands = dict.fromkeys([*kinefit.cli.COMMANDS, "init"])
-    monkeypatch.setattr(kinefit.cli, "COMMANDS", tuple(commands))
-
-
 def run(*args):
     return CliRunner().invoke(main, [str(arg) for arg in args])
 

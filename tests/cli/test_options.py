@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from kinefit import load_body, read_motion
 from kinefit.cli import main
-from kinefit.cli.track import track as command
+from kinefit.cli.tracking.track import track as command
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
 from kinefit.observations import Markers

@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 import kinefit
 from kinefit.cli import main
-from kinefit.cli.simulate import _SENSORS
+from kinefit.cli.motions.simulate import _SENSORS
 from kinefit.exporters import write_motion
 from kinefit.simulation import SENSORS, cut, squat_and_wave
 

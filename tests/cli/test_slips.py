@@ -215,7 +215,7 @@ def test_who_is_followed_is_told_of_the_option(take):
 
 
 def test_formats_may_stand_apart():
-    from kinefit.cli.track import chosen_formats
+    from kinefit.cli.tracking.track import chosen_formats
 
     assert chosen_formats(None, None, "csv bvh, GLB csv") == ("csv", "bvh", "glb")
 

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from tests.photogrammetry import scenes
 
-from kinefit.cli.surface import surface
+from kinefit.cli.surfaces.surface import surface
 from kinefit.errors import CalibrationError, FileError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

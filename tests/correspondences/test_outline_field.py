@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.correspondences.outline_field import OutlineField
+from kinefit.correspondences.contours.outline_field import OutlineField
 from kinefit.errors import ObservationError
 
 

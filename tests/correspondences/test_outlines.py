@@ -7,8 +7,8 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import body_mesh
-from kinefit.correspondences.outlines import outline_pairs, outline_rows
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 

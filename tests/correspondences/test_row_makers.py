@@ -22,8 +22,8 @@ from tests.oracle import (
 import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
 from kinefit.bodies.closures import Closure
-from kinefit.bodies.morphing import JointMotion, LocalMorph, Morphing
-from kinefit.bodies.steering import Steering
+from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
+from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.surfaces import SkinnedMesh
 from kinefit.correspondences import (
     Bands,
@@ -49,10 +49,10 @@ from kinefit.correspondences import (
     surface_rows,
     target_rows,
 )
-from kinefit.correspondences.collisions import CollisionPairs
-from kinefit.correspondences.depth_image import SurfaceSamples
-from kinefit.correspondences.free_space import FreeSpace
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.rims import Rim
+from kinefit.correspondences.occupancy.collisions import CollisionPairs
+from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import KinefitError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Rig

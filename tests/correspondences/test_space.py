@@ -13,10 +13,10 @@ from kinefit.bodies import Body, BodyState, KinematicTree, PointSet, load_body
 from kinefit.bodies.parts import PartJoint, box, with_part
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.correspondences import collision_rows, free_space_rows
-from kinefit.correspondences._kernels_space import capsule_gaps
-from kinefit.correspondences.collisions import _capsules, collision_pairs
-from kinefit.correspondences.depth_image import SurfaceSamples
-from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.occupancy._kernels_space import capsule_gaps
+from kinefit.correspondences.occupancy.collisions import _capsules, collision_pairs
+from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.solvers.least_squares import gauss_newton

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.images.person_detector import DetectedPerson
-from kinefit.images.pose_model import SIZE, PersonLandmarks
+from kinefit.images.detectors.person_detector import DetectedPerson
+from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 
 
 class DiscModels:

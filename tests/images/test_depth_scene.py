@@ -13,8 +13,8 @@ from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import KINECT, TOF, measured_depth
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import KINECT, TOF, measured_depth
 
 CAMERA = Camera("kinect", (320, 240), [[287.5, 0, 159.5], [0, 287.5, 119.5], [0, 0, 1]])
 UP = (0.0, -1.0, 0.0)

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.images.detection import detect_people, mask_runs
-from kinefit.images.pose_model import SIZE
-from kinefit.images.roi import Roi
+from kinefit.images.detectors.detection import detect_people, mask_runs
+from kinefit.images.detectors.pose_model import SIZE
+from kinefit.images.detectors.roi import Roi
 from kinefit.observations import MEDIAPIPE_33, Detections
 
 

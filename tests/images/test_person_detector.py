@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from kinefit.images.models import squares
-from kinefit.images.person_detector import SIZE, DetectedPerson, PersonDetector, anchors, decode
+from kinefit.images.detectors.models import squares
+from kinefit.images.detectors.person_detector import SIZE, DetectedPerson, PersonDetector, anchors, decode
 
 
 def test_anchors_are_those_of_the_network():

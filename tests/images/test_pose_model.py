@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.images.pose_model import PoseModel, refine
+from kinefit.images.detectors.pose_model import PoseModel, refine
 
 
 def heat(*peaks):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kinefit.images.roi import Roi, Steady
+from kinefit.images.detectors.roi import Roi, Steady
 
 UPRIGHT = np.array([[100.0, 200.0], [100.0, 120.0]])
 

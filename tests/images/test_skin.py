@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.images.skin import WRISTS, SkinTracker
+from kinefit.images.detectors.skin import WRISTS, SkinTracker
 from kinefit.readers.video import Video
 from kinefit.sensors.occlusion import SEEN
 

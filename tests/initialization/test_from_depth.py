@@ -12,8 +12,8 @@ from kinefit.initialization.from_depth import start_from_points
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import TOF, measured_depth
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import TOF, measured_depth
 
 CAMERA = camera()
 STATE = facing(**ARMS)

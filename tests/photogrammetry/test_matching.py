@@ -5,9 +5,9 @@ import pytest
 from tests.photogrammetry import scenes
 
 from kinefit.errors import ObservationError
-from kinefit.photogrammetry import _kernels_matching as kernels
 from kinefit.photogrammetry.least_squares_matching import match, windows_by_texture
-from kinefit.photogrammetry.noise_correlation import variance_factor
+from kinefit.photogrammetry.matching import _kernels_matching as kernels
+from kinefit.photogrammetry.matching.noise_correlation import variance_factor
 from kinefit.photogrammetry.spline_image import SplineImage
 
 AT = np.stack(np.meshgrid(np.arange(30, 130, 12.0), np.arange(30, 90, 12.0)), axis=-1).reshape(-1, 2)

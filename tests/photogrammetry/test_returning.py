@@ -12,8 +12,8 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.textured import textured_picture
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.textured import textured_picture
 
 RIG = cameras(320)
 

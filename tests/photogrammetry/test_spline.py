@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.photogrammetry import _kernels_spline as kernels
+from kinefit.photogrammetry.matching import _kernels_spline as kernels
 from kinefit.photogrammetry.spline_image import SplineImage, grey, pixel_noise, template_share
 
 

@@ -9,7 +9,7 @@ from kinefit.evaluation.sequences import sequence
 from kinefit.evaluation.voodoo import point_errors
 from kinefit.recipes.depth_fusion import depth_fusion
 from kinefit.simulation.movements import people
-from kinefit.simulation.sensors import TOF
+from kinefit.simulation.rendering.sensors import TOF
 
 
 @pytest.fixture(scope="module")

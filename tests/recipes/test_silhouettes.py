@@ -7,7 +7,7 @@ import pytest
 from tests.sensors.scenes import ring
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.recipes.silhouettes import contour_points, pose_from_contours, track_contours

@@ -10,10 +10,10 @@ from tests.sensors.scenes import at, ring
 from tests.tracking.movements import BODY, SENSOR, a_motion, a_rig, images, turned
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphing import JointMotion, Morphing
-from kinefit.bodies.steering import Steering
+from kinefit.bodies.morphs.morphing import JointMotion, Morphing
+from kinefit.bodies.morphs.steering import Steering
 from kinefit.correspondences import depth_image_rows, free_space_rows, surface_rows
-from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame

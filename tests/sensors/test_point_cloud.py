@@ -10,7 +10,7 @@ from tests.sensors.test_depth_image import SETTINGS, TRUTH, apart, found, moving
 from tests.tracking.movements import BODY, cloud_frame, turned
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.parts import with_part
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.correspondences import surface_rows

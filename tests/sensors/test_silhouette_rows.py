@@ -9,8 +9,8 @@ from tests.sensors.scenes import posture, ring
 from tests.sensors.test_depth_image import apart, softened
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphing import Morphing
-from kinefit.correspondences.outlines import outline_pairs, outline_rows
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame

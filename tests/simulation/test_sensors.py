@@ -28,7 +28,7 @@ from kinefit.simulation import (
     squat_and_wave,
 )
 from kinefit.simulation.placing import look_at
-from kinefit.simulation.room import room
+from kinefit.simulation.rendering.room import room
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from kinefit.smoothing.process_noise import Strength
 from kinefit.smoothing.smoother import pixels_of_track
 from kinefit.smoothing.unwrap import continued, unwrap
 from kinefit.solvers.equations import block_diagonal
-from kinefit.solvers.marginal import leave
-from kinefit.solvers.motion_prior import MotionPrior
-from kinefit.solvers.smoothing import blocks, smooth
+from kinefit.solvers.trajectory.marginal import leave
+from kinefit.solvers.trajectory.motion_prior import MotionPrior
+from kinefit.solvers.trajectory.smoothing import blocks, smooth
 from kinefit.subject.subject import Subject
 from kinefit.tracking.session import KeptFrame, one_layout
 

@@ -11,7 +11,7 @@ from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.sensors.channels import make_channels
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors, members, shared_by
-from kinefit.solvers.seen_points import SeenPoints
+from kinefit.solvers.trajectory.seen_points import SeenPoints
 
 MOTION = squat_and_wave(rate=20.0, duration=2.0)
 RIG = studio_rig(MOTION)

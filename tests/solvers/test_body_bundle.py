@@ -6,9 +6,9 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.losses import geman_mcclure
-from kinefit.solvers.body_bundle import fit_body_and_cameras
-from kinefit.solvers.cameras import COLUMNS, TIME, CameraPrior, PointPixels, departure, moved_rig
-from kinefit.solvers.shape import PixelFrames, shape_parameters
+from kinefit.solvers.bundle.body_bundle import fit_body_and_cameras
+from kinefit.solvers.bundle.cameras import COLUMNS, TIME, CameraPrior, PointPixels, departure, moved_rig
+from kinefit.solvers.bundle.shape import PixelFrames, shape_parameters
 
 BODY = load_body("humanoid")
 SET = BODY.keypoints("BODY_25B")

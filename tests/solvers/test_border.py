@@ -13,8 +13,8 @@ from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, huber
 from kinefit.rows import PairRows, ParameterRows
 from kinefit.solvers import _kernels_border
-from kinefit.solvers.border import Prior, solve
-from kinefit.solvers.whitened import PoseScrews, columns, residuals
+from kinefit.solvers.bundle.border import Prior, solve
+from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals
 
 ARM = load_body("arm")
 HUMANOID = load_body("humanoid")

@@ -7,7 +7,7 @@ from tests.oracle import rig_around
 from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.losses import SQUARED, geman_mcclure
-from kinefit.solvers.cameras import (
+from kinefit.solvers.bundle.cameras import (
     COLUMNS,
     FOCAL,
     TIME,

@@ -1,7 +1,7 @@
 """Which points of a body share a shift: left and right are alike."""
 
 from kinefit.bodies import PointSet, load_body
-from kinefit.solvers.shape import mirror_points
+from kinefit.solvers.bundle.shape import mirror_points
 
 BODY = load_body("humanoid")
 SEGMENTS = ("trunk", "leg_r", "leg_l", "foot_r")

@@ -11,11 +11,11 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.simulation import squat_and_wave, studio_rig
-from kinefit.solvers import _kernels_band
 from kinefit.solvers.equations import block_diagonal, dense_pattern
-from kinefit.solvers.motion_prior import MotionPrior
-from kinefit.solvers.seen_points import SeenPoints
-from kinefit.solvers.smoothing import Smoothed, _system, _workspace, blocks, posterior, smooth
+from kinefit.solvers.trajectory import _kernels_band
+from kinefit.solvers.trajectory.motion_prior import MotionPrior
+from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import Smoothed, _system, _workspace, blocks, posterior, smooth
 
 BODY = load_body("humanoid")
 TREE, N = BODY.tree, BODY.tree.n_dofs

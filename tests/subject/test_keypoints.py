@@ -12,7 +12,7 @@ from kinefit.observations import Keypoints
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.channels import make_channels
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
-from kinefit.solvers.shape import mirror_points
+from kinefit.solvers.bundle.shape import mirror_points
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics

@@ -15,7 +15,7 @@ from kinefit.losses import geman_mcclure
 from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import RowsOf, Unknown
 from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
-from kinefit.solvers.border_frames import differences
+from kinefit.solvers.bundle.border_frames import differences
 from kinefit.subject.lasting import Seen, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KNOWN_SIZE, UNKNOWN_SIZE, PointOffsets, SegmentScales, World, stacked

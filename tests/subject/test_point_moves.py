@@ -9,7 +9,7 @@ from kinefit.losses import SQUARED
 from kinefit.observations import KeypointFrame
 from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.border_frames import differences
+from kinefit.solvers.bundle.border_frames import differences
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import PointOffsets, SegmentScales, World, stacked
 

@@ -12,8 +12,8 @@ from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import KINECT, measured_depth
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import KINECT, measured_depth
 from kinefit.tracking.tracker import Tracker
 
 BODY = load_body("humanoid10")

@@ -13,7 +13,7 @@ from kinefit import load_body, read_motion
 from kinefit.assets import anny_files
 from kinefit.bodies import BodyState
 from kinefit.bodies.anny import load_anny
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.cli import main
 from kinefit.errors import AssetError, BodyError
 from kinefit.observations import SilhouetteFrame
@@ -54,7 +54,7 @@ def test_cylinders_are_as_wide_as_the_skin(model):
 
 
 def test_without_its_files_it_is_told_how_to_fetch_them(tmp_path, monkeypatch):
-    from kinefit.bodies import anny
+    from kinefit.bodies.anny import model as anny
 
     monkeypatch.setattr(anny, "cache_directory", lambda: tmp_path)
     with pytest.raises(BodyError, match="anny_files"):

@@ -7,8 +7,8 @@ import pytest
 from tests.sensors.scenes import at, ring
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphing import Morphing
-from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.correspondences.contours.morphed import on_moved_joints
 from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas

@@ -9,8 +9,8 @@ from tests.tracking.movements import BODY, RATE, SENSOR, a_motion, a_rig, images
 
 from kinefit import track
 from kinefit.observations import DepthFrame
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import measured_depth
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import measured_depth
 from kinefit.tracking.recording import Recording
 
 FRAMES, WRONG = 10, 0.2

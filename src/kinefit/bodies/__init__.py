@@ -3,11 +3,11 @@
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import load_body
 from kinefit.bodies.marker_sets import placement
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.serial import save_body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
-from kinefit.bodies.toml_files import catalogue, parse_body
+from kinefit.bodies.toml.bodies import catalogue, parse_body
 from kinefit.bodies.tree import KinematicTree
 
 __all__ = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
 from kinefit.bodies.closures import FIXED, Closure, Dimension
-from kinefit.bodies.operators import Operator
+from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.surfaces.tables import SurfaceTables, tables

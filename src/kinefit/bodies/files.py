@@ -8,7 +8,7 @@ from kinefit._arguments import checked
 from kinefit.bodies.anny import fetched_anny
 from kinefit.bodies.body import Body
 from kinefit.bodies.serial import saved_body
-from kinefit.bodies.toml_files import read_toml_body
+from kinefit.bodies.toml.bodies import read_toml_body
 
 
 @checked

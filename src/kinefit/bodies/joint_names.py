@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
-from kinefit.bodies.toml_files import read_toml_body
+from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.errors import BodyError, ObservationError, choices
 
 SIDES = {

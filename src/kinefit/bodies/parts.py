@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kinefit._files import repeated
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import without_landmarks
-from kinefit.bodies.operators import Operator
+from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, Surface
 from kinefit.bodies.tree import KinematicTree

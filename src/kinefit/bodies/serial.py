@@ -42,14 +42,14 @@ from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
-from kinefit.bodies.records import stature_of
-from kinefit.bodies.serial_morphs import (
+from kinefit.bodies.morphs.serial_morphs import (
     morphs_from_arrays,
     morphs_to_arrays,
     skin_from_arrays,
     skin_to_arrays,
 )
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, Surface, TaperedCylinder
+from kinefit.bodies.toml.records import stature_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 

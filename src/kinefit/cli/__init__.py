@@ -17,10 +17,14 @@ from kinefit.cli import _screen
 from kinefit.cli._group import CommandGroup
 from kinefit.errors import KinefitError
 
-COMMANDS = (
-    "demo", "init", "calibrate", "detect", "check", "track", "live", "batch", "markers", "surface", "body", "view",
-    "replay", "export", "retarget", "simulate", "evaluate", "warmup",
-)  # fmt: skip
+COMMANDS = {
+    "demo": "tracking.demo", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
+    "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.batch",
+    "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view",
+    "replay": "motions.replay", "export": "motions.export", "retarget": "motions.retarget",
+    "simulate": "motions.simulate", "evaluate": "motions.evaluate", "warmup": "warmup",
+}  # fmt: skip
+"""Commands in the order of use, and their modules."""
 
 _EPILOG = """\b
 Examples:
@@ -57,7 +61,7 @@ class _Commands(CommandGroup):
         """Import a command."""
         if name not in COMMANDS:
             return None
-        return getattr(import_module(f"kinefit.cli.{name}"), name)
+        return getattr(import_module(f"kinefit.cli.{COMMANDS[name]}"), name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

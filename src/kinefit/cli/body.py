@@ -42,7 +42,7 @@ def body(ctx: click.Context) -> None:
 @click.argument("file", type=_FILE, required=False)
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file of your own."""
-    from kinefit.bodies.toml_files import catalogue_text
+    from kinefit.bodies.toml.bodies import catalogue_text
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
 

@@ -4,12 +4,12 @@ from kinefit.correspondences.anchored import anchored_rows, target_rows
 from kinefit.correspondences.bands import Bands, band_rows, joint_bands
 from kinefit.correspondences.closures import closure_rows
 from kinefit.correspondences.coincidence import coincidence_rows
-from kinefit.correspondences.collisions import collision_rows
-from kinefit.correspondences.depth_image import depth_image_rows
-from kinefit.correspondences.free_space import free_space_rows
+from kinefit.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
+from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
 from kinefit.correspondences.image_lines import edge_rows, image_line_rows
-from kinefit.correspondences.morphed import morphed_outline_rows, morphed_rows
-from kinefit.correspondences.outlines import outline_pairs, outline_rows
+from kinefit.correspondences.occupancy.collisions import collision_rows
+from kinefit.correspondences.occupancy.depth_image import depth_image_rows
+from kinefit.correspondences.occupancy.free_space import free_space_rows
 from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
 from kinefit.correspondences.pixels import pixel_rows
 from kinefit.correspondences.planes import plane_rows

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces.nearest import nearest_lines
+from kinefit.bodies.surfaces.closest.nearest import nearest_lines
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences._kernels_surface import surface_rows as fill
 from kinefit.errors import ObservationError

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, load_body
-from kinefit.diagnostics.arrangement import disagreement_share, sample, stranger_findings
+from kinefit.diagnostics.arrangement import disagreement_share, frame_findings, sample, stranger_findings
 from kinefit.diagnostics.bias import CameraBias, camera_biases, disagreement
 from kinefit.diagnostics.distortion import distortion_findings
-from kinefit.diagnostics.frames import frame_findings
 from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.mistakes import focal_findings, mistake_findings
 from kinefit.diagnostics.person import size_findings, stature, upright_findings

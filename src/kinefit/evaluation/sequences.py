@@ -10,16 +10,16 @@ import numpy as np
 
 from kinefit.bodies import Body, PointSet
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.skin import LANDMARKS, SkinTracker, face_box
+from kinefit.images.detectors.skin import LANDMARKS, SkinTracker, face_box
 from kinefit.motion import Motion
 from kinefit.observations import MEDIAPIPE_33, DepthFrame, Frame, KeypointFrame
 from kinefit.sensors.channels import joined
 from kinefit.simulation._postures import MOVEMENTS
 from kinefit.simulation.movements import Performer, movement, people
-from kinefit.simulation.pictures import ColourSensor, picture
 from kinefit.simulation.placing import beside, in_front
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import TOF, DepthSensor, measured_depth
+from kinefit.simulation.rendering.pictures import ColourSensor, picture
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import TOF, DepthSensor, measured_depth
 
 Inputs = Literal["3d", "2d", "fusion"]
 INPUTS: tuple[Inputs, ...] = ("3d", "2d", "fusion")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import STIFF, hard_equations, looped, soft_closures
-from kinefit.correspondences.collisions import CollisionPairs, collision_pairs, collision_rows
+from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.minimum import ROUGH, Minimum, minimum
 from kinefit.frame.prediction import belief, released_from

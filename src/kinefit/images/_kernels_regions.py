@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit._kernels_rendering import rasterise
+from kinefit.rendering._kernels import rasterise
 
 UNKNOWN = 1e6  # in a table of log ratios
 

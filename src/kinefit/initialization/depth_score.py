@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.fingers import of_fingers
 from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
-from kinefit.correspondences.collisions import CollisionPairs, collision_pairs
+from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs
 from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors import _kernels_depth_view as kernels
 from kinefit.sensors.depth_view import DepthView

@@ -12,8 +12,8 @@ from kinefit.errors import TrackingError
 from kinefit.geometry import se3
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.rows import AnyRows, Rows
+from kinefit.solvers.bundle.shape import PROPORTIONS
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.shape import PROPORTIONS
 
 _NUMBERS = {3: "three", 6: "six"}
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from kinefit.geometry.camera import ImageFrame
-from kinefit.images.detection import Follower, PersonDetection
-from kinefit.images.models import Models
+from kinefit.images.detectors.detection import Follower, PersonDetection
+from kinefit.images.detectors.models import Models
 from kinefit.live.inbox import Arrived
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 from kinefit.observations.detections import in_calibration

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit.photogrammetry._kernels_matching import (
+from kinefit.photogrammetry.matching._kernels_matching import (
     CORRELATION,
     DIVERGED,
     FOUND,

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
+from kinefit.photogrammetry.seeding.unaided import grow_over_time
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface import MeasuredSurface, refuse_repeated, refuse_untextured
-from kinefit.photogrammetry.unaided import grow_over_time
 
 _EXACT = 1e-6  # [px²] of the places in the first image, which define the points
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.photogrammetry import _kernels_matching as kernels
-from kinefit.photogrammetry.noise_correlation import variance_factor
+from kinefit.photogrammetry.matching import _kernels_matching as kernels
+from kinefit.photogrammetry.matching.noise_correlation import variance_factor
 from kinefit.photogrammetry.spline_image import SplineImage, template_share
 
 WINDOW = 13

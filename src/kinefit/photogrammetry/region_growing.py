@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.photogrammetry import _kernels_growing, _kernels_matching
+from kinefit.photogrammetry import _kernels_growing
 from kinefit.photogrammetry.least_squares_matching import STEPS, TOLERANCE, WINDOW, Matches, halves_of, places
+from kinefit.photogrammetry.matching import _kernels_matching
 from kinefit.photogrammetry.spline_image import SplineImage, template_share
 
 LEAST_CORRELATION = 0.8

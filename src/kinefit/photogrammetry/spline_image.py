@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.photogrammetry import _kernels_spline as kernels
+from kinefit.photogrammetry.matching import _kernels_spline as kernels
 
 _MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
 _SMALLEST = 16  # [px] a side, two windows' margins

@@ -13,10 +13,10 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.strain import Strain, grid_step, strain
 from kinefit.photogrammetry.surface import MeasuredSurface, check_images, from_matches, measure
-from kinefit.photogrammetry.unaided import grow_between, grow_over_time, grow_through
 
 Progress = Callable[[str, int, int], None]
 

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.photogrammetry.correlation import search_box
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
-from kinefit.photogrammetry.multi_image import match_along_rays
+from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import match_along_rays
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
+from kinefit.photogrammetry.seeding.unaided import grow_between
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.unaided import grow_between
 
 _EXACT = 1e-6  # [px²] of the template's own place, which defines the point
 _FEWEST = 3  # points of a surface

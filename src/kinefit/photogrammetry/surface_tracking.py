@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.photogrammetry.correlation import search_box
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, match
+from kinefit.photogrammetry.matching.correlation import search_box
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage

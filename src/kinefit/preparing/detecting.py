@@ -171,8 +171,8 @@ def _look_through(
     threads: int,
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
-    from kinefit.images.detection import detect_people
-    from kinefit.images.models import Models
+    from kinefit.images.detectors.detection import detect_people
+    from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
     models = Models(folder, threads)
@@ -198,7 +198,7 @@ def _look_through(
 def networks(progress: Step | None, tell: Tell) -> Path:
     """Folder with the networks; their licence is shown when they are fetched."""
     from kinefit.assets import MODELS_CREDIT, detector_models
-    from kinefit.images.models import check_runtime
+    from kinefit.images.detectors.models import check_runtime
 
     check_runtime()
     fetched: list[int] = []
@@ -258,7 +258,7 @@ def _fits(
 
 def hush(networks: Path) -> None:
     """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
-    from kinefit.images.models import Models
+    from kinefit.images.detectors.models import Models
 
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

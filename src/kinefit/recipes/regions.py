@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
-from kinefit.correspondences.outlines import outline_rows
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.outlines import outline_rows
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.recipes._colour_densities import COLOURS, DENSITIES, colour_cells

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.morphing import MorphedPose, Morphing
-from kinefit.correspondences.morphed import morphed_rows
-from kinefit.correspondences.outlines import outline_pairs
-from kinefit.correspondences.rims import RimFinder
+from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
+from kinefit.correspondences.contours.morphed import morphed_rows
+from kinefit.correspondences.contours.outlines import outline_pairs
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lines import perpendiculars

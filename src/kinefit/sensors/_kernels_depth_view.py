@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit._kernels_rendering import rasterise
 from kinefit.bodies._kernels import forward
-from kinefit.correspondences._kernels_space import capsule_gaps
+from kinefit.correspondences.occupancy._kernels_space import capsule_gaps
+from kinefit.rendering._kernels import rasterise
 
 
 @jit

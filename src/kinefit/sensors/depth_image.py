@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.correspondences import depth_image_rows, surface_rows
-from kinefit.correspondences.free_space import FreeSpace
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images.depth_noise import without_speckles

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh
-from kinefit.correspondences.rims import Window
+from kinefit.correspondences.contours.rims import Window
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.rendering import Canvas

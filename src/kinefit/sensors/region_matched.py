@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.correspondences.morphed import morphed_outline_rows
-from kinefit.correspondences.outlines import outline_rows
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.correspondences.contours.outlines import outline_rows
+from kinefit.correspondences.contours.rims import Rim
 from kinefit.losses import Loss
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, by_segments

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, TaperedCylinder
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.rims import Rim
 
 AROUND, OTHER = -1, -2  # labels of what is around the body, and of what is neither that nor the body
 _BESIDE = 1.0  # [px] of the drawing from a contour to what is beyond it

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.tree import KinematicTree
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry.camera import Camera
 from kinefit.losses import Loss
 from kinefit.rows import DofRows

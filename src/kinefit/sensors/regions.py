@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.morphing import MorphedPose, Morphing
+from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
 from kinefit.correspondences import targets
-from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.correspondences.contours.morphed import on_moved_joints
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.surface import TrackedSurface

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.correspondences.morphed import morphed_outline_rows
-from kinefit.correspondences.outlines import outline_pairs, outline_rows
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.morphed import morphed_outline_rows
+from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
+from kinefit.correspondences.contours.rims import Rim
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import choose_person, outline

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.fingers import of_fingers
-from kinefit.bodies.morphing import MorphedPose, Morphing
+from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
 from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
-from kinefit.correspondences.depth_image import SurfaceSamples
-from kinefit.correspondences.rims import RimFinder
+from kinefit.correspondences.contours.rims import RimFinder
+from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled

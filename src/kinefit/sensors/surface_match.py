@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from kinefit.bodies.surfaces import SurfaceAnchors
 from kinefit.correspondences import anchored_rows, free_space_rows, target_rows
 from kinefit.correspondences.anchored import anchored
-from kinefit.correspondences.depth_image import SurfaceSamples
-from kinefit.correspondences.free_space import FreeSpace
-from kinefit.correspondences.morphed import on_moved_joints
+from kinefit.correspondences.contours.morphed import on_moved_joints
+from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.geometry.camera import Camera
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.rows import DofRows, Rows

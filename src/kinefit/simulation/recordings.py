@@ -22,11 +22,11 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation.keypoints import simulate_keypoints
-from kinefit.simulation.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
 from kinefit.simulation.placing import in_front, places
-from kinefit.simulation.room import room as room_around
-from kinefit.simulation.scenes import SimulatedScene
-from kinefit.simulation.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
+from kinefit.simulation.rendering.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
+from kinefit.simulation.rendering.room import room as room_around
+from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
 """What `write_recording` simulates."""

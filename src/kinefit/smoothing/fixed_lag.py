@@ -24,12 +24,12 @@ from kinefit.sensors.checks import of_kind
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
 from kinefit.smoothing.unwrap import boxes, continued
-from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal
-from kinefit.solvers.marginal import Entering, leave
-from kinefit.solvers.motion_prior import MotionPrior
-from kinefit.solvers.smoothing import Equations, Smoothed, blocks, posterior, smooth
+from kinefit.solvers.trajectory import _kernels_smoothing
+from kinefit.solvers.trajectory.marginal import Entering, leave
+from kinefit.solvers.trajectory.motion_prior import MotionPrior
+from kinefit.solvers.trajectory.smoothing import Equations, Smoothed, blocks, posterior, smooth
 
 _BEFORE = 0.3  # [s] of frames before the lag that are still linearised anew
 _TRIED = 3  # steps of a window: it begins where the last one ended

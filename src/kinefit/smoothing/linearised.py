@@ -23,9 +23,9 @@ from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers import _kernels_smoothing
 from kinefit.solvers.equations import normal_equations
-from kinefit.solvers.smoothing import Equations, MakeEquations
+from kinefit.solvers.trajectory import _kernels_smoothing
+from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
 
 SceneOf = Callable[[BodyState, float], Scene]
 ApartRows = Callable[[Scene], Sequence[AnyRows]]

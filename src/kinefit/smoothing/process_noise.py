@@ -20,9 +20,9 @@ from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, w
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
 from kinefit.smoothing.spool import Spool, stretches
 from kinefit.smoothing.unwrap import boxes
-from kinefit.solvers.motion_prior import MotionPrior
-from kinefit.solvers.seen_points import SeenPoints
-from kinefit.solvers.smoothing import Posterior, Smoothed, posterior, smooth
+from kinefit.solvers.trajectory.motion_prior import MotionPrior
+from kinefit.solvers.trajectory.seen_points import SeenPoints
+from kinefit.solvers.trajectory.smoothing import Posterior, Smoothed, posterior, smooth
 
 INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual is noise
 _RAYLEIGH = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ²

@@ -5,7 +5,7 @@ from __future__ import annotations
 from kinefit._records import Codec
 from kinefit.bodies import BodyState, PointSet
 from kinefit.bodies.surfaces import SurfaceAnchors
-from kinefit.correspondences.rims import Rim
+from kinefit.correspondences.contours.rims import Rim
 from kinefit.frame.results import FrameResult
 from kinefit.images.regions import Ratios, RegionColours
 from kinefit.losses import Loss

@@ -19,7 +19,7 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channel_residuals import ChannelResiduals
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers.border_frames import gram
+from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
 from kinefit.solvers.variance_components import VarianceComponents, variance_components
 

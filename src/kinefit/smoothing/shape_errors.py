@@ -21,7 +21,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.solvers.border_frames import Part, Weighing, differences, frame_at, gram
+from kinefit.solvers.bundle.border_frames import Part, Weighing, differences, frame_at, gram
 from kinefit.solvers.equations import joint_moves, normal_equations
 from kinefit.subject.matched_frames import CLOSURES, Worlds
 from kinefit.subject.parameters import PointOffsets, stacked

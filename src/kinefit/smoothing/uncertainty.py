@@ -30,10 +30,10 @@ from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverag
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
-from kinefit.solvers.border_frames import gram
+from kinefit.solvers.bundle.border_frames import gram
+from kinefit.solvers.bundle.whitened import PoseScrews, columns
 from kinefit.solvers.equations import block_diagonal, joint_moves, product
 from kinefit.solvers.variance_components import VarianceComponents, variance_components
-from kinefit.solvers.whitened import PoseScrews, columns
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves

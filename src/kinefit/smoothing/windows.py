@@ -14,7 +14,7 @@ from kinefit._threads import side_by_side
 from kinefit.sensors.base import Matched
 from kinefit.smoothing.process_noise import SmoothTake, Strength
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers.smoothing import Posterior
+from kinefit.solvers.trajectory.smoothing import Posterior
 
 _TOLERANCES = 1e-3, 1e-5  # of two passes of matching all other sensors anew and solving, at known process noise
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
-from kinefit._kernels_losses import weigh
+from kinefit.losses._kernels import weigh
 
 
 @jit

@@ -17,8 +17,8 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
-from kinefit.solvers.border import Bordered, Prior, solve
-from kinefit.solvers.border_frames import POSTURE, SETTLING
+from kinefit.solvers.bundle.border import Bordered, Prior, solve
+from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING
 from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channel_names import ChannelNames
-from kinefit.solvers.whitened import residuals
+from kinefit.solvers.bundle.whitened import residuals
 
 _FEWEST = 10  # residuals of a sensor, below which nothing is said of their errors
 _MOST_HIDDEN = 0.75  # share of all lasting errors that a fit may be thought to follow

@@ -13,7 +13,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
-from kinefit.solvers.border_frames import Part, apart
+from kinefit.solvers.bundle.border_frames import Part, apart
 from kinefit.subject.closure_moves import ClosureMoves, closing_rows
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World, stacked

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces._kernels_metaballs import nearest_on_metaballs
+from kinefit.bodies.surfaces.closest._kernels_metaballs import nearest_on_metaballs
 from kinefit.bodies.surfaces.metaballs import pack_balls
 from kinefit.errors import BodyError, ObservationError
 from kinefit.solvers.least_squares import relax

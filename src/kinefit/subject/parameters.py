@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.shape import PROPORTIONS, mirror_points
+from kinefit.solvers.bundle.shape import PROPORTIONS, mirror_points
 
 UNKNOWN_SIZE, KNOWN_SIZE = 0.2, 0.02
 """Standard deviation of the logarithm of a person's size, and of one whose stature is known (shoes, posture)."""

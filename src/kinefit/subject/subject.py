@@ -13,7 +13,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.view_bias import ViewBias
-from kinefit.solvers.border import Prior
+from kinefit.solvers.bundle.border import Prior
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces.body_skin import FOLLOWED, body_skins
-from kinefit.bodies.surfaces.skin_tubes import field
-from kinefit.bodies.surfaces.subdivision import check_closed, limit, subdivided
+from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, body_skins
+from kinefit.bodies.surfaces.skins.skin_tubes import field
+from kinefit.bodies.surfaces.skins.subdivision import check_closed, limit, subdivided
 from kinefit.errors import BodyError
 
 BODY = load_body("humanoid_metaballs")

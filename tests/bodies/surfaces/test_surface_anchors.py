@@ -8,7 +8,7 @@ from tests.bodies.surfaces.shapes import ball, points_on
 
 from kinefit.bodies import MeshSurface, TaperedCylinder, load_body
 from kinefit.bodies.surfaces import SurfaceAnchors, sample
-from kinefit.bodies.surfaces._kernels_grid import nearest_faces
+from kinefit.bodies.surfaces.closest._kernels_grid import nearest_faces
 from kinefit.errors import BodyError
 
 BODY = load_body("humanoid")

@@ -3,9 +3,9 @@
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.fourier import FourierSurface
-from kinefit.bodies.surfaces.low_pass import low_pass
+from kinefit.bodies.surfaces.skins.low_pass import low_pass
 
 
 def bumpy(height):

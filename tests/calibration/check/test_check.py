@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kinefit.calibration.check.check import check_take
+from kinefit.diagnostics.arrangement import frame_findings
 from kinefit.diagnostics.bias import camera_biases, disagreement, without_points
-from kinefit.diagnostics.frames import frame_findings
 from kinefit.diagnostics.keypoints import check_keypoints
 from kinefit.diagnostics.scene import lens_findings, placement_findings
 from kinefit.diagnostics.views import make_views, with_sides_right

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
-from kinefit.cli._check_refine import Refined
+from kinefit.cli.checks._refine import Refined
 from kinefit.diagnostics.sensor_fit import SensorAlignment, doubts_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

@@ -13,7 +13,7 @@ from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.simulation import simulate_keypoints
-from kinefit.solvers.cameras import COLUMNS, camera_jacobian, moved_rig
+from kinefit.solvers.bundle.cameras import COLUMNS, camera_jacobian, moved_rig
 
 
 def knocked(rig, seed=0, degrees=0.6, metres=0.03):

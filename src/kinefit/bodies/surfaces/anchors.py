@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.surfaces._kernels_grid import nearest_faces
+from kinefit.bodies.surfaces.closest._kernels_grid import nearest_faces
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.errors import BodyError

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.surfaces.grid import DistanceGrid, cell_size, distance_grid, parts
+from kinefit.bodies.surfaces.closest.grid import DistanceGrid, cell_size, distance_grid, parts
 from kinefit.errors import BodyError
 
 WELD = 1e-6  # [m] corners as near as that are one: what six decimals in a file leave apart

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.surfaces.closest.grid import GridTable, pack_grids
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.grid import GridTable, pack_grids
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.metaballs import BallTable, Metaballs, pack_balls
 

@@ -24,7 +24,7 @@ from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solvers.cameras import CameraPrior, PointPixels
+from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels
 
 _SURE = 0.3  # confidence of a keypoint that takes part in the start
 _MOST = 2500  # points in space of the start

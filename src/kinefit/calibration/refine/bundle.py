@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.losses import Loss, geman_mcclure
-from kinefit.solvers.cameras import (
+from kinefit.solvers.bundle.cameras import (
     COLUMNS,
     TIME,
     CameraPrior,

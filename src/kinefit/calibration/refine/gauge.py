@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.cameras import COLUMNS, POSE
+from kinefit.solvers.bundle.cameras import COLUMNS, POSE
 
 _PLACE, _TURN = 0.05, np.radians(1.0)  # a camera's place and turn count alike where 5 cm stand against 1°: 3 m away
 

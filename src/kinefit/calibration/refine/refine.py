@@ -25,8 +25,8 @@ from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
-from kinefit.solvers.body_bundle import fit_body_and_cameras
-from kinefit.solvers.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
+from kinefit.solvers.bundle.body_bundle import fit_body_and_cameras
+from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
 PLACE_SIGMA, TURN_SIGMA = 0.05, np.radians(2.0)
 """How far a calibration is believed to be off [m, rad]: tripods that were knocked, not cameras that were moved."""

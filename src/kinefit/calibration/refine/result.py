@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.calibration.refine.sightings import PersonSighting
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.solvers.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
+from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
 
 SURE_PX = 3.0
 """[px] up to which a rig is trusted: a static point about the person is seen where it says, one standard deviation."""

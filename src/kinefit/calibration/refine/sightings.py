@@ -14,8 +14,8 @@ from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solvers.cameras import PointPixels
-from kinefit.solvers.shape import PROPORTIONS, PixelFrames, ShapeParameters, shape_parameters
+from kinefit.solvers.bundle.cameras import PointPixels
+from kinefit.solvers.bundle.shape import PROPORTIONS, PixelFrames, ShapeParameters, shape_parameters
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import PointOffsets
 from kinefit.subject.subject import Subject

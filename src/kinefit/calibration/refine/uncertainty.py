@@ -12,9 +12,9 @@ from kinefit.bodies import BodyState
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
 from kinefit.calibration.refine.sightings import PersonSighting, correlation_time
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.body_bundle import BodyBundle, fit_body_and_cameras
-from kinefit.solvers.cameras import CameraPrior, PointPixels, departure
-from kinefit.solvers.shape import PixelFrames, ShapeParameters
+from kinefit.solvers.bundle.body_bundle import BodyBundle, fit_body_and_cameras
+from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels, departure
+from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 
 _FRAMES = 40  # that the parts are compared over
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.bodies.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.exporters.skeletons.tubes import side_colour
 from kinefit.geometry.camera import Camera, ImageFrame

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB

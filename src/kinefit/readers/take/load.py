@@ -33,8 +33,7 @@ from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
 from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_assumed
-from kinefit.readers.take.regions import load_regions
-from kinefit.readers.take.silhouettes import load_silhouettes
+from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
 from kinefit.readers.take.surface_points import load_surface_points

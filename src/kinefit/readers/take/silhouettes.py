@@ -1,4 +1,4 @@
-"""Silhouettes of a take: masks in files, by a video's background or the body's colour, of the built-in detector."""
+"""Masks of a take in files, by a video's background, the body's colour or the built-in detector; colour images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
-from kinefit.observations import Detections, SilhouetteVideo
+from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
@@ -207,3 +207,23 @@ def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | Non
         return mask
     T = frame.T_image_calibration[:2]
     return np.asarray(cv2.warpAffine(mask, T, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
+
+
+def load_regions(take: Take, rig: Rig | None, images: Mapping[str, ImageFrame]) -> tuple[ColourVideo, ...]:
+    """The videos of all `[[region]]` of a take, in its order, in the calibration's image frame.
+
+    Raises
+    ------
+    KinefitError
+        What reading a video raises.
+    """
+    out = []
+    for entry in take.regions:
+        assert rig is not None
+        camera = next(c for c in take.cameras if c.name == entry.camera)
+        assert camera.video is not None
+        video, size, frame = Video(camera.video, rate=take.rate), rig[entry.camera].size, images[entry.camera]
+        times = camera.time_offset + np.arange(len(video)) / video.rate
+        image = lambda i, video=video, size=size, frame=frame: in_calibration(video.read(i), size, frame)
+        out.append(ColourVideo(entry.camera, video.rate, times, size, image, str(camera.video)))
+    return tuple(out)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import KinefitError, TakeError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.images.skin import LANDMARKS, WRISTS, SkinTracker, face_box
+from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.observations import KeypointVideo
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.entries import KeypointsEntry

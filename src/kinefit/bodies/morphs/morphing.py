@@ -1,0 +1,285 @@
+"""Bodies in a pose with all that changes with it (P1 3): their skin, joints that move and surfaces that morph.
+
+What a body's operators are is told in `operators`; here they act. The derivative of every node includes what a morph
+adds to it, which P1 holds constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.morphs.operators import (
+    GlobalMorph,
+    JointMotion,
+    LocalMorph,
+    Operator,
+    SegmentMorph,
+    radial_basis,
+)
+from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
+from kinefit.bodies.surfaces.skins.low_pass import low_pass
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
+from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, triangles
+from kinefit.errors import BodyError, choices
+from kinefit.geometry import se3
+
+__all__ = [
+    "GlobalMorph",
+    "JointMotion",
+    "LocalMorph",
+    "MorphedPose",
+    "Morphing",
+    "Operator",
+    "SegmentMorph",
+    "radial_basis",
+]
+
+_AROUND, _ALONG = 20, 6  # of cylinders, as `body_mesh` takes them
+
+
+class Morphing:
+    """A body with its skin and the operators that change both.
+
+    Parameters
+    ----------
+    body : Body
+    mesh : nodes in the root frame at rest with their segments; default: the body's skin, or else its surfaces.
+    operators : any number of each kind; default: the body's own.
+    parameters : (V, n) of the nodes, where local morphs are given in the surface's own parameters.
+
+    Attributes
+    ----------
+    mesh : what is posed, its `faces`, `segment` and `face_segment`.
+    skin : SkinnedMesh, the same.
+
+    Raises
+    ------
+    BodyError
+        An unknown coordinate or segment; a target of another topology; a body without surfaces.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        mesh: BodyMesh | SkinnedMesh | None = None,
+        operators: Sequence[Operator] | None = None,
+        parameters: NDArray | None = None,
+    ) -> None:
+        self.body = body
+        self.mesh = mesh or body.skin or body_mesh(body, around=_AROUND, along=_ALONG)
+        self.skin = self.mesh if isinstance(self.mesh, SkinnedMesh) else SkinnedMesh.of_mesh(self.mesh)
+        self.operators = body.morphs if operators is None else tuple(operators)
+        tree, x = body.tree, self.mesh.vertices
+        if self.skin.owners.size and self.skin.owners.max() >= len(tree.segments):
+            problem = f"a skin with segment {self.skin.owners.max()} for a body with {len(tree.segments)}"
+            raise BodyError(problem, remedy="Take the skin of this body.")
+        for o in self.operators:
+            if o.steering.coordinate not in tree.coordinates:
+                name = o.steering.coordinate
+                raise BodyError(choices(f"angle of body '{body.name}' named", name, tree.coordinates))
+        motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
+        if any(s == 0 for _, s in motions):
+            raise BodyError("the root has no joint that could move", remedy="Name a segment beyond a joint.")
+        self._motions: dict[int, list[JointMotion]] = {}
+        for o, s in motions:
+            self._motions.setdefault(s, []).append(o)
+        self._fields: list[tuple[Steering, NDArray]] = []
+        for o in self.operators:
+            if isinstance(o, GlobalMorph):
+                self._fields.append((o.steering, o.field(x, parameters)))
+            elif isinstance(o, SegmentMorph):
+                self._fields.append((o.steering, self._segment_field(o)))
+            elif isinstance(o, LocalMorph):
+                self._fields.append((o.steering, self._share(o) * o.placed(tree).field(x, parameters)))
+        above = np.eye(len(tree.segments), dtype=bool)
+        for s in range(1, len(tree.segments)):
+            above[s] |= above[tree.parents[s]]
+        self._above = above
+
+    @property
+    def is_rigid(self) -> bool:
+        """Every node is owned by one segment, and nothing morphs: `Rows` can say all of it."""
+        return not self.operators and self.skin.owners.shape[1] == 1
+
+    @property
+    def moves_joints(self) -> bool:
+        """Some joint moves with an angle, so that frames are not those of the tree alone."""
+        return bool(self._motions)
+
+    def low_pass(self, passes: int) -> Morphing:
+        """The same with a skin without high frequencies (`surfaces.low_pass`), which a fit may begin with (P1 2.4)."""
+        out, skin = copy(self), self.skin
+        shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
+        out.skin = out.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
+        return out
+
+    def _share(self, morph: LocalMorph) -> NDArray:
+        """(V, 1) how much of each node belongs to segments that a local morph acts on."""
+        if not morph.on:
+            return np.ones((len(self.skin.nodes), 1))
+        chosen = np.isin(self.skin.owners, [self.body.tree.segment(name) for name in morph.on])
+        return np.sum(self.skin.weights * chosen, 1, keepdims=True)
+
+    def _segment_field(self, morph: SegmentMorph) -> NDArray:
+        """(V, 3) from a segment's surfaces to their second shape; for the mesh of the body's own surfaces."""
+        here, body = self.body.tree.segment(morph.segment), self.body
+        place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
+        meshes = [triangles(s, _AROUND, _ALONG) for s in body.surfaces]
+        if sum(len(v) for v, _ in meshes) != len(self.mesh.vertices) or self.mesh is body.skin:
+            problem = "a segment's surface blends to another, but what is drawn is a skin or a mesh of other points"
+            raise BodyError(problem, place=place, remedy="Take a global morph of all its nodes.")
+        targets = list(morph.surfaces)
+        if len(targets) != sum(s.segment == here for s in body.surfaces):
+            raise BodyError(f"{len(targets)} surfaces as the target of others", place=place, remedy=remedy)
+        out, first = np.zeros_like(self.mesh.vertices), 0
+        for surface, (v, faces) in zip(body.surfaces, meshes):
+            if surface.segment == here:
+                target, other = triangles(targets.pop(0), _AROUND, _ALONG)
+                if target.shape != v.shape or not np.array_equal(other, faces):
+                    raise BodyError("a surface that blends to one of another topology", place=place, remedy=remedy)
+                out[first : first + len(v)] = target - v
+            first += len(v)
+        return out
+
+    def _steered(self, steering: Steering, state: BodyState) -> tuple[int, float, float]:
+        d = self.body.tree.coordinate(steering.coordinate)
+        return (d, *steering.at(float(state.angles[d])))
+
+    def _moved(self, state: BodyState) -> tuple[NDArray, NDArray, list[tuple[int, int, NDArray]]]:
+        """Frames (S, 12) and screws (D, 6) with the joints moved, and by how much angles move joints."""
+        tree, centre = self.body.tree, state.T_world_root[:3, 3]
+        plain, screws = tree.forward(state.T_world_root, state.angles)
+        drives: list[tuple[int, int, NDArray]] = []
+        if not self._motions:
+            return plain, screws, drives
+        Ts = se3.transform(plain[:, :9].reshape(-1, 3, 3), plain[:, 9:])
+        moved: dict[int, NDArray] = {}  # by segments behind a joint that moves
+        to_centre, back = se3.transform(np.eye(3), -centre), se3.transform(np.eye(3), centre)
+        for s in range(1, len(Ts)):
+            p = int(tree.parents[s])
+            if p in moved:
+                moved[s] = moved[p]
+            for motion in self._motions.get(s, ()):
+                d, weight, slope = self._steered(motion.steering, state)
+                at = moved.get(s, np.eye(4)) @ Ts[p]
+                if slope:
+                    drives.append((6 + d, s, slope * (se3.adjoint(to_centre @ at) @ motion.twist)))
+                moved[s] = at @ se3.exp(weight * motion.twist) @ se3.inverse(Ts[p])
+            if s in moved:
+                own = slice(tree.dof_start[s], tree.dof_start[s + 1])
+                screws[own] = screws[own] @ se3.adjoint(to_centre @ moved[s] @ back).T
+        frames = plain.copy()
+        for s, motion_of_s in moved.items():
+            T = motion_of_s @ Ts[s]
+            frames[s, :9], frames[s, 9:] = T[:3, :3].ravel(), T[:3, 3]
+        return frames, screws, drives
+
+    def pose(self, state: BodyState) -> MorphedPose:
+        """Frames, screws and nodes of a state."""
+        frames, screws, drives = self._moved(state)
+        shift: NDArray | None = None
+        slopes: dict[int, NDArray] = {}
+        for steering, field in self._fields:
+            d, weight, slope = self._steered(steering, state)
+            if weight:
+                shift = weight * field if shift is None else shift + weight * field
+            if slope:
+                slopes[6 + d] = slopes[6 + d] + slope * field if 6 + d in slopes else slope * field
+        return MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
+
+
+@dataclass(frozen=True, eq=False)
+class MorphedPose:
+    """A body with its skin in one state.
+
+    Parameters
+    ----------
+    morphing : Morphing
+    state : BodyState
+    frames : (S, 12) and screws : (D, 6), like those of `KinematicTree.forward`.
+    shift : (V, 3) [m] of the nodes at rest, by all morphs; None where nothing acts.
+    slopes : degree of freedom -> (V, 3) change of the nodes at rest by it.
+    drives : (degree of freedom, segment, (6,) twist about the root's origin): what moves joints with angles.
+    """
+
+    morphing: Morphing
+    state: BodyState
+    frames: NDArray
+    screws: NDArray
+    shift: NDArray | None
+    slopes: dict[int, NDArray]
+    drives: tuple[tuple[int, int, NDArray], ...]
+
+    def positions(self, points: PointSet) -> NDArray:
+        """(K, 3) [m] points of segments in the world, on joints that move."""
+        f = self.frames[points.segments]
+        x = self.morphing.body.points_rest(points)
+        return np.asarray((f[:, :9].reshape(-1, 3, 3) @ x[:, :, None])[..., 0] + f[:, 9:])
+
+    @property
+    def nodes(self) -> NDArray:
+        """(V, 3) [m] of the mesh, morphed, in the root frame at rest."""
+        x = self.morphing.mesh.vertices
+        return x.copy() if self.shift is None else x + self.shift
+
+    @cached_property
+    def vertices(self) -> NDArray:
+        """(V, 3) [m] nodes in the world."""
+        return self.morphing.skin.posed(self.frames, self.shift)
+
+    def segment_jacobian(self, segment: int) -> NDArray:
+        """J_s (6, 6 + D), as `KinematicTree.segment_jacobian`, with the joints' motions by their angles."""
+        out = self.morphing.body.tree.segment_jacobian(self.screws, segment)
+        for d, s, twist in self.drives:
+            if self.morphing._above[segment, s]:
+                out[:, d] += twist
+        return out
+
+    def along(self, index: ArrayLike, direction: ArrayLike, share: ArrayLike | None = None) -> NDArray:
+        """n·∂x/∂δ (N, 6 + D) of points of the surface along directions n, the morph's own part included.
+
+        Parameters
+        ----------
+        index : (N,) int, nodes; or (N, C), the nodes that each point lies between.
+        direction : (N, 3) in the world.
+        share : (N, C) of each of these nodes (barycentric coordinates).
+        """
+        skin, tree = self.morphing.skin, self.morphing.body.tree
+        n = np.ascontiguousarray(direction, float)
+        chosen = np.ascontiguousarray(np.asarray(index, np.int64).reshape(len(n), -1))
+        part = np.ones(chosen.shape) if share is None else np.ascontiguousarray(share, float)
+        if part.shape != chosen.shape or n.shape != (len(n), 3):
+            problem = f"points between nodes {chosen.shape} with shares {part.shape} and directions {n.shape}"
+            raise BodyError(problem, remedy="Give (N, C), (N, C) and (N, 3).")
+        if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(skin.nodes):
+            raise BodyError(f"nodes that a surface of {len(skin.nodes)} does not have", remedy="Count from 0.")
+        nodes = skin.nodes if self.shift is None else skin.nodes + self.shift[:, None]
+        drive_dof = np.array([d for d, _, _ in self.drives], np.int64)
+        drive_segment = np.array([s for _, s, _ in self.drives], np.int64)
+        drive_twist = np.array([t for _, _, t in self.drives]).reshape(-1, 6)
+        centre, out = np.ascontiguousarray(self.state.T_world_root[:3, 3]), np.empty((len(n), tree.n_dofs))
+        kernels.moves(
+            nodes, skin.owners, skin.weights, chosen, part, n, centre, self.frames, self.screws, tree.dof_parent,
+            tree.last_dof, drive_dof, drive_segment, drive_twist, self.morphing._above, out,
+        )  # fmt: skip
+        if self.slopes:
+            R = self.frames[:, :9].reshape(-1, 3, 3)
+            back = np.einsum("nck,nckij,ni->ncj", skin.weights[chosen], R[skin.owners[chosen]], n)
+            for d, slope in self.slopes.items():
+                out[:, d] += np.einsum("nc,ncj,ncj->n", part, back, slope[chosen])
+        return out
+
+    def jacobian(self, index: ArrayLike) -> NDArray:
+        """(K, 3, 6 + D) change of the nodes `index` (K,) in the world by δ, the morph's own included."""
+        chosen = np.repeat(np.asarray(index, np.int64), 3)
+        axes = np.tile(np.eye(3), (len(chosen) // 3, 1))
+        return self.along(chosen, axes).reshape(-1, 3, self.morphing.body.tree.n_dofs)

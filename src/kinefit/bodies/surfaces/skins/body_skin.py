@@ -1,0 +1,273 @@
+"""One seamless skin over a whole body of metaballs: tubes about its limbs, joined where they branch (P4, section 3.1).
+
+Where a limb leaves another, as an arm the trunk, a block of the other's net is cut out whose border has as many
+corners as the limb's cross-sections, and rows of quadrilaterals join both. All of it is one closed net, and the skin is
+the bicubic B-spline surface over it (`subdivision`). It is made in a pose with the limbs apart, in which arms do not
+touch the trunk, and brought to rest by the way in which its vertices follow the segments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.body import Body
+from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces.metaballs import LEVEL, Metaballs
+from kinefit.bodies.surfaces.skins.skin_tubes import PosedLimb, Tube, field, tube
+from kinefit.bodies.surfaces.skins.subdivision import check_closed, interpolated, limit, spread, subdivided
+from kinefit.errors import BodyError
+from kinefit.geometry import se3
+
+AROUND, TRUNK = 16, 32  # corners of a limb's cross-section, and of one that limbs branch off
+FOLLOWED = 4  # segments that a vertex follows at most, as files of skins have it
+_BEND = np.cos(np.deg2rad(60.0))  # of directions, beyond which a limb does not go on but leaves the other
+_ASIDE = np.deg2rad(12.0)  # from rest to the middle of a joint's limits, beyond which limbs are held apart there
+_SOFT = 8  # rounds in which weights spread: over about a limb's radius to either side of a joint
+_FILLET = 4  # rounds in which the rows of a join spread
+
+
+@dataclass(frozen=True, eq=False)
+class BodySkin:
+    """The closed net of one skin, in a pose with the limbs apart.
+
+    Parameters
+    ----------
+    control : (V, 3) [m] control points, in the root's frame
+    faces : (Q, 4) facing outwards
+    weights : (V, S) how much each follows the segments; they sum to 1
+    joined : (V,) bool, at a join, where no field says where the skin is
+    tubes : limbs that it is about, as they are posed, tube by tube
+    Ts : (S, 4, 4) from the rest pose to this one, of all segments
+    """
+
+    control: NDArray
+    faces: NDArray
+    weights: NDArray
+    joined: NDArray
+    tubes: tuple[tuple[PosedLimb, ...], ...]
+    Ts: NDArray
+
+    @property
+    def limbs(self) -> tuple[PosedLimb, ...]:
+        """All of them."""
+        return tuple(limb for limbs in self.tubes for limb in limbs)
+
+    def mesh(self, times: int = 1) -> tuple[NDArray, NDArray, NDArray]:
+        """Vertices (V', 3) [m] on the skin, triangles (T, 3), weights (V', S), after so many subdivisions."""
+        x, weights, faces = self.control, self.weights, self.faces
+        for _ in range(times):
+            both, faces = subdivided(np.concatenate([x, weights], axis=1), faces)
+            x, weights = both[:, :3], both[:, 3:]
+        x, weights = limit(x, faces), limit(weights, faces)
+        triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
+        return x, triangles, _followed(weights)
+
+    def at_rest(self, x: NDArray, weights: NDArray) -> NDArray:
+        """(V, 3) [m] vertices in the rest pose, from which weights (V, S) bring them where they are here."""
+        T = np.einsum("vs,sij->vij", weights, self.Ts)
+        return np.asarray(np.linalg.solve(T[:, :3, :3], (x - T[:, :3, 3])[..., None])[..., 0])
+
+
+def _followed(weights: NDArray) -> NDArray:
+    """(V, S) the largest few weights of each, which sum to 1."""
+    least = np.sort(weights, axis=1)[:, -min(FOLLOWED, weights.shape[1])]
+    kept = np.where((weights >= least[:, None]) & (weights > 1e-3), weights, 0.0)
+    return np.asarray(kept / kept.sum(axis=1, keepdims=True))
+
+
+def body_skins(body: Body) -> list[BodySkin]:
+    """Skins of all metaballs of a body; one, where its limbs hang together.
+
+    Raises
+    ------
+    BodyError
+        Limbs that do not meet; one for which there is no room where it branches off.
+    """
+    balls = {s.segment: s for s in body.surfaces if isinstance(s, Metaballs)}
+    out = []
+    for first in sorted(balls):
+        if int(body.tree.parents[first]) not in balls:
+            out.append(_skin(body, balls, first))
+    return out
+
+
+@dataclass(eq=False)
+class _TubePart:
+    """A tube to be, with what it is joined to: the part that its start, or its end, is let into."""
+
+    segments: list[int]
+    start: int | None = None
+    end: int | None = None
+
+
+def _skin(body: Body, balls: dict[int, Metaballs], first: int) -> BodySkin:
+    frames = body.tree.forward(np.eye(4), _apart(body, balls, first).angles)[0]
+    Ts = np.tile(np.eye(4), (len(frames), 1, 1))
+    Ts[:, :3, :3] = frames[:, :9].reshape(-1, 3, 3)
+    Ts[:, :3, 3] = frames[:, 9:]
+    posed = {s: PosedLimb(limb, Ts[s] @ se3.transform(np.eye(3), body.tree.rest[s])) for s, limb in balls.items()}
+    parts = _parts(body, posed, first)
+    hosts = {part.start for part in parts}
+    around = [TRUNK if k in hosts else AROUND for k in range(len(parts))]
+    tubes = [
+        tube([posed[s] for s in part.segments], n, (part.start is None, part.end is None))
+        for part, n in zip(parts, around)
+    ]
+    return _joined(body, parts, tubes, Ts)
+
+
+def _apart(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
+    """The rest pose with limbs that branch off held away: the middle of their joints' limits about the front's axis."""
+    tree, state = body.tree, body.usual_state()
+    angles = np.zeros_like(state.angles)
+    several = {s for s in balls if sum(int(tree.parents[c]) == s for c in balls) > 1}
+    for s in balls:
+        above = s
+        while above in balls and int(tree.parents[above]) not in several:
+            above = int(tree.parents[above])
+        for d in np.flatnonzero((tree.owners == s) & ~tree.prismatic):
+            middle = 0.5 * (tree.lower[d] + tree.upper[d])
+            if above in balls and abs(tree.axes[d, 0]) > 0.95 and abs(middle) > _ASIDE and np.isfinite(middle):
+                angles[d] = middle
+    return BodyState(np.eye(4), angles)
+
+
+def _parts(body: Body, posed: dict[int, PosedLimb], first: int) -> list[_TubePart]:
+    """Tubes of a body: a limb goes on in its child that bends least, the others branch off."""
+    parents, parts = body.tree.parents, [_TubePart([first])]
+    for number, part in ((k, p) for k in range(len(posed)) if k < len(parts) for p in [parts[k]]):
+        while True:
+            last = part.segments[-1]
+            children = [c for c in posed if int(parents[c]) == last]
+            straight = [float(posed[c].way @ posed[last].way) for c in children]
+            on = int(np.argmax(straight)) if children and max(straight) > _BEND else None
+            for k, child in enumerate(children):
+                if k != on and len(children) == 1:  # as the foot: the limb ends in it
+                    part.end = len(parts)
+                    parts.append(_TubePart([child]))
+                elif k != on:
+                    parts.append(_TubePart([child], start=number))
+            if on is None:
+                break
+            part.segments.append(children[on])
+    return parts
+
+
+def _joined(body: Body, parts: Sequence[_TubePart], tubes: list[Tube], Ts: NDArray) -> BodySkin:
+    """One net of all tubes."""
+    joints = [(k, part.start, 0) for k, part in enumerate(parts) if part.start is not None]
+    joints += [(k, part.end, -1) for k, part in enumerate(parts) if part.end is not None]
+    for k, host, end in joints:
+        tubes[k] = _shortened(body, tubes[k], tubes[host], end)
+    first = np.cumsum([0, *(len(t.vertices) for t in tubes)])
+    faces = [t.faces() for t in tubes]
+    open_to = [np.ones(len(f), bool) for f in faces]
+    x = np.concatenate([t.vertices for t in tubes])
+    weights = np.zeros((len(x), len(body.tree.segments)))
+    weights[np.arange(len(x)), np.concatenate([t.segment for t in tubes])] = 1.0
+    bridges, joined = [], np.zeros(len(x), bool)
+    for k, host, end in joints:
+        ring = first[k] + (tubes[k].rings[0] if end == 0 else tubes[k].rings[-1, ::-1])
+        block, border = _hole(body, tubes[host], faces[host], open_to[host], x[ring], tubes[k].limbs)
+        open_to[host][block] = False
+        border = border + first[host]
+        gap = np.linalg.norm(x[border] - x[ring], axis=1).mean()
+        size = np.linalg.norm(x[ring] - x[np.roll(ring, 1)], axis=1).mean()
+        rows = [border]
+        for t in np.linspace(0.0, 1.0, max(2, 1 + round(gap / size)))[1:-1]:
+            rows.append(len(x) + np.arange(len(ring)))
+            x = np.concatenate([x, (1 - t) * x[border] + t * x[ring]])
+            weights = np.concatenate([weights, (1 - t) * weights[border] + t * weights[ring]])
+        rows.append(ring)
+        joined = np.concatenate([joined, np.ones(len(x) - len(joined), bool)])
+        joined[border] = joined[ring] = True
+        for a, b in pairwise(rows):
+            bridges.append(np.stack([a, np.roll(a, -1), np.roll(b, -1), b], axis=1))
+    net = np.concatenate([*(f[o] + n for f, o, n in zip(faces, open_to, first)), *bridges])
+    kept, net = np.unique(net, return_inverse=True)
+    net = net.reshape(-1, 4)
+    x, weights, joined = x[kept], weights[kept], joined[kept]
+    check_closed(net)
+    x = np.where(joined[:, None], spread(x, net, _FILLET), x)
+    limbs = tuple(t.limbs for t in tubes)
+    return BodySkin(interpolated(x, net), net, spread(weights, net, _SOFT), joined, limbs, Ts)
+
+
+def _shortened(body: Body, limb: Tube, host: Tube, end: int) -> Tube:
+    """A tube without the cross-sections that the one into which it is let covers."""
+    hidden = np.flatnonzero((field(host.limbs, limb.vertices[limb.rings]) >= LEVEL).any(axis=1))
+    rings = limb.rings
+    if len(hidden):
+        rings = rings[1 + int(hidden.max()) :] if end == 0 else rings[: int(hidden.min())]
+    if len(rings) < 2:
+        name = body.tree.segments[limb.limbs[0].limb.segment]
+        problem = f"limb of segment '{name}' lies within the one that it branches off"
+        raise BodyError(problem, remedy="Make it longer, or the other thinner.")
+    return replace(limb, rings=rings).cut
+
+
+def _hole(
+    body: Body, host: Tube, faces: NDArray, free: NDArray, ring: NDArray, limbs: Sequence[PosedLimb]
+) -> tuple[NDArray, NDArray]:
+    """Faces of a tube to be cut out for a limb whose ring (A, 3) [m] is given, and the border (A,) that fits it best.
+
+    Blocks of the wall and of the caps whose border has as many corners; none reaches a face that is cut out, nor one
+    beside such.
+    """
+    taken = np.zeros(len(host.vertices), bool)
+    taken[faces[~free]] = True
+    covered = field(limbs, host.vertices) >= LEVEL
+    best, out = np.inf, None
+    turns = (np.arange(len(ring)) + np.arange(len(ring))[:, None]) % len(ring)
+    for block, loop in _blocks(host, len(ring)):
+        if taken[loop].any() or not free[block].all():
+            continue
+        border = host.vertices[loop]
+        if len(ring) * float(np.sum((border.mean(axis=0) - ring.mean(axis=0)) ** 2)) >= best:
+            continue  # however it is turned
+        inside = np.zeros(len(host.vertices), bool)
+        inside[faces[block]] = True
+        squares = np.sum((border[turns] - ring) ** 2, axis=(1, 2))
+        shift = int(np.argmin(squares))
+        cost = float(squares[shift]) * (1.0 + (covered & ~inside).sum() / len(ring))
+        if cost < best:
+            best, out = cost, (block, loop[turns[shift]])
+    if out is None:
+        name = body.tree.segments[limbs[0].limb.segment]
+        raise BodyError(f"no room for the limb of segment '{name}' where it branches off", remedy="Move limbs apart.")
+    return out
+
+
+def _blocks(host: Tube, corners: int) -> list[tuple[NDArray, NDArray]]:
+    """Blocks of a tube's faces, each with its border, counterclockwise from outside."""
+    (R, A), out = host.rings.shape, []
+    sizes = [(h, corners // 2 - h) for h in range(2, corners // 2 - 1)]
+    wall = np.concatenate([host.rings, host.rings], axis=1)
+    for h, w in sizes:
+        for i in range(R - h):
+            for j in range(A):
+                rows = np.arange(i, i + h)[:, None] * A + (np.arange(j, j + w) % A)
+                out.append((rows.ravel(), _border(wall[i : i + h + 1, j : j + w + 1])))
+    number = (R - 1) * A
+    for end, cap in enumerate(host.caps):
+        if cap is None:
+            continue
+        n = len(cap) - 1
+        for h, w in sizes:
+            for i in range(n - h + 1):
+                for j in range(n - w + 1):
+                    rows = number + np.arange(i, i + h)[:, None] * n + np.arange(j, j + w)
+                    loop = _border(cap[i : i + h + 1, j : j + w + 1])
+                    out.append((rows.ravel(), loop[::-1] if end else loop))
+        number += n * n
+    return out
+
+
+def _border(grid: NDArray) -> NDArray:
+    """Vertices about a grid: along its first row, then up its last column, back along the last row, and down."""
+    return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])

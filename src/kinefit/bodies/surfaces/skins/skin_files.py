@@ -1,0 +1,94 @@
+"""`[skin]` in a body file: one mesh over all segments, with weights."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies.surfaces.obj import LONGEST, UNITS, read_obj
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError, choices
+
+_PLACE = "skin"
+
+
+class SkinRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`[skin]`: an OBJ file in the root's frame at rest, and a CSV file of weights, beside the body file."""
+
+    mesh: str
+    weights: str
+    unit: str = "m"
+    owners: int = 4
+
+
+def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> SkinnedMesh | None:
+    """The skin that a body file names; `source` is the body file.
+
+    Raises
+    ------
+    BodyError
+        Files that cannot be read, an unknown unit, segment or vertex, a weight given twice; a mesh with holes or
+        flipped faces, weights that do not sum to one (see `SkinnedMesh`).
+    """
+    if record is None:
+        return None
+    if record.unit not in UNITS:
+        raise BodyError(choices("unit", record.unit, UNITS), file=source, place=_PLACE, remedy="Use one of these.")
+    if record.owners < 1:
+        raise BodyError(f"{record.owners} owners a node", file=source, place=_PLACE, remedy="Give 1 or more.")
+    mesh, table = Path(source).parent / record.mesh, Path(source).parent / record.weights
+    vertices, faces = read_obj(mesh)
+    vertices = UNITS[record.unit] * vertices
+    if (size := float(np.ptp(vertices, axis=0).max())) > LONGEST:
+        problem = f"the skin is {size:.4g} m long"
+        raise BodyError(problem, file=mesh, place=_PLACE, remedy='State the unit of its file, such as unit = "mm".')
+    weights = read_weights(table, len(vertices), tree)
+    try:
+        return SkinnedMesh.of(vertices, faces, weights, tree, owners=record.owners)
+    except BodyError as error:
+        file = table if "weights" in error.problem else mesh
+        raise BodyError(error.problem, file=file, place=_PLACE, remedy=error.remedy) from error
+
+
+def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
+    """Weights (V, S) of a CSV file: lines of vertex (counted from 1, as in OBJ files), segment, weight.
+
+    Without a weight the segment owns the vertex alone: P1's joint list. A first line of words is passed over.
+
+    Raises
+    ------
+    BodyError
+        A file that cannot be read, a line that is not what it says, an unknown segment or vertex, a weight given twice.
+    """
+    try:
+        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, ValueError, csv.Error) as error:
+        remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
+        problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"
+        raise BodyError(problem, file=path, place=_PLACE, remedy=remedy) from error
+    out = np.full((count, len(tree.segments)), np.nan)
+    for number, line in enumerate(lines, 1):
+        cells = [cell.strip() for cell in line]
+        if not any(cells) or (number == 1 and not cells[0].isdigit()):
+            continue
+        where = f"{_PLACE}, line {number}"
+        try:
+            vertex, segment = int(cells[0]), cells[1]
+            weight = float(cells[2]) if len(cells) > 2 and cells[2] else 1.0
+        except (ValueError, IndexError) as error:
+            remedy = "A line has a vertex counted from 1, a segment, and a weight."
+            raise BodyError(f"not a weight: '{','.join(line)[:60]}'", file=path, place=where, remedy=remedy) from error
+        if segment not in tree.segments:
+            problem = choices("segment", segment, tree.segments)
+            raise BodyError(problem, file=path, place=where, remedy="Use one of these.")
+        s = tree.segments.index(segment)
+        if not 1 <= vertex <= count or not np.isnan(out[vertex - 1, s]):
+            problem = f"vertex {vertex} of {count} " + ("twice" if 1 <= vertex <= count else "is not there")
+            raise BodyError(problem, file=path, place=where, remedy="Give each of the mesh's vertices, from 1, once.")
+        out[vertex - 1, s] = weight
+    return np.nan_to_num(out, nan=0.0)

@@ -1,0 +1,155 @@
+"""Skinned triangle meshes: every node is carried by one segment, or blended between several (linear blend skinning).
+
+x_world = Σ_k w_k (R_k x_k + t_k). Where one segment owns a node, its joints are P1's joint list 𝒥 (2.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies.surfaces.mesh import check_triangles
+from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
+from kinefit.bodies.surfaces.triangles import BodyMesh
+from kinefit.errors import BodyError
+
+if TYPE_CHECKING:
+    from kinefit.bodies.tree import KinematicTree
+
+_ONE = 1e-3  # weights that sum to one within this are rounded ones; they are made to
+
+
+@dataclass(frozen=True, eq=False)
+class SkinnedMesh:
+    """Triangle mesh blended between segments.
+
+    Parameters
+    ----------
+    nodes : (V, K, 3) [m]
+        Each node as each of its K owners carries it, in the root frame at rest; all the same where it is modelled at
+        rest.
+    faces : (T, 3) int32, outward counter-clockwise.
+    owners : (V, K) int32, segments.
+    weights : (V, K), 0 for owners that a node does not need; those of a node sum to 1.
+
+    Raises
+    ------
+    BodyError
+        Weights below zero, not finite, or that do not sum to one; arrays that do not fit together.
+    """
+
+    nodes: NDArray
+    faces: NDArray
+    owners: NDArray
+    weights: NDArray
+
+    def __post_init__(self) -> None:
+        nodes, weights = np.array(self.nodes, float), np.array(self.weights, float)
+        owners, faces = np.array(self.owners), np.array(self.faces)
+        if nodes.ndim != 3 or nodes.shape[2] != 3 or owners.shape != nodes.shape[:2] or weights.shape != owners.shape:
+            problem = f"a skin of nodes {nodes.shape}, owners {owners.shape} and weights {weights.shape}"
+            raise BodyError(problem, remedy="Give (V, K, 3), (V, K) and (V, K).")
+        known = not faces.size or 0 <= faces.min() <= faces.max() < len(nodes)
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or not known:
+            raise BodyError(f"a skin of {len(nodes)} nodes has faces {faces.shape} of others", remedy="Count from 0.")
+        if not np.isfinite(nodes).all():
+            bad = int(np.flatnonzero(~np.isfinite(nodes).all((1, 2)))[0])
+            raise BodyError(f"node {bad} of a skin is not finite", remedy="Leave out it and its faces.")
+        total = weights.sum(1)
+        wrong = np.flatnonzero(~((np.abs(total - 1.0) < _ONE) & (weights >= 0.0).all(1)))
+        if len(wrong):
+            problem = f"weights of {len(wrong)} nodes do not sum to one or are below zero, the first "
+            problem += f"{np.round(weights[wrong[0]], 4).tolist()} of node {wrong[0]}"
+            raise BodyError(problem, remedy="Normalise them: in Blender, Weights, Normalize All.")
+        if owners.size and owners.min() < 0:
+            raise BodyError("a skin's owner below 0", remedy="Give indices of segments, with weight 0 where unused.")
+        for name, array, dtype in (
+            ("nodes", nodes, float), ("faces", faces, np.int32), ("owners", owners, np.int32),
+            ("weights", weights / total[:, None], float),
+        ):  # fmt: skip
+            value: NDArray = np.ascontiguousarray(array, dtype)
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def of(
+        cls, vertices: ArrayLike, faces: ArrayLike, weights: ArrayLike, tree: KinematicTree, *, owners: int = 4
+    ) -> SkinnedMesh:
+        """Skin of vertices (V, 3) [m] in the root frame at rest with weights (V, S) of all segments, checked.
+
+        Parameters
+        ----------
+        owners : int, the most that a node keeps, the largest ones.
+
+        Raises
+        ------
+        BodyError
+            As the class; neighbours of which one is flipped, parts inside out, holes.
+        """
+        x, w = np.asarray(vertices, float), np.asarray(weights, float)
+        if x.ndim != 2 or x.shape[1] != 3 or w.shape != (len(x), len(tree.segments)):
+            problem = f"vertices {x.shape} with weights {w.shape} for {len(tree.segments)} segments"
+            raise BodyError(problem, remedy="Give (V, 3) and (V, S).")
+        which, share = strongest(w, owners)
+        skin = cls(np.repeat(x[:, None], which.shape[1], 1), np.asarray(faces), which, share)
+        check_triangles(skin.vertices, skin.faces)
+        return skin
+
+    @classmethod
+    def of_mesh(cls, mesh: BodyMesh) -> SkinnedMesh:
+        """A mesh each node of which one segment owns."""
+        weights = np.ones((len(mesh.vertices), 1))
+        return cls(mesh.vertices[:, None], mesh.faces, mesh.segment[:, None], weights)
+
+    @cached_property
+    def vertices(self) -> NDArray:
+        """(V, 3) [m] in the root frame at rest."""
+        return np.einsum("vk,vki->vi", self.weights, self.nodes)
+
+    @cached_property
+    def segment(self) -> NDArray:
+        """(V,) int32 segment that carries most of each node."""
+        return np.take_along_axis(self.owners, self.weights.argmax(1)[:, None], 1)[:, 0]
+
+    @cached_property
+    def face_segment(self) -> NDArray:
+        """(T,) int32 segment of each face: that of two of its corners, or of the first."""
+        a, b, c = self.segment[self.faces].T
+        return np.where(b == c, b, a)
+
+    def joint_list(self, node: int, tree: KinematicTree) -> tuple[int, ...]:
+        """𝒥 (P1 2.4): the coordinates that move a node, from the root on; of all its owners."""
+        wanted: set[int] = set()
+        for segment in self.owners[node][self.weights[node] > 0]:
+            s = int(segment)
+            while s >= 0:
+                wanted |= set(range(tree.dof_start[s], tree.dof_start[s + 1]))
+                s = int(tree.parents[s])
+        return tuple(sorted(wanted))
+
+    def posed(self, frames: NDArray, shift: NDArray | None = None) -> NDArray:
+        """(V, 3) [m] in the world; frames (S, 12) of `KinematicTree.forward`, shift (V, 3) [m] of nodes at rest."""
+        nodes = self.nodes if shift is None else self.nodes + shift[:, None]
+        out = np.empty((len(nodes), 3))
+        kernels.posed(nodes, self.owners, self.weights, frames, out)
+        return out
+
+    def stretched(self, old: NDArray, new: NDArray, factors: NDArray) -> SkinnedMesh:
+        """The skin on segments stretched by factors (S,), their joints moved from old to new (S, 3)."""
+        k = self.owners
+        return SkinnedMesh(new[k] + factors[k][..., None] * (self.nodes - old[k]), self.faces, k, self.weights)
+
+
+def strongest(weights: NDArray, owners: int) -> tuple[NDArray, NDArray]:
+    """The most important owners (V, K) of weights (V, S) and their weights, which sum to what they did."""
+    count = min(max(owners, 1), weights.shape[1])
+    which = np.argsort(-weights, axis=1, kind="stable")[:, :count]
+    share = np.take_along_axis(weights, which, 1)
+    whole, kept = weights.sum(1, keepdims=True), share.sum(1, keepdims=True)
+    share = share * np.where(kept > 0, whole / np.where(kept > 0, kept, 1.0), 0.0)
+    used = max(int((share > 0).sum(1).max(initial=1)), 1)
+    return which[:, :used], share[:, :used]

@@ -1,0 +1,65 @@
+"""The usual posture, and departures from it that go together, as a body file states them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kinefit.bodies.toml.records import CouplingRecord
+from kinefit.bodies.tree import KinematicTree
+from kinefit.errors import BodyError, choices
+
+
+def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
+    """The tree with the couplings of a file, whose weights have no unit and whose spreads are in degrees.
+
+    Raises
+    ------
+    BodyError
+        A coordinate that is not there or slides, nothing or no number as weights, a spread that is not positive, or a
+        coordinate that cannot be coupled, see `KinematicTree`.
+    """
+    lines = np.zeros((len(couplings), len(tree.coordinates)))
+    for line, c in zip(lines, couplings):
+        place = f"coupling {c.name}"
+        for name, weight in c.of.items():
+            if name not in tree.coordinates:
+                raise BodyError(
+                    choices("coordinate", name, tree.coordinates), file=source, place=place, remedy="Use one of these."
+                )
+            line[tree.coordinate(name)] = weight
+        if not (np.isfinite(line).all() and line.any() and 0.0 < c.spread < np.inf):
+            problem = f"spread {c.spread}, weights {list(c.of.values())}"
+            raise BodyError(problem, file=source, place=place, remedy="Give a positive spread, and weights besides 0.")
+        if tree.prismatic[line != 0.0].any():
+            raise BodyError("it couples a coordinate that slides", file=source, place=place, remedy="Couple angles.")
+        line /= np.radians(c.spread)
+    try:
+        return replace(tree, couplings=lines)
+    except BodyError as error:
+        raise BodyError(error.problem, file=source, place="coupling", remedy=error.remedy) from error
+
+
+def with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
+    """The tree with another usual posture: values [deg] or [m] of some coordinates.
+
+    Raises
+    ------
+    BodyError
+        A coordinate that is not there, or a value beyond its range.
+    """
+    out = np.array(tree.usual)
+    for name, value in usual.items():
+        place = f"usual {name}"
+        if name not in tree.coordinates:
+            problem = choices("coordinate", name, tree.coordinates)
+            raise BodyError(problem, file=source, place=place, remedy="Use one of these.")
+        d = tree.coordinate(name)
+        unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
+        if not (np.isfinite(value) and tree.lower[d] <= value * unit <= tree.upper[d]):
+            ends = f"{tree.lower[d] / unit:g} to {tree.upper[d] / unit:g}"
+            raise BodyError(f"{value:g} is out of its range", file=source, place=place, remedy=f"Give {ends}.")
+        out[d] = value * unit
+    return replace(tree, usual=out)

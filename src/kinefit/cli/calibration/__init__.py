@@ -1,0 +1,1 @@
+"""`kinefit calibrate`."""

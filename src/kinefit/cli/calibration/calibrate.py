@@ -1,0 +1,143 @@
+"""`kinefit calibrate`: cameras from a board, from a bar with two targets, or from the people in view."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _screen
+from kinefit.cli._group import CommandGroup
+
+if TYPE_CHECKING:
+    from kinefit.calibration.board.calibrate import BoardCalibration
+
+_WAYS = {
+    "board": "kinefit.cli.calibration.calibrate", "bar": "kinefit.cli.calibration._bar",
+    "people": "kinefit.cli.calibration._people",
+}  # fmt: skip
+
+_EXAMPLES = """\b
+Examples:
+  kinefit calibrate board videos/ --board charuco:5x7:0.04:0.03 --floor 12
+  kinefit calibrate board left.mp4 right.mp4 --board checkerboard:9x6:0.025 -o stereo.toml
+  kinefit calibrate board pictures/ --board checkerboard:9x6:0.025 --interiors-only
+  kinefit calibrate board videos/ --board charuco:5x7:0.04:0.03:5X5_100 --interiors lenses.toml
+  kinefit calibrate bar videos/ --length 0.9
+"""
+
+
+class _Ways(CommandGroup):
+    """Subcommands that are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the order of use."""
+        return list(_WAYS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """Import a subcommand."""
+        return getattr(import_module(_WAYS[name]), name) if name in _WAYS else None
+
+
+@click.group(cls=_Ways, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, a bar, or from people in view.")
+def calibrate() -> None:
+    """Calibrate cameras: with a board in view, with a bar that is waved, or from the people in view alone."""
+
+
+@click.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
+@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_OR_FOLDER...")
+@click.option(
+    "--board", "spec", required=True, metavar="SPEC",
+    help="checkerboard:9x6:0.025 (inner corners, square in m) or charuco:5x7:0.04:0.03[:DICTIONARY] (squares, square "
+    "and marker in m).",
+)
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
+              help="File to write, Pose2Sim TOML.")
+@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration whose lenses are kept.")
+@click.option("--interiors-only", is_flag=True, help="Lenses alone; the cameras need not see the board together.")
+@click.option("--floor", metavar="FRAME", help="Frame, or time as 3.5s, at which the board lies on the floor, face up.")
+@click.option("--max-frames", type=click.IntRange(4), default=200, show_default=True,
+              help="Frames of each camera to look at, evenly over the recording.")
+@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+@_screen.verbose_option
+def board(
+    sources: tuple[Path, ...], spec: str, out: Path, interiors: Path | None, interiors_only: bool, floor: str | None,
+    max_frames: int, overwrite: bool, verbose: bool,
+) -> None:
+    """Intrinsics and extrinsics from a checkerboard or ChArUco board.
+
+    Give a synchronised video for each camera, named as the camera, or a folder of them; or folders of pictures. Frames
+    of one number are of one time. The board's square gives the scale, the board on the floor the origin and up.
+    """
+    from kinefit.calibration.board.calibrate import calibrate_board
+    from kinefit.calibration.board.detection import Board
+    from kinefit.calibration.board.sources import camera_sources, find_boards
+    from kinefit.cli._results import check_new
+    from kinefit.readers.calibration.read import read_calibration, write_calibration
+
+    described = Board.parse(spec)
+    found = camera_sources(sources)
+    check_new(out, overwrite)
+    kept = read_calibration(interiors, exteriors=False) if interiors else None
+    frame = _frame(floor, found)
+    with _screen.bars() as step:
+        described, seen = find_boards(
+            found, described, max_frames=max_frames, include=() if frame is None else (frame,), progress=step
+        )
+        step("calibrating", 0, 1)
+        result = calibrate_board(seen, described, interiors=kept, floor=frame, exteriors=not interiors_only)
+        step("calibrating", 1, 1)
+    write_calibration(result.rig, out)
+    _tell(result)
+    _screen.say(f"Written: {out}")
+
+
+def _frame(floor: str | None, sources: dict) -> int | None:
+    """Frame number of "12" or "3.5s"."""
+    from kinefit.readers.video import Video
+
+    if floor is None:
+        return None
+    try:
+        if not floor.endswith("s"):
+            return int(floor)
+        seconds = float(floor[:-1])
+    except ValueError:
+        raise click.BadParameter(f"'{floor}' is no frame; write 12, or 3.5s", param_hint="--floor") from None
+    first = next(iter(sources.values()))
+    if isinstance(first, dict):
+        raise click.BadParameter("pictures have no times; give the number of one", param_hint="--floor")
+    with Video(first) as video:
+        return round(seconds * video.rate)
+
+
+def _tell(result: BoardCalibration) -> None:
+    from rich.table import Table
+
+    table = Table(title=f"{result.board}", title_justify="left")
+    for column in ("camera", "focal px", "± px", "views", "picture covered", "rms px", "lens alone px", "place ± mm"):
+        left = column == "camera"
+        table.add_column(column, justify="left" if left else "right", no_wrap=left)
+    for camera in result.rig:
+        report = result.cameras[camera.name]
+        told = (
+            f"{camera.matrix[0, 0]:.1f}", f"{report.focal_std_px:.1f}" if report.focal_std_px else "given",
+            f"{report.used} of {report.views}", f"{100 * report.coverage:.0f} %", f"{report.rms_px:.2f}",
+            f"{report.own_rms_px:.2f}", f"{1e3 * report.position_std:.1f}" if report.position_std < 1e3 else "-",
+        )  # fmt: skip
+        table.add_row(camera.name, *told)
+    _screen.console().print(table)
+    for (a, b), distance in result.rig.distances.items() if result.shared else ():
+        told_frames = f"{result.shared.get((a, b), 0)} frames agree"
+        _screen.say(f"{a} to {b}: {distance:.3f} m, {told_frames}")
+    if result.jitter[0] > 5e-4:
+        shift, turn = 1e3 * result.jitter[0], 57.3 * result.jitter[1]
+        _screen.say(
+            f"Between cameras the board differs by {shift:.1f} mm and {turn:.2f} degrees: they are a little out of "
+            "step and the board moved, or it is not flat. Hold it still for a moment in each place."
+        )
+    _screen.say(result.world)
+    for line in result.advice:
+        _screen.say(f"More: {line}")

@@ -1,0 +1,113 @@
+"""`kinefit check`: what is wrong with a recording, in plain words and on a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _screen
+
+if TYPE_CHECKING:
+    from kinefit.cli.checks._refine import Refined
+    from kinefit.diagnostics.keypoints import Check
+
+_EXAMPLES = """\b
+Examples:
+  kinefit check take.toml                    findings, and a page with images
+  kinefit check take.toml --refine           a better calibration and a take that uses it, beside the old ones
+"""
+_PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r exchanged")
+
+
+@click.command(short_help="Find out what is wrong with a recording; refine its calibration.", epilog=_EXAMPLES)
+@click.argument("take", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Page to write.  [default: TAKE-check.html]")
+@click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, never over the old.")
+@click.option("--focal", is_flag=True, help="With --refine: focal lengths too.")
+@click.option("--distortion", is_flag=True, help="With --refine: lens distortion too.")
+@click.option("--time-offsets", is_flag=True, help="With --refine: time offsets too.")
+@click.option(
+    "--points", type=click.Path(path_type=Path),
+    help="With --refine: TOML of static points, [name] and camera = [u, v] px in the calibration's image.",
+)
+@click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
+@_screen.verbose_option
+@click.pass_context
+def check(
+    ctx: click.Context, take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
+    points: Path | None, strict: bool, verbose: bool,
+) -> None:  # fmt: skip
+    """Find out what is wrong with a recording, how sure that is, and what would fix it.
+
+    TAKE is the recording's take file. Looked at are the calibration (which camera moved, lens, unit, poses), the order
+    of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
+    up, what each camera sees, and whether depth cameras and marker systems fit the videos.
+    """
+    if (focal or distortion or time_offsets or points) and not refine:
+        raise click.UsageError("--focal, --distortion, --time-offsets and --points only go with --refine.")
+    if points is not None and not points.is_file():
+        raise click.BadParameter(f"no such file: {points}", param_hint="--points")
+    from kinefit.calibration.check.check import check_take
+    from kinefit.cli._results import check_file
+    from kinefit.cli.checks._page import check_page
+    from kinefit.cli.checks._refine import refined_of, write_refined
+    from kinefit.errors import KinefitError
+    from kinefit.exporters.atomic import write_text
+    from kinefit.preparing.take import with_detections
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.find import find_take
+
+    take = find_take(take, wanted=("check",))
+    out = out or take.with_name(f"{take.stem}-check.html")
+    check_file(out)
+    entry = read_take(take)
+    refined: Refined | None = None
+    failed: KinefitError | None = None
+    with _screen.bars() as step:
+        try:
+            entry = with_detections(entry, step, _screen.note)
+        except KinefitError as error:  # the rest can be checked without
+            _screen.note(f"note: no keypoints: {error}")
+        found = check_take(entry, progress=step)
+        if refine:
+            try:
+                refined = refined_of(
+                    found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets
+                )
+            except KinefitError as error:
+                failed = error
+    _print(found, verbose)
+    write_text(out, check_page(found, refinement=refined, up=entry.up))
+    _screen.say(f"\nWritten: {out}")
+    if failed is not None:
+        raise failed
+    if refined is not None:
+        write_refined(found, refined, take)
+    if strict and found.faults:
+        ctx.exit(2)
+
+
+def _print(found: Check, verbose: bool) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from kinefit.cli.checks._page import camera_rows, verdict
+
+    _screen.say(f"\n{found.name}: {verdict(found)}")
+    for one in found.findings:
+        if one.severity == "good" and not verbose:
+            continue
+        _screen.tell_finding(one)
+    good = [one for one in found.findings if one.severity == "good"]
+    if good and not verbose:
+        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v says more)")
+    columns, rows = camera_rows(found)
+    if rows:
+        shown = [at for at, name in enumerate(columns) if name in _PRINTED]
+        table = Table(*(escape(columns[at]) for at in shown), box=None, pad_edge=False)
+        for row in rows:
+            table.add_row(*(row[at] for at in shown))
+        _screen.say()
+        _screen.console().print(table)

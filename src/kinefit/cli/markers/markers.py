@@ -1,0 +1,254 @@
+"""`kinefit markers`: from points without names to a labelled take, and a body that moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from kinefit.cli import _results, _screen
+from kinefit.cli._group import CommandGroup
+
+if TYPE_CHECKING:
+    from kinefit.identification.take.takes import TakeIdentification
+    from kinefit.observations import Markers
+
+MOST_DOUBTS = 12
+"""Doubtful spans that are printed; the table has all."""
+
+_EXAMPLES = """\b
+Examples:
+  kinefit markers learn labelled.c3d -o anna.json         what Anna's markers hold to each other
+  kinefit markers set labelled.c3d -o lab.toml            a first marker set for labels that are not known
+  kinefit markers identify walk.c3d anna.json             names for the points of an unlabelled take
+  kinefit markers fit walk-named.c3d                      body, joint angles, .mot, BVH, GLB
+  kinefit markers fit walk.c3d --subject anna.json        both in one
+  kinefit markers audit walk-named.c3d                    swapped labels of a take that somebody named
+"""
+_FILE = click.Path(path_type=Path)
+_unit = click.option("--unit", metavar="UNIT", help="Of files that state none, or a wrong one: mm, cm, m ...")
+
+
+@click.group(
+    cls=CommandGroup, short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES
+)
+def markers() -> None:
+    """Name the markers of a take (C3D, TRC), fit a body to them, check labels."""
+
+
+@markers.command(epilog="""\b
+Examples:
+  kinefit markers learn range_of_motion.c3d --name Anna
+  kinefit markers learn static.c3d walk.c3d squat.c3d -o anna.json
+  kinefit markers learn static.c3d --frame 100 --set cmu_41
+""")  # fmt: skip
+@click.argument("takes", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--out", type=_FILE, help="File of the subject.  [default: NAME.json]")
+@click.option("--name", help="Of the subject.  [default: of the first take]")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set, of the catalogue or a file.  [default: the one "
+              "that knows the labels]")  # fmt: skip
+@click.option("--no-set", is_flag=True, help="Find segments and joints from the motion alone.")
+@click.option("--frame", type=int, help="Learn from this one frame (from 0; -1: the one that shows most) and the set.")
+@_unit
+@_screen.verbose_option
+def learn(
+    takes: tuple[Path, ...], out: Path | None, name: str | None, marker_set: str | None, no_set: bool,
+    frame: int | None, unit: str | None, verbose: bool,
+) -> None:  # fmt: skip
+    """Learn a subject's markers from labelled takes, best one in which every joint moves."""
+    from kinefit.cli._results import check_file
+    from kinefit.cli.markers._name import learn_files
+    from kinefit.identification.model.files import save_model
+
+    if no_set and (marker_set or frame is not None):
+        raise click.UsageError("--no-set learns from motion alone: without --set and --frame.")
+    if out is not None:
+        check_file(out)
+    model, findings = learn_files(takes, name=name, marker_set="" if no_set else marker_set, frame=frame, unit=unit)
+    out = out or Path(f"{model.name}.json")
+    save_model(model, out)
+    _screen.say(f"{model.name}: {len(model)} markers in {len(model.segments)} segments")
+    for s, (segment, members) in enumerate(zip(model.names, model.segments, strict=True)):
+        joint = next((j for j in model.joints if j.child == s), None)
+        on = "" if joint is None else f" on {model.names[joint.parent]}"
+        _screen.say(f"  {segment}{on}: {', '.join(model.labels[m] for m in members)}")
+    if findings:
+        _screen.say("\nWhat the training leaves open:")
+        for f in findings:
+            _screen.say(f"  {f}")
+    _screen.say(f"\nWritten: {out}")
+
+
+@markers.command("set", epilog="""\b
+Examples:
+  kinefit markers set range_of_motion.c3d -o lab.toml
+  kinefit markers learn range_of_motion.c3d --set lab.toml -o anna.json
+""")  # fmt: skip
+@click.argument("takes", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--out", type=_FILE, help="File of the set.  [default: TAKE.toml]")
+@click.option("--name", help="Of the set.  [default: of the file]")
+@_unit
+@_screen.verbose_option
+def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit: str | None, verbose: bool) -> None:
+    """Write a first marker set for labels that the catalogue does not know.
+
+    TAKES are labelled takes of one subject in which joints move. Labels are paired left and right, those with words
+    that the catalogue knows are laid on the humanoid's landmarks, and every marker goes to the segment that it moves
+    with. Look through the file before you learn with it.
+    """
+    from kinefit.cli._results import check_file
+    from kinefit.cli.markers._name import write_first_set
+
+    out = out or Path(f"{takes[0].stem}.toml")
+    check_file(out)
+    found = write_first_set(takes, out, name=name, unit=unit)
+    for segment, labels in found.segments.items():
+        _screen.say(f"  {segment}: {', '.join(labels)}")
+    if not found.placed:
+        _screen.say("Too few labels have words that the catalogue knows: the groups are what moved together. Give each")
+        _screen.say("the name of its body part and its parent; add [places] and [markers] if a body is to be fitted.")
+    _screen.say(f"{len(found.paired)} pairs of left and right, {len(found.placed)} markers placed on the humanoid")
+    _screen.say(f"\nWritten: {out}")
+    _screen.say(f"Next: look through it, then kinefit markers learn {takes[0].name} --set {out}")
+
+
+@markers.command(epilog="""\b
+Examples:
+  kinefit markers identify walk.c3d anna.json
+  kinefit markers identify dance.c3d anna.json bob.json -o dance-named.c3d
+  kinefit markers identify walk.trc anna.json --no-fill --rest
+""")  # fmt: skip
+@click.argument("take", type=_FILE)
+@click.argument("subjects", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--out", type=_FILE, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
+@click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
+@click.option("--rest", is_flag=True, help='Keep points that are nobody\'s, as "*1", "*2" ...')
+@_unit
+@_screen.verbose_option
+def identify(
+    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, unit: str | None, verbose: bool
+) -> None:
+    """Name the points of an unlabelled take.
+
+    SUBJECTS are files of `kinefit markers learn`: one for each person in the take. Labels that the take may have are
+    not looked at. What is not certain has no name; doubtful frames are printed, and all of them written as a table.
+    """
+    from kinefit.cli.markers._name import identify_file
+    from kinefit.identification.take.takes import TakeSettings
+
+    settings = TakeSettings() if fill else TakeSettings(fill=0.0)
+    with _screen.bars() as step:
+        labelled, found, files = identify_file(
+            take, list(subjects), out, settings=settings, unit=unit, rest=rest, step=step
+        )
+    _tell(labelled, found)
+    _screen.say("\nWritten:")
+    _screen.say(f"  {files['markers']}  labelled markers")
+    _screen.say(f"  {files['doubts']}  doubtful frames, worst first")
+
+
+def _tell(labelled: Markers, found: dict[str, TakeIdentification]) -> None:
+    """Doubtful frames first, then how much has a name."""
+    doubts = sorted(((d.confidence, name, d) for name, f in found.items() for d in f.doubts), key=lambda row: row[0])
+    _screen.say("doubtful frames: none" if not doubts else "doubtful frames, worst first:")
+    for _, name, d in doubts[:MOST_DOUBTS]:
+        _screen.say(f"  {name + ' ' if len(found) > 1 else ''}{d.text}")
+    if len(doubts) > MOST_DOUBTS:
+        _screen.say(f"  and {len(doubts) - MOST_DOUBTS} more")
+    for name, f in found.items():
+        seen = f.column >= 0
+        never = [label for m, label in enumerate(f.labels) if not seen[:, m].any()]
+        _screen.say(
+            f"{name}: {len(labelled)} frames at {labelled.rate:g} Hz, {100 * seen.mean():.1f} % of the labels named, "
+            f"{100 * f.filled.mean():.1f} % filled, {f.ghosts} points unassigned"
+        )
+        if never:
+            _screen.say(f"  never found: {', '.join(never)}")
+
+
+@markers.command(epilog="""\b
+Examples:
+  kinefit markers fit walk-named.c3d
+  kinefit markers fit walk.c3d --subject anna.json --static static.c3d
+  kinefit markers fit walk.trc --height 1.78 --formats mot,osim
+""")  # fmt: skip
+@click.argument("take", type=_FILE)
+@click.option("-o", "--out", type=_FILE, help="Folder of results.  [default: TAKE-kinefit]")
+@click.option("--subject", "subjects", multiple=True, type=_FILE,
+              help="Name the points first, by this file of `learn`; again for another person.")  # fmt: skip
+@click.option("--static", type=_FILE, help="Labelled static trial of the same subject.")
+@click.option("--body", default="humanoid", show_default=True, help="Of the catalogue, or a body file.")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the one that knows the labels]")
+@click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Of the subject, barefoot [m].")
+@click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: found]")
+@click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joints within their ranges.")
+@click.option("--formats", metavar="LIST", help="What to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
+@_unit
+@_screen.verbose_option
+def fit(
+    take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
+    height: float | None, up: str | None, limits: bool, formats: str | None, unit: str | None, verbose: bool,
+) -> None:  # fmt: skip
+    """Fit a body to markers: size and marker places from all frames, then angles in each."""
+    from kinefit.cli._summary import print_summary
+    from kinefit.cli.markers._fit import FORMATS, fit_file
+    from kinefit.cli.markers._name import identify_file
+
+    out = out or take.with_name(f"{take.stem}-kinefit")
+    chosen = FORMATS if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
+    _results.check_folder(out)
+    with _screen.bars() as step:
+        source = take
+        if subjects:
+            target = out / f"{take.stem}-named.c3d"
+            labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
+            source, unit = files["markers"], None
+        known = Path(body) if Path(body).suffix else body
+        found = fit_file(
+            source, known, out, static=static, marker_set=marker_set, height=height, unit=unit, up=up, limits=limits,
+            formats=chosen, step=step,
+        )  # fmt: skip
+    if subjects:
+        _tell(labelled, named)
+    for motion, _ in found.values():
+        print_summary(motion, points=verbose)
+    _screen.say("\nWritten:")
+    written = [files] if subjects else []
+    for path in (path for group in (*written, *(w for _, w in found.values())) for path in group.values()):
+        _screen.say(f"  {path}")
+
+
+@markers.command(epilog="""\b
+Examples:
+  kinefit markers audit walk.c3d squat.c3d
+  kinefit markers audit walk.c3d --subject anna.json
+""")  # fmt: skip
+@click.argument("takes", nargs=-1, required=True, type=_FILE)
+@click.option("--subject", type=_FILE, help="File of `kinefit markers learn`: shows swaps that last through a take.")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the one that knows the labels]")
+@click.option("--strict", is_flag=True, help="Exit with 2 where a label is wrong.")
+@_unit
+@_screen.verbose_option
+@click.pass_context
+def audit(
+    ctx: click.Context, takes: tuple[Path, ...], subject: Path | None, marker_set: str | None, strict: bool,
+    unit: str | None, verbose: bool,
+) -> None:  # fmt: skip
+    """Find swapped labels, and markers off their segment, in takes that somebody labelled."""
+    from kinefit.bodies.marker_sets import load_marker_set
+    from kinefit.identification.audit.audit import audit_take
+    from kinefit.identification.model.files import load_model
+    from kinefit.readers.markers import read_markers
+
+    model = load_model(subject) if subject else None
+    known = load_marker_set(marker_set) if marker_set else None
+    wrong = False
+    for take in takes:
+        findings = audit_take(read_markers(take, unit=unit), model=model, marker_set=known)
+        wrong = wrong or any(f.kind in ("swapped", "throughout") for f in findings)
+        _screen.say(f"{take}: {'nothing found' if not findings else ''}".rstrip())
+        for f in findings:
+            _screen.say(f"  {f}")
+    if strict and wrong:
+        ctx.exit(2)

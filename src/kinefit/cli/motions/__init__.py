@@ -1,0 +1,1 @@
+"""Commands on motions: `kinefit replay`, `export`, `retarget`, `simulate`, `evaluate`."""

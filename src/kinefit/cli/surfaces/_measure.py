@@ -1,0 +1,282 @@
+"""What `kinefit surface` reads, measures and writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._pictures import read_picture
+from kinefit.cli.surfaces._files import PHOTOGRAPHS, StateImages, read_seeds
+from kinefit.errors import FileError, ObservationError, TrackingError
+from kinefit.exporters.surface_files import (
+    point_columns,
+    write_field_picture,
+    write_paths_csv,
+    write_point_picture,
+    write_points_csv,
+    write_surface_vtk,
+)
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
+from kinefit.photogrammetry.fields import field_camera, field_of
+from kinefit.photogrammetry.flat import measure_flat
+from kinefit.photogrammetry.least_squares_matching import windows_by_texture
+from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
+from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
+from kinefit.photogrammetry.surface import MeasuredSurface
+from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
+from kinefit.photogrammetry.trajectories import Trajectories, uniform
+from kinefit.readers.motion import read_motion
+from kinefit.readers.video import Video, check_rates
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Options of the command."""
+
+    out: Path
+    window: str
+    step: int
+    mask: Path | None
+    seeds: Path | None
+    least: float | None
+    gauge: float | None
+    incremental: bool
+    still: int | None
+    field: str | None
+    smooth: float
+    motion: Path | None = None
+
+    def side_of_all(self) -> int:
+        """Side of the windows [px], of all."""
+        if not self.window.isdigit():
+            problem = f"a window of '{self.window}'"
+            raise ObservationError(problem, remedy="Give an odd number of pixels; or 'texture' for photographs.")
+        return int(self.window)
+
+    def side(self, first: SplineImage, second: SplineImage, grid: Grid) -> int | NDArray:
+        """Side of the windows [px], of all or of each place."""
+        if self.window == "texture":
+            return windows_by_texture(first, second, np.nan_to_num(grid.points))
+        return self.side_of_all()
+
+
+def with_field(rig: Rig, field: str | None) -> Rig:
+    """Cameras of a field of interlaced images."""
+    return rig if field is None else Rig(tuple(field_camera(camera, field) for camera in rig))  # type: ignore[arg-type]
+
+
+def spline_of(image: NDArray, field: str | None, smooth: float) -> SplineImage:
+    """An image, or a field of it, smoothed by [px]."""
+    return SplineImage.of(image if field is None else field_of(image, field), smooth=smooth)  # type: ignore[arg-type]
+
+
+def mask_of(path: Path | None, field: str | None) -> NDArray | None:
+    """Where points are wanted (H, W)."""
+    if path is None:
+        return None
+    mask = read_picture(path).max(axis=2) > 0
+    return mask if field is None else field_of(mask, field)  # type: ignore[arg-type]
+
+
+def measure_photographs(rig: Rig, views: StateImages, wanted: Wanted, progress: Progress) -> list[str]:
+    """Measure all states and write them; what to say about them."""
+    rig = with_field(rig, wanted.field)
+    count = len(views.photographs[0])
+    if wanted.still is not None and wanted.still >= count:
+        raise ObservationError(f"state {wanted.still} of {count}", remedy="The first is 0; --still names another one.")
+    states = _States(views.photographs, wanted.field, wanted.smooth)
+    first = states[0]
+    grid = Grid.of(first[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
+    seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
+    window = wanted.side(first[0], first[1], grid)
+    surfaces = measure_states(
+        rig, states, grid, seeds=seeds, window=window, incremental=wanted.incremental, progress=progress,
+        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+    )  # fmt: skip
+    return _write_all(surfaces, views.photographs[0], wanted, int(np.max(window)))
+
+
+def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: Wanted) -> list[str]:
+    """Measure a flat surface in photographs of one camera and write it; what to say about it.
+
+    Raises
+    ------
+    ObservationError
+        Fewer than two photographs, views with names of cameras, or --seeds.
+    """
+    named = [str(p) for p in photographs if p.suffix.lower() not in PHOTOGRAPHS or ("=" in p.name and not p.exists())]
+    if named or wanted.seeds is not None or len(photographs) < 2:
+        problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
+        raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
+    states = [spline_of(read_picture(path), wanted.field, wanted.smooth) for path in photographs]
+    grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
+    window = wanted.side(states[0], states[1], grid)
+    surfaces = measure_flat(
+        states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
+        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+    )  # fmt: skip
+    return _write_all(surfaces, photographs, wanted, int(np.max(window)))
+
+
+def _write_all(
+    surfaces: Sequence[MeasuredSurface], photographs: Sequence[Path], wanted: Wanted, window: int
+) -> list[str]:
+    """Write all states; lines about them."""
+    told = []
+    for k, surface in enumerate(surfaces):
+        reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
+        told += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
+    return told
+
+
+class _States(Sequence[list[SplineImage]]):
+    """Images of all cameras in each state, read when they are asked for: the first and the latest are kept."""
+
+    def __init__(self, photographs: tuple[tuple[Path, ...], ...], field: str | None, smooth: float) -> None:
+        self._files, self._field, self._smooth = photographs, field, smooth
+        self._kept = dict[int, list[SplineImage]]()
+
+    def __len__(self) -> int:
+        return len(self._files[0])
+
+    def __getitem__(self, k: Any) -> Any:
+        if k not in self._kept:
+            self._kept = {j: images for j, images in self._kept.items() if j == 0}
+            self._kept[k] = [spline_of(read_picture(files[k]), self._field, self._smooth) for files in self._files]
+        return self._kept[k]
+
+
+def _grey(path: Path, field: str | None) -> NDArray:
+    """Grey values (H, W) of a photograph, or of a field of it."""
+    image = cv2.cvtColor(read_picture(path), cv2.COLOR_RGB2GRAY)
+    return image if field is None else field_of(image, field)  # type: ignore[arg-type]
+
+
+def _write(
+    surface: MeasuredSurface, reference: MeasuredSurface | None, grey: NDArray, wanted: Wanted, k: int, window: int
+) -> list[str]:
+    """Write one state; lines about it."""
+    out, told = wanted.out, [_about(surface, k)]
+    strain = None
+    if reference is not None:
+        T, residual = rigid_motion(reference.x_world, surface.x_world)
+        rms = 1e3 * float(np.sqrt(np.nanmean(residual**2)))
+        middle = np.nanmean(reference.x_world, axis=0)
+        moved = 1e3 * float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
+        turned = np.rad2deg(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
+        told.append(
+            f"   moved by {moved:.3f} mm, turned by {turned:.3f} degrees; the rest {rms:.4f} mm RMS a coordinate"
+        )
+        if wanted.gauge is not None:
+            strain = surface_strain(reference, surface, wanted.gauge / 1e3, window)
+            levels = {name: 1e6 * value for name, value in strain.rms().items()}
+            kind = "noise floor" if k == wanted.still else "strain"
+            told.append(
+                f"   {kind} over {1e3 * strain.gauge:.2f} mm, RMS: xx {levels['xx']:.0f}e-6, yy {levels['yy']:.0f}e-6, "
+                f"xy {levels['xy']:.0f}e-6"
+            )
+    columns = point_columns(surface, reference, strain)
+    write_points_csv(surface, out / f"points_{k:03d}.csv", columns)
+    write_surface_vtk(surface, out / f"surface_{k:03d}.vtk", columns)
+    std = 1e3 * np.linalg.norm(surface.std, axis=1)
+    write_field_picture(surface, grey, std, out / f"std_{k:03d}.png", title="std deviation", unit="mm")
+    if reference is not None:
+        file = out / f"displacement_{k:03d}.png"
+        length = 1e3 * np.linalg.norm(surface.x_world - reference.x_world, axis=1)
+        write_field_picture(surface, grey, length, file, title="displacement", unit="mm")
+    if strain is not None:
+        for name in ("xx", "yy", "xy"):
+            file = out / f"strain_{name}_{k:03d}.png"
+            title = f"strain {name}, {1e3 * strain.gauge:.1f} mm"
+            write_field_picture(surface, grey, 1e6 * getattr(strain, name), file, title=title, unit="1e-6")
+    return told
+
+
+def _about(surface: MeasuredSurface, k: int) -> str:
+    inside, seen = surface.grid.inside.sum(), surface.measured
+    if not seen.any():
+        return f"state {k}: none of {inside} points found"
+    std = 1e3 * float(np.median(np.linalg.norm(surface.std[seen], axis=1)))
+    return (
+        f"state {k}: {seen.sum()} of {inside} points, {len(surface.triangles)} triangles; "
+        f"standard deviation {std:.4f} mm, "
+        f"correlation {np.median(surface.correlation[seen]):.3f}, parallax {np.median(surface.parallax[seen]):.2f} px "
+        "(medians)"
+    )
+
+
+def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progress) -> list[str]:
+    """Track the surface through videos and write its paths; what to say about them.
+
+    Raises
+    ------
+    ObservationError
+        Options that are for photographs, or videos of other rates.
+    """
+    photographs = {"--gauge": wanted.gauge, "--still": wanted.still, "--incremental": wanted.incremental or None}
+    given = [name for name, value in photographs.items() if value is not None]
+    if given:
+        problem = f"{', '.join(given)} with videos"
+        raise ObservationError(problem, remedy="These are for photographs: states of one surface.")
+    rig = with_field(rig, wanted.field)
+    motion = None if wanted.motion is None else read_motion(wanted.motion)
+    with ExitStack() as opened:
+        videos = [opened.enter_context(Video(path)) for path in views.videos]
+        check_rates({name: video.rate for name, video in zip(views.names, videos)})
+        if motion is not None:
+            _check_motion(motion, wanted.motion, videos[0].rate)
+        count = min(len(video) for video in videos)
+        settings = SurfaceTracking(
+            window=wanted.side_of_all(), step=wanted.step,
+            least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+        )  # fmt: skip
+        seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
+        tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)
+        told = []
+        for k in range(count):
+            images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
+            try:
+                points = tracker.update(images)
+            except TrackingError as error:
+                told.append(f"stopped: {error}")
+                break
+            if k in (0, count // 2, count - 1):
+                write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
+            progress("frames", k + 1, count)
+    paths = tracker.trajectories()
+    speed = float(np.nanpercentile(np.linalg.norm(paths.velocity, axis=2), 99)) if len(paths.times) > 1 else 0.0
+    kept = paths.kept(uniform(paths, radius=_surroundings(paths))) if len(paths.times) > 2 else paths
+    write_paths_csv(kept, wanted.out / "trajectories.csv")
+    live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
+    lengths = kept.live.sum(axis=0)
+    lengths = lengths[lengths > 0]
+    about = f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} a frame"
+    told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
+    return told
+
+
+def _check_motion(motion: Motion, path: Path | None, rate: float) -> None:
+    """Refuse a motion of another rate than the videos', or one that does not begin with them."""
+    if abs(motion.rate - rate) > 1e-3 * rate or abs(float(motion.times[0])) > 0.5 / rate:
+        problem = f"a motion at {motion.rate:g} Hz from {motion.times[0]:.3f} s on, for videos at {rate:g} Hz"
+        remedy = "Give the motion of these videos: kinefit track of a take with rate and first frame as theirs."
+        raise FileError(problem, file=path, place="times", remedy=remedy)
+
+
+def _surroundings(paths: Trajectories) -> float:
+    """[m] about a point within which the surface moves alike: five times the distance of neighbours."""
+    x = paths.x_world[0][paths.live[0]]
+    gaps = np.linalg.norm(x[:, None] - x[None, :200], axis=2)
+    gaps[gaps == 0] = np.inf
+    return 5.0 * float(np.median(gaps.min(axis=0)))

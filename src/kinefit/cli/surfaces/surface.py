@@ -1,0 +1,82 @@
+"""`kinefit surface`: two or more photographs or videos of a surface to points, a mesh and strain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _screen
+
+_EXAMPLES = """\b
+Examples:
+  kinefit surface calib.toml left=left.png right=right.png            points, mesh, standard deviations
+  kinefit surface calib.toml 201=states/201 202=states/202 --gauge 5  folders: states of one surface; strain over 5 mm
+  kinefit surface calib.toml a=a.mp4 b=b.mp4 --window 21              videos: the surface is tracked
+  kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm a pixel
+"""
+
+
+@click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog=_EXAMPLES)
+@click.argument("calibration", type=click.Path(path_type=Path))
+@click.argument("views", nargs=-1, required=True, metavar="CAMERA=PATH...")
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("surface"), help="Folder.")
+@click.option("--unit", default="auto", help="Of the calibration: m, cm, mm ..., or metres.  [default: as it states]")
+@click.option("--window", default="13", show_default=True, help="Side [px] of the windows, odd, or 'texture'.")
+@click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="[px] from point to point.")
+@click.option("--mask", type=click.Path(path_type=Path), help="PNG over the first image, black where no point is.")
+@click.option(
+    "--seeds", type=click.Path(path_type=Path),
+    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: they are found]",
+)  # fmt: skip
+@click.option("--least", type=click.FloatRange(0, 1), help="Correlation of a match.  [default: 0.8]")
+@click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Strain over this length [mm].")
+@click.option("--incremental", is_flag=True, help="Match and strain each state against the one before, not the first.")
+@click.option("--still", type=click.IntRange(1), help="State of nothing moved: strain to it is the noise floor.")
+@click.option(
+    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="[px] of a Gaussian, for texture sharper than pixels."
+)
+@click.option(
+    "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
+    help="Photographs of one camera that faces a flat surface; MM are the millimetres that a pixel shows.",
+)  # fmt: skip
+@click.option(
+    "--motion", type=click.Path(path_type=Path),
+    help="Of videos: the motion.npz, or its folder, of the body that they show; lost points are sought where it says.",
+)  # fmt: skip
+@click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
+@_screen.verbose_option
+def surface(
+    calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
+    seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
+    smooth: float, flat: float | None, motion: Path | None, field: str | None,
+    verbose: bool,
+) -> None:  # fmt: skip
+    """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
+
+    CALIBRATION is any that `kinefit` reads; each CAMERA=PATH names one of its cameras and its photograph, its folder of
+    photographs (states, in the order of the names) or its video. The first camera's first image holds the grid of
+    points.
+
+    With --flat no calibration is needed: all arguments are photographs, before and after.
+    """
+    from kinefit.cli._results import check_folder
+    from kinefit.cli.surfaces._files import read_views
+    from kinefit.cli.surfaces._measure import Wanted, measure_one_camera, measure_photographs, measure_videos
+    from kinefit.errors import ObservationError
+
+    check_folder(out)
+    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion)
+    if motion is not None and flat is not None:
+        raise ObservationError("--motion with --flat", remedy="It is for videos, which are followed in time.")
+    if flat is not None:
+        told = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
+    else:
+        rig, paths = read_views(calibration, unit, views)
+        if motion is not None and not paths.videos:
+            raise ObservationError("--motion with photographs", remedy="It is for videos, which are followed in time.")
+        with _screen.bars() as progress:
+            told = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
+    for line in told:
+        _screen.say(line)
+    _screen.say(f"\nWritten: {out}")

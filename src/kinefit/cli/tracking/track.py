@@ -1,0 +1,204 @@
+"""`kinefit track`: a take file becomes a folder of results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from kinefit.batch import results
+from kinefit.cli import _results, _screen
+
+if TYPE_CHECKING:
+    from kinefit.batch.one import Choices, TrackedPerson
+    from kinefit.readers.take.file import Take
+    from kinefit.tracking.in_view import InView
+
+
+def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
+    """Formats of a list such as "bvh,csv"."""
+    formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
+    for name in formats:
+        if name not in results.NAMES:
+            raise click.BadParameter(_results.no_format(name, results.NAMES))
+    return formats
+
+
+PICTURES = ("full", "blurred", "none")
+
+_EXAMPLES = """\b
+Examples:
+  kinefit track my_take/take.toml
+  kinefit track take.toml --out results --no-overlays --formats bvh,csv
+  kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
+  kinefit track take.toml --lag 0.1     the same a tenth of a second later, which is far smoother
+  kinefit track take.toml --person moving      one of several people
+  kinefit track take.toml -v            also how well every point of every camera fits
+"""
+
+
+def choices_options(command: Callable) -> Callable:
+    """Add the options that say what is made of a take, given to the command as `Choices`, `choices`.
+
+    The command gets `wanted`, too: whether overlays were asked for in so many words.
+    """
+    options = (
+        click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video."),
+        click.option(
+            "--formats", default=",".join(results.USUAL), show_default=True, callback=chosen_formats, metavar="LIST",
+            help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.USUAL}))} are there too.",
+        ),
+        click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
+        click.option(
+            "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
+            help="What report and overlays show of the videos: all, all but the person's face, nothing.",
+        ),
+        click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor."),
+        click.option("--realtime", is_flag=True, help="Do not smooth over the whole take."),
+        click.option(
+            "--lag", type=float, metavar="SECONDS",
+            help="Each frame from those before it and so many seconds after it, as a live session has it a little "
+            "later.",
+        ),
+        click.option(
+            "--person", metavar="WHO",
+            help='Follow one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
+            "[default: the take's, else all, each in a folder of their own]",
+        ),
+        click.option(
+            "--restart", is_flag=True, help="Begin anew where an earlier run was stopped; the default is to go on."
+        ),
+    )  # fmt: skip
+
+    @wraps(command)
+    def called(*args: Any, **given: Any) -> Any:
+        from kinefit.batch.one import Choices
+
+        told = {parameter: given.pop(parameter) for parameter in _CHOICES}
+        source = click.get_current_context().get_parameter_source("overlays")
+        wanted = told["overlays"] and source == click.core.ParameterSource.COMMANDLINE
+        told["smooth"] = not told.pop("realtime")
+        choices = Choices(**told)
+        _check(choices, wanted)
+        return command(*args, **given, choices=choices, wanted=wanted)
+
+    for option in reversed(options):
+        called = option(called)
+    return called
+
+
+_CHOICES = ("overlays", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart")
+
+
+def _check(choices: Choices, wanted: bool) -> None:
+    """Refuse choices that exclude each other."""
+    if choices.contacts and not choices.smooth:
+        raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
+    if choices.lag is not None and (choices.contacts or not choices.smooth):
+        other = "--contacts needs the whole take" if choices.contacts else "--realtime knows of no later frame"
+        raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
+    if choices.pictures == "none" and wanted:
+        raise click.UsageError("--overlays draws on the videos, --pictures none shows nothing of them: choose one.")
+
+
+@click.command(short_help="Track the person of a take file and write all results.", epilog=_EXAMPLES)
+@click.argument("take", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results.  [default: TAKE-kinefit]")
+@choices_options
+@_screen.verbose_option
+@click.pass_context
+def track(
+    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool, verbose: bool
+) -> None:
+    """Track the people of a take file and write all results.
+
+    TAKE is one TOML file that names calibration, cameras, videos and keypoints: `kinefit init` writes a first one,
+    `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
+    the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done; the same command
+    then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
+
+    Faults of the inputs (a camera that moved, a wrong unit, vertical, focal length or clock, exchanged names, mirrored
+    images) stand on top of what is printed and of report.html, with what to do: `kinefit check` looks closer.
+
+    Where keypoints show several people, each has the same results in OUT/person-1, OUT/person-2 and so on.
+    """
+    from kinefit.readers.take.find import find_take
+
+    take = find_take(take)
+    out = out or take.with_name(f"{take.stem}-kinefit")
+    ctx.exit(run(take, out, choices, verbose=verbose, wanted=wanted))
+
+
+def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wanted: bool = False) -> int:
+    """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
+    from kinefit.batch.one import asked_take, check_drawable, people_of
+    from kinefit.batch.outcome import Row, failed
+    from kinefit.batch.people_report import write_people_report
+    from kinefit.batch.work import of_motion
+    from kinefit.errors import KinefitError
+
+    take = asked_take(path, choices)
+    if wanted:
+        check_drawable(take)
+    _results.check_folder(out)
+    with _screen.bars() as step:
+        view, people = people_of(take, out, step, _screen.note)
+    if len(people) == 1:
+        return _track_one(*people[0], choices, view, verbose=verbose)[0]
+    code, rows = 0, []
+    for k, (person, folder) in enumerate(people, 1):
+        _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
+        folder.mkdir(parents=True, exist_ok=True)
+        row = Row(take=take.name, person=k, folder=folder.name)
+        try:
+            own, done = _track_one(person, folder, choices, view, verbose=verbose)
+            rows.append(of_motion(row, done.motion, done.notes))
+        except KinefitError as error:  # of one person: the others are tracked all the same
+            _screen.tell_error(error)
+            own = error.exit_code
+            rows.append(failed(row, str(error)))
+        if own == _screen.INTERRUPTED:
+            return own
+        code = max(code, own)
+    if choices.report:
+        page = write_people_report(rows, out, pictures=choices.draws)
+        _screen.say(f"all people: {page}", style="bold")
+    return code
+
+
+def _track_one(
+    take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool
+) -> tuple[int, TrackedPerson]:  # fmt: skip
+    """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
+    from kinefit.batch.one import track_person
+    from kinefit.cli._summary import print_files, print_summary
+    from kinefit.cli.tracking._agreement import print_agreement
+    from kinefit.errors import TrackingError
+    from kinefit.findings import of_provenance
+
+    files: dict[str, Path] = {}
+    try:
+        with _screen.bars() as step:
+            done = track_person(take, out, choices, view=view, step=step, tell=_screen.note, files=files)
+    except BaseException as error:
+        if files:
+            print_files(files)
+        if verbose and isinstance(error, TrackingError):
+            print_agreement(take)
+        if files and isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
+        raise
+    for found in of_provenance(done.motion.provenance):
+        _screen.tell_finding(found)
+    for note in done.notes:
+        _screen.say(f"note: {note}")
+    print_summary(done.motion, points=verbose)
+    print_files(files)
+    if done.total:
+        told = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."
+        _screen.tell_interrupted(f"{told} The same command goes on.")
+        return _screen.INTERRUPTED, done
+    return 0, done

@@ -1,0 +1,1 @@
+"""Rows of contours in images: outlines of a body against edges."""

@@ -1,0 +1,111 @@
+"""Points of a body's skin along directions: blended between segments, moved by morphs (P1 2.4, 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.bodies.morphs.morphing import MorphedPose
+from kinefit.correspondences.contours.rims import Rim
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.rows import DofRows, Rows
+
+
+def morphed_rows(
+    pose: MorphedPose,
+    index: ArrayLike,
+    direction: ArrayLike,
+    residual: ArrayLike,
+    *,
+    share: ArrayLike | None = None,
+    sigma: ArrayLike = 0.01,
+    group: ArrayLike | None = None,
+) -> Rows | DofRows:
+    """One row a point, r ≈ n·∂x/∂δ δ, with all that a morph adds to the derivative.
+
+    Plain `Rows` where every node has one owner and nothing morphs, which are faster.
+
+    Parameters
+    ----------
+    pose : MorphedPose, of `Morphing(body).pose(state)`.
+    index : (K,) int, nodes of the mesh; or (K, C), the nodes that each point lies between, such as a face's corners.
+    direction : (K, 3) unit, in the world.
+    residual : (K,) [m] how much further along it each point should lie; NaN for none.
+    share : (K, C) barycentric coordinates.
+    sigma : scalar or (K,) [m]
+    group : (K,) int, default each point by itself; see `Rows`.
+    """
+    n, r = np.asarray(direction, float), np.asarray(residual, float)
+    chosen = np.asarray(index, np.int64)
+    chosen = chosen[:, None] if chosen.ndim == 1 else chosen
+    if n.shape != (len(chosen), 3) or r.shape != (len(chosen),):
+        problem = f"{len(chosen)} nodes with directions of shape {n.shape} and residuals of shape {r.shape}"
+        raise ObservationError(problem, remedy="Give (K, 3) and (K,).")
+    deviation = np.broadcast_to(np.asarray(sigma, float), r.shape)
+    if not np.all(deviation > 0):
+        raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")
+    part = np.ones(chosen.shape) if share is None else np.asarray(share, float)
+    ids = np.arange(len(r)) if group is None else np.asarray(group, np.int64)
+    seen = np.isfinite(r) & np.isfinite(n).all(1)
+    chosen, n, r, part, ids = chosen[seen], n[seen], r[seen], part[seen], ids[seen]
+    weight = 1.0 / deviation[seen] ** 2
+    skin = pose.morphing.skin
+    if pose.morphing.is_rigid and (skin.owners[chosen, 0] == skin.owners[chosen[:, :1], 0]).all():
+        x = np.einsum("kc,kci->ki", part, pose.vertices[chosen])
+        return Rows.of(skin.owners[chosen[:, 0], 0], x, n, r, weight, ids)
+    return DofRows(pose.along(chosen, n, part), r, weight, ids)
+
+
+def on_moved_joints(pose: MorphedPose, rows: Rows) -> DofRows:
+    """Rows of points on segments, made with `pose.frames`, with the derivative that moving joints have."""
+    arm = rows.point - pose.state.T_world_root[:3, 3]
+    a = np.concatenate([rows.direction, np.cross(arm, rows.direction)], axis=1)
+    J = np.empty((len(rows), pose.morphing.body.tree.n_dofs))
+    for s in np.unique(rows.segment):
+        of = rows.segment == s
+        J[of] = a[of] @ pose.segment_jacobian(int(s))
+    return DofRows(J, rows.residual, rows.weight, rows.group, rows.loss, rows.segment)
+
+
+def morphed_outline_rows(
+    pose: MorphedPose,
+    rim: Rim,
+    camera: Camera,
+    image: NDArray,
+    pairs: tuple[NDArray, NDArray],
+    *,
+    sigma: float = 2.0,
+) -> Rows | DofRows:
+    """As `outline_rows` by pixels, of a skin that is blended or morphs.
+
+    Parameters
+    ----------
+    pose : MorphedPose
+    rim : Rim of `pose.vertices` in this camera.
+    image : (4, M) outline of the silhouette: u, v [px], normal.
+    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
+    sigma : float [px] standard deviation of a pair.
+    """
+    if not sigma > 0:
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+    i, k = pairs
+    chosen = rim.chosen(i)
+    n, away, size = toward_tangents(chosen.on(pose.vertices), camera, image[:, k])
+    share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
+    return morphed_rows(pose, chosen.vertices, n, away, share=share, sigma=sigma / size)
+
+
+def toward_tangents(x_world: NDArray, camera: Camera, image: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Which way points (N, 3) [m] must move for their pixels to lie on the tangents of an outline (4, N).
+
+    Returns
+    -------
+    direction : (N, 3) unit, in the world, along which the pixel moves fastest across the tangent.
+    residual : (N,) [m] how far; size : (N,) [px/m] how fast.
+    """
+    u, v, a, b = image
+    pixel, J = camera.project_with_jacobian(x_world)
+    slope = a[:, None] * J[:, 0] + b[:, None] * J[:, 1]
+    size = np.maximum(np.linalg.norm(slope, axis=1), 1e-12)
+    return slope / size[:, None], (a * (u - pixel[:, 0]) + b * (v - pixel[:, 1])) / size, size

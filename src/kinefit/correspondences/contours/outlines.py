@@ -1,0 +1,93 @@
+"""Outline to outline: rim points of the body towards the contour of its silhouette (P1 2.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState
+from kinefit.correspondences import _kernels
+from kinefit.correspondences.contours import _kernels_outlines as kernels
+from kinefit.correspondences.contours.rims import Rim
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.geometry.lines import line_along
+from kinefit.rows import Rows
+
+
+def outline_pairs(
+    rim: NDArray, image: NDArray, *, reach: float, angle: float = 1.0, both: bool = True
+) -> tuple[NDArray, NDArray]:
+    """Points of two outlines (4, N) and (4, M) that belong together: indices (K,) of the first and of the second.
+
+    Each point of the body's rim gets the nearest point of the image's outline that looks the same way; with `both`,
+    each point of the image's the nearest of the rim too: that draws parts of the body to where the image shows
+    something that nothing explains.
+
+    Parameters
+    ----------
+    reach : float [px] beyond which no points are paired.
+    angle : float [rad] beyond which two normals do not look the same way.
+    """
+    to_image = np.empty(rim.shape[1], np.int64)
+    to_model = np.empty((2, image.shape[1]))
+    kernels.match(rim, image, reach, np.cos(angle), to_image, to_model)
+    first = np.flatnonzero(to_image >= 0)
+    pairs = [(first, to_image[first])]
+    if both:
+        second = np.flatnonzero(to_model[0] >= 0)
+        pairs.append((to_model[0, second].astype(np.int64), second))
+    i, k = (np.concatenate(side) for side in zip(*pairs))
+    return i, k
+
+
+def outline_rows(
+    body: Body,
+    state: BodyState,
+    rim: Rim,
+    vertices_world: NDArray,
+    camera: Camera,
+    image: NDArray,
+    pairs: tuple[NDArray, NDArray],
+    *,
+    sigma: float = 2.0,
+    by: str = "pixels",
+) -> Rows:
+    """Rows that draw the rim of a body onto the outline of its silhouette.
+
+    By "pixels", one row a pair: the rim point's pixel should lie on the tangent of the outline, so that outlines glide
+    along each other. By "rays", two rows a pair: the rim point should lie on the ray of the outline's point (P1's
+    constraint). The rows of one pair bear its number as their measurement id.
+
+    Parameters
+    ----------
+    rim : Rim of the body at this state in this camera.
+    vertices_world : (V, 3) [m] of the mesh at this state.
+    camera : Camera, of the image's size.
+    image : (4, M) outline of the silhouette: u, v [px], normal.
+    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
+    sigma : float [px] standard deviation of a pair.
+    """
+    if by not in ("pixels", "rays"):
+        raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')
+    if not sigma > 0:
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+    i, k = pairs
+    count = len(i)
+    data, segment, group = _kernels.buffers(2 * count)
+    if by == "pixels":
+        used = kernels.tangent_rows(
+            camera.packed, np.ascontiguousarray(vertices_world), rim.vertices, rim.share, rim.segment, image, i, k,
+            1.0 / sigma**2, data, segment, group,
+        )  # fmt: skip
+        return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])
+    frames, _ = body.tree.forward(state.T_world_root, state.angles)
+    owner, points = rim.segment[i], rim.chosen(i).on(vertices_world)
+    f = frames[owner]
+    rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), points - f[:, 9:]))
+    rays = line_along(camera.centre_world, camera.ray(image[:2, k].T))
+    focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    depth = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+    weight = np.where(depth > 0.0, (focal / (depth * sigma)) ** 2, 0.0)
+    used = _kernels.ray_rows(frames, owner, rest, rays, weight, data, segment, group, 0)
+    return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])

@@ -1,0 +1,212 @@
+"""The outline of a body as a camera would see it: rim points of its mesh, by a virtual image (P1 2.3).
+
+A rim point lies on an edge between a triangle that looks at the camera and one that does not. The virtual image, depth
+and triangle of every pixel, tells whether it is seen, and what is behind it: nothing, or another part of the body.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.correspondences.contours import _kernels_outlines as kernels
+from kinefit.geometry.camera import Camera
+from kinefit.rendering import Canvas, Raster
+
+_ROOM = 20000  # rim points of one image, at most
+_NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
+_APART = 0.03  # [m] depth behind a rim from which it is the outline of one part before another, and no crease
+_OTHER = -2  # in an image of triangles, where there are those of another body
+_MARGIN = 4.0  # [px] of a window about the body
+_CELL = 32  # [px] by which windows grow, so that few canvases serve all of them
+
+
+class Window(NamedTuple):
+    """A part of a camera's image, drawn at another size: pixel i of it is at (i + 0.5) / scale - 0.5 + left.
+
+    Parameters
+    ----------
+    left, top : float [px] of the camera's image
+    size : (width, height) [px] of the window's own
+    scale : float [px] of the window in one of the camera's
+    """
+
+    left: float
+    top: float
+    size: tuple[int, int]
+    scale: float
+
+    @classmethod
+    def about(cls, uv: NDArray, camera: Camera, longest: int) -> Window:
+        """About points (N, 2) [px] of a camera's image, at most `longest` [px] and a margin wide."""
+        (left, top, right, bottom), (width, height) = kernels.bounds(uv), camera.size
+        left, right = min(max(left, 0.0), width - 1.0), min(max(right, 0.0), width - 1.0)
+        top, bottom = min(max(top, 0.0), height - 1.0), min(max(bottom, 0.0), height - 1.0)
+        scale = min(longest / max(right - left, bottom - top, 1.0), 1.0)
+        margin = math.ceil(_MARGIN / scale)
+        wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
+        size = math.ceil(wide / _CELL) * _CELL, math.ceil(high / _CELL) * _CELL
+        return cls(float(math.floor(left - margin)), float(math.floor(top - margin)), size, scale)
+
+
+class Triangles(Protocol):
+    """A mesh whose faces have segments."""
+
+    @property
+    def faces(self) -> NDArray:
+        """(T, 3) int."""
+        ...
+
+    @property
+    def face_segment(self) -> NDArray:
+        """(T,) int."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """Outline of a body in one camera, N points.
+
+    Parameters
+    ----------
+    outline : (4, N) u, v [px] and the unit normal (a, b), away from the body.
+    vertices : (N, 2) int, ends of the mesh's edge that each point lies on.
+    share : (N,) of the second end.
+    segment : (N,) int
+    inner : (N,) bool, outline of one part of the body before another: a silhouette does not show it.
+    """
+
+    outline: NDArray
+    vertices: NDArray
+    share: NDArray
+    segment: NDArray
+    inner: NDArray
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    def on(self, vertices: NDArray) -> NDArray:
+        """(N, 3) [m] the points on vertices (V, 3) of the mesh, wherever these are: in the world, or at rest."""
+        s = self.share[:, None]
+        return np.asarray((1.0 - s) * vertices[self.vertices[:, 0]] + s * vertices[self.vertices[:, 1]])
+
+    def chosen(self, which: NDArray) -> Rim:
+        """Some of the points."""
+        return Rim(
+            np.ascontiguousarray(self.outline[:, which]), self.vertices[which], self.share[which], self.segment[which],
+            self.inner[which],
+        )  # fmt: skip
+
+
+class RimFinder:
+    """Room and tables to find the rims of one mesh again and again.
+
+    Parameters
+    ----------
+    mesh : its faces (T, 3), outward counter-clockwise, with their segments (T,); the vertices come with every call.
+    like : RimFinder of the same mesh, whose tables are shared: finders that work side by side need room each.
+    """
+
+    def __init__(self, mesh: Triangles, like: RimFinder | None = None) -> None:
+        if like is not None:
+            self.__dict__["_edges"] = like._edges
+        self.faces = np.ascontiguousarray(mesh.faces, np.int32)
+        self.face_segment = np.ascontiguousarray(mesh.face_segment, np.int64)
+        self._front = np.empty(len(self.faces), np.int8)
+        self._out, self._place = np.empty((4, _ROOM)), np.empty((_ROOM, 2))
+        self._kind = np.empty(_ROOM, np.int8)
+        self._canvases: dict[tuple[int, int], Canvas] = {}
+        self._last: tuple[Camera, NDArray, Raster, Window] | None = None
+        #: the part of the image that was drawn last, moved with the body since then
+        self.window = Window(0.0, 0.0, (0, 0), 1.0)
+
+    @cached_property
+    def _edges(self) -> tuple[NDArray, NDArray]:
+        """Edges (E, 2) and the faces on their sides (E, 2), -1 for none."""
+        ends = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2).reshape(-1, 2)
+        owner = np.repeat(np.arange(len(self.faces)), 3)
+        order = np.lexsort((owner, ends.max(axis=1), ends.min(axis=1)))
+        pairs, owner = np.sort(ends, axis=1)[order], owner[order]
+        first = np.flatnonzero(np.any(np.diff(pairs, axis=0, prepend=-1), axis=1))
+        second = np.append(first[1:], len(pairs)) - 1  # a third face on one edge is beyond what a surface has
+        other = np.where(second > first, owner[second], -1)
+        return np.ascontiguousarray(pairs[first]), np.stack([owner[first], other], axis=1)
+
+    def drawn(self, camera: Camera) -> NDArray:
+        """(H, W) int32 triangle of every pixel of a camera of this size, -1 for none, as it was drawn last."""
+        return self._canvases[camera.size].face
+
+    @property
+    def face(self) -> NDArray:
+        """(h, w) int32 triangle of every pixel of the window that was drawn last, -1 for none."""
+        assert self._last is not None
+        return self._last[2].face
+
+    @property
+    def depth(self) -> NDArray:
+        """(h, w) float32 [m] along the optical axis, of the same window, inf for none."""
+        assert self._last is not None
+        return self._last[2].depth
+
+    def find(
+        self, vertices_world: NDArray, camera: Camera, *, spacing: float = 3.0, inner: bool = True, stale: float = 0.0,
+        close: int | None = None, others: Sequence[tuple[NDArray, NDArray]] = (),
+    ) -> Rim:  # fmt: skip
+        """Rim points about `spacing` [px] apart of the mesh's vertices (V, 3) [m] in the world.
+
+        Parameters
+        ----------
+        inner : whether outlines of one part before another are wanted, which silhouettes do not show.
+        stale : float [px]
+            The last virtual image of this camera serves again where no vertex has moved farther since it was drawn;
+            with `close`, than all of them together.
+        close : int [px], optional
+            Only the part of the image that the body fills is drawn, so many pixels wide at most; see `window`.
+        others : vertices (W, 3) [m] in the world and faces (U, 3) of other bodies
+            The body is not seen behind them, has no outline beside them, and the virtual image has -2 where they are.
+        """
+        x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
+        kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
+        last, moved = self._last, np.inf
+        if last is not None and last[0] is camera and stale > 0.0:
+            du, dv, moved = kernels.shift(uv, last[1], close is not None)
+        if last is not None and moved <= stale:
+            drawn, w = last[2], last[3]._replace(left=last[3].left + du, top=last[3].top + dv)
+            self.window = w
+        else:
+            w = Window(0.0, 0.0, camera.size, 1.0) if close is None else Window.about(uv, camera, close)
+            if w.size not in self._canvases:
+                self._canvases[w.size] = Canvas(w.size)
+            canvas = self._canvases[w.size]
+            fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
+            cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
+            drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
+            for vertices, faces in others:
+                there = np.empty((len(vertices), 3))
+                kernels.seen(camera.packed, np.ascontiguousarray(vertices), there, np.empty((len(vertices), 2)))
+                other = Canvas(w.size).draw(there, np.ascontiguousarray(faces, np.int32), fx, fy, cx, cy, cull=True)
+                drawn.face[(other.face >= 0) & (other.depth < drawn.depth)] = _OTHER
+            self._last = camera, uv, drawn, w
+            self.window = w
+        if close is not None:
+            uv = (uv + (0.5 - w.left, 0.5 - w.top)) * w.scale - 0.5
+        edges, sides = self._edges
+        n = kernels.rims(
+            x, uv, self.faces, self.face_segment, edges, sides, drawn.depth, drawn.face, spacing, _NEAR, _APART,
+            inner, self._front, self._out, self._place, self._kind,
+        )  # fmt: skip
+        number = self._place[:n, 0].astype(np.int64)
+        own = np.where(self._front[sides[number, 0]] == 1, sides[number, 0], sides[number, 1])
+        outline = self._out[:, :n].copy()
+        if close is not None:
+            outline[:2] = (outline[:2] + 0.5) / w.scale - 0.5 + np.array([[w.left], [w.top]])
+        return Rim(
+            outline, edges[number].astype(np.int64), self._place[:n, 1].copy(), self.face_segment[own],
+            self._kind[:n] == kernels.INNER,
+        )  # fmt: skip

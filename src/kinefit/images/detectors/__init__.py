@@ -1,0 +1,1 @@
+"""Detection of people in images: networks, regions of interest, people over time, skin."""

@@ -1,0 +1,132 @@
+"""The two networks of the built-in detector, run by LiteRT on the processor (extra `detect`)."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.errors import FileError, ObservationError
+from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetector
+from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel
+
+DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
+_REMEDY = "Delete its folder; it is then fetched again."
+
+
+class Models:
+    """Networks that find people in a picture and their landmarks in a region; not to be shared between threads.
+
+    Parameters
+    ----------
+    folder : path
+        With the two files.
+    threads : int
+        That each network runs on; the answers are the same.
+
+    Raises
+    ------
+    ObservationError
+        The extra `detect` is not installed.
+    FileError
+        A file is missing or not a network.
+    """
+
+    def __init__(self, folder: str | PathLike[str], threads: int = 1) -> None:
+        self._landmarks, self._threads = Path(folder) / LANDMARKS, threads
+        self._points = PoseModel(_interpreter(self._landmarks, threads, without=MASK))
+        self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR, threads))
+
+    @cached_property
+    def _outlines(self) -> PoseModel:
+        return PoseModel(_interpreter(self._landmarks, self._threads))
+
+    def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
+        """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
+        return (self._outlines if mask else self._points)(crop)
+
+    def find_people(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
+        """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""
+        return self._detect(image)
+
+    def search(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
+        """Those who are small or lie, the surest first: in parts of the picture, or in the picture turned by quarters.
+
+        There is more in a picture that looks like a person when it is looked at so closely.
+        """
+        people = []
+        for u, v, side in squares(image.shape[1], image.shape[0]):
+            part = self._detect(image[v : v + side, u : u + side])
+            people += [replace(person, points=person.points + [u, v]) for person in part]
+        for quarters in () if people else (1, 3, 2):
+            turned = self._detect(np.ascontiguousarray(np.rot90(image, quarters)))
+            people += [person.turned_back(quarters, image.shape[:2]) for person in turned]
+        return sorted(people, key=lambda person: -person.score)
+
+
+def squares(width: int, height: int) -> list[tuple[int, int, int]]:
+    """Squares (left, top, side) [px] as high as the picture's shorter side and half of it, each half over the next."""
+    found = []
+    for side in (min(width, height), min(width, height) // 2):
+        lefts, tops = (np.linspace(0, n - side, max(round(2 * n / side) - 1, 1)).astype(int) for n in (width, height))
+        found += [(int(u), int(v), side) for v in tops for u in lefts if side < max(width, height) and side > 0]
+    return found
+
+
+def check_runtime() -> None:
+    """Raise ObservationError where the extra `detect` is not installed."""
+    _runtime()
+
+
+def _runtime() -> Any:
+    try:
+        from ai_edge_litert.interpreter import Interpreter
+    except ImportError as error:
+        raise ObservationError(
+            f"the runtime of the built-in detector is not installed ({error})",
+            remedy="Run: pip install 'kinefit[detect]'.",
+        ) from error
+    return Interpreter
+
+
+def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
+    """A network, ready to run; `without` the output of a shape, and what makes it alone."""
+    runtime = _runtime()
+    if not path.is_file():
+        raise FileError("no such network", file=path, remedy=_REMEDY)
+    try:
+        given = {"model_content": _reduced(path, without)} if without else {"model_path": str(path)}
+        interpreter = runtime(**given, num_threads=threads)
+        interpreter.allocate_tensors()
+    except (ValueError, RuntimeError, TypeError, LookupError, AttributeError, struct.error) as error:
+        raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=_REMEDY) from error
+    return interpreter
+
+
+@lru_cache(maxsize=2)
+def _reduced(path: Path, without: tuple[int, ...]) -> bytes:
+    """A network's file without one of its outputs, told by its shape: its other answers are the same, bit for bit."""
+    import flatbuffers
+    from ai_edge_litert import schema_py_generated as schema
+
+    content = path.read_bytes()
+    if not schema.Model.ModelBufferHasIdentifier(content, 0):
+        raise ValueError("it is no file of TensorFlow Lite")
+    model = schema.ModelT.InitFromObj(schema.Model.GetRootAs(content, 0))
+    graph = model.subgraphs[0]
+    graph.outputs = [k for k in graph.outputs if tuple(graph.tensors[k].shape) != without]
+    needed, kept = set(graph.outputs), []
+    for operator in reversed(graph.operators):
+        if needed.intersection(operator.outputs):
+            kept.append(operator)
+            needed.update(operator.inputs)
+    graph.operators = kept[::-1]
+    builder = flatbuffers.Builder(len(content))
+    builder.Finish(model.Pack(builder), b"TFL3")
+    return bytes(builder.Output())

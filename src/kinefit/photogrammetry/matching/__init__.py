@@ -1,0 +1,1 @@
+"""Matching of image patches: correlation, least squares in many images, noise."""

@@ -1,0 +1,104 @@
+"""Matching in several images at once, kept on the cameras' rays: the geometrically constrained form.
+
+A. Gruen and E. Baltsavias, Geometrically constrained multiphoto matching (1988). The unknowns of a point are its
+distance along the template's ray, and an affine map, a gain and an offset for each other image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Rig
+from kinefit.photogrammetry.least_squares_matching import STEPS, TOLERANCE, WINDOW, halves_of, places
+from kinefit.photogrammetry.matching import _kernels_matching as matching
+from kinefit.photogrammetry.matching import _kernels_multi_image as kernels
+from kinefit.photogrammetry.spline_image import SplineImage
+
+
+@dataclass(frozen=True, eq=False)
+class RayMatches:
+    """Windows of the first camera's image, found along their rays.
+
+    Parameters
+    ----------
+    x_world : (N, 3) [m]
+    rays : (N, 3) unit directions in the world
+    distance : (N,) [m] along the ray, from the first camera's centre
+    variance : (N,) [m²] of the distance
+    correlation : (N,) mean over the images
+    parallax : (N,) [px] RMS by which the images alone would leave the rays
+    used : (N, C - 1) which images took part
+    iterations, status : (N,) int, as in `Matches`
+    """
+
+    x_world: NDArray
+    rays: NDArray
+    distance: NDArray
+    variance: NDArray
+    correlation: NDArray
+    parallax: NDArray
+    used: NDArray
+    iterations: NDArray
+    status: NDArray
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """(N,) which points were found."""
+        return self.status == matching.FOUND
+
+
+def match_along_rays(
+    rig: Rig,
+    images: Sequence[SplineImage],
+    points: ArrayLike,
+    distance: ArrayLike,
+    deformation: ArrayLike,
+    *,
+    window: int | ArrayLike = WINDOW,
+    steps: int = STEPS,
+    tolerance: float = TOLERANCE,
+) -> RayMatches:
+    """Find windows of the first camera's image in all others at once.
+
+    Parameters
+    ----------
+    rig, images : C cameras, and the image of each, in the size of its calibration
+    points : (N, 2) [px] centres of the windows in the first image
+    distance : (N,) [m] along their rays to start with, right to about two pixels; NaN leaves a point out
+    deformation : (N, C - 1, 2, 2) of the window into each other image, to start with; NaN leaves that image out
+    window, steps, tolerance : as in `match`; the side of all windows or of each
+    """
+    at, start = places(points), np.array(distance, float)
+    maps = np.array(deformation, float)
+    count = len(rig) - 1
+    if start.shape != (len(at),) or maps.shape != (len(at), count, 2, 2) or count < 1 or len(images) != count + 1:
+        problem = f"{len(at)} points, distances {start.shape}, deformations {maps.shape}, {len(images)} images"
+        raise ObservationError(problem, remedy="Give (N,), (N, C - 1, 2, 2) and C images.")
+    halves = halves_of(window, len(at))
+    height, width = (max(image.size[k] for image in images[1:]) for k in (1, 0))
+    stack, sizes = np.zeros((count, height, width), np.float32), np.zeros((count, 2), np.int64)
+    for k, image in enumerate(images[1:]):
+        sizes[k] = image.size[::-1]
+        stack[k, : sizes[k, 0], : sizes[k, 1]] = image.coefficients
+    first = rig.cameras[0]
+    rays, origin = np.ascontiguousarray(first.ray(at)), np.ascontiguousarray(first.centre_world)
+    out, each = np.empty((len(at), kernels.COLUMNS)), np.empty((len(at), count, matching.ROW))
+    starts = np.concatenate([start[:, None], maps.reshape(len(at), -1)], axis=1)
+    noise = np.mean([image.noise**2 for image in images[1:]])
+    kernels.match_rays(
+        images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, steps, tolerance,
+        float(images[0].noise**2 / (images[0].noise**2 + noise)), float(images[0].noise**2), out, each,
+    )  # fmt: skip
+    status = out[:, kernels.STATE].astype(np.int64)
+    good = status == matching.FOUND
+    told = np.where(good[:, None], out, np.nan)
+    return RayMatches(
+        origin + told[:, :1] * rays, rays, told[:, kernels.DISTANCE], told[:, kernels.VARIANCE],
+        told[:, kernels.SIMILARITY], told[:, kernels.PARALLAX], each[:, :, matching.STATUS] == matching.FOUND,
+        np.nan_to_num(out[:, kernels.STEPS]).astype(np.int64), status,
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Seeds of region growing, found without help."""

@@ -1,0 +1,129 @@
+"""Grids matched without seeds: these are found along lines of sight, in boxes, or from features."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.photogrammetry.least_squares_matching import Matches
+from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
+from kinefit.photogrammetry.seeding.ray_seeds import TEXTURE, WINDOW, ray_seeds
+from kinefit.photogrammetry.seeding.seeds import sift_seeds
+from kinefit.photogrammetry.spline_image import SplineImage
+
+_PLACES = 200  # of a grid, at which seeds are sought in a round
+_ROUNDS = 6
+_SHARE = 0.01  # of the grid that a round adds if there is to be another
+_FEWEST = 5  # seeds of the first round, below which features are asked instead
+_MOVED = 40  # places that are sought in a later image
+_REACH = 30  # [px] by which a surface moves between images that need no features
+_ALIKE, _UNIQUE = 0.8, 0.85  # least correlation there; the runner-up's share of it
+_FOUND = 0.3  # of the places sought, below which features are asked instead
+
+
+def grow_between(
+    first: SplineImage, second: SplineImage, cameras: tuple[Camera, Camera], grid: Grid, *,
+    window: int | ArrayLike, least: float,
+) -> Matches:  # fmt: skip
+    """Match a grid of one camera's image in another's of the same time.
+
+    Places of the grid are sought along their lines of sight; then some of those to which nothing grew, so that surfaces
+    apart from each other get seeds of their own. SIFT features are asked where lines of sight tell too little.
+    """
+    rng, out = np.random.default_rng(0), None
+    textured = grid.inside & _textured(first, grid.points)
+    for _ in range(_ROUNDS):
+        left = np.flatnonzero(textured if out is None else textured & ~out.found)
+        seeds, _ = ray_seeds(first, second, cameras, grid.points[rng.permutation(left)[:_PLACES]])
+        if out is None and len(seeds.first) < _FEWEST:
+            seeds = sift_seeds(first, second, cameras)
+            return _agreeing(grid, grow(first, second, grid, seeds, window=window, least=least))
+        more = _agreeing(grid, grow(first, second, _without(grid, out), seeds, window=window, least=least))
+        out = more if out is None else out.or_else(more)
+        if more.found.sum() < _SHARE * textured.sum():
+            break
+    assert out is not None
+    return out
+
+
+def grow_over_time(
+    first: SplineImage, second: SplineImage, grid: Grid, *, window: int | ArrayLike, least: float
+) -> Matches:
+    """Match a grid of one image in a later one: from near where it was, or from features if it went far.
+
+    Raises
+    ------
+    ObservationError
+        A grid without places.
+    """
+    places = grid.points[grid.inside]
+    if not len(places):
+        raise ObservationError("the surface is lost", remedy="Take more images between, or leave this one out.")
+    spots = places[np.random.default_rng(0).permutation(len(places))[:_MOVED]]
+    told = search_box(first, second, spots, reach=_REACH, window=WINDOW)
+    good = (told.best >= _ALIKE) & (told.runner_up < _UNIQUE * told.best)
+    if good.sum() >= _FOUND * len(spots):
+        seeds = Seeds(spots[good], told.uv[good], np.tile(np.eye(2), (int(good.sum()), 1, 1)))
+    else:
+        seeds = sift_seeds(first, second)
+        seeds = seeds if len(seeds.first) else Seeds.of(spots, spots)
+    return _agreeing(grid, grow(first, second, grid, seeds, window=window, least=least))
+
+
+def grow_through(
+    first: SplineImage, middle: SplineImage, second: SplineImage, cameras: tuple[Camera, Camera], grid: Grid,
+    own: Matches, *, window: int | ArrayLike, least: float,
+) -> Matches:  # fmt: skip
+    """Match a grid of an earlier image in another camera's later one, by way of the own camera's later image.
+
+    Parameters
+    ----------
+    first, middle : images of one camera, earlier and later
+    second : of the other camera, at the time of `middle`
+    cameras : of `middle` and `second`
+    own : the grid in `middle`
+    """
+    spots = np.flatnonzero(own.found)
+    spots = np.random.default_rng(0).permutation(spots)[:_MOVED]
+    seeds, index = ray_seeds(middle, second, cameras, own.uv[spots])
+    if len(index) >= _FOUND * len(spots):
+        spots = spots[index]
+        goal = seeds.second + np.einsum("nij,nj->ni", seeds.deformation, own.uv[spots] - seeds.first)
+        seeds = Seeds(grid.points[spots], goal, seeds.deformation @ own.deformation[spots])
+        return _agreeing(grid, grow(first, second, grid, seeds, window=window, least=least))
+    return grow_over_time(first, second, grid, window=window, least=least)
+
+
+def _textured(image: SplineImage, points: NDArray) -> NDArray[np.bool_]:
+    """(N,) whether the grey values about points (N, 2) [px] scatter by more than noise; False of NaN."""
+    mean, square = (cv2.blur(values, (WINDOW, WINDOW)) for values in (image.grey, image.grey**2))
+    at = np.nan_to_num(np.rint(points)).astype(int)
+    scatter = (square - mean**2)[at[:, 1], at[:, 0]]
+    return np.isfinite(points).all(axis=1) & (scatter > (TEXTURE * image.noise) ** 2)
+
+
+def _agreeing(grid: Grid, found: Matches) -> Matches:
+    """Without points that are not where most of their neighbours' maps put them, or have no neighbours: wrong seeds."""
+    points, uv, maps = (v.reshape(-1, grid.columns, *v.shape[1:]) for v in (grid.points, found.uv, found.deformation))
+    there, agree = np.zeros(points.shape[:2]), np.zeros(points.shape[:2])
+    one, two, everything = slice(1, None), slice(None, -1), slice(None)
+    for here, beside in (
+        ((one, everything), (two, everything)), ((two, everything), (one, everything)),
+        ((everything, one), (everything, two)), ((everything, two), (everything, one)),
+    ):  # fmt: skip
+        told = uv[beside] + np.einsum("ijkl,ijl->ijk", maps[beside], points[here] - points[beside])
+        off = np.linalg.norm(uv[here] - told, axis=2)
+        there[here] += np.isfinite(off)
+        agree[here] += off <= grid.step / 2
+    return found.only((2 * agree >= np.maximum(there, 1)).ravel())
+
+
+def _without(grid: Grid, found: Matches | None) -> Grid:
+    """A grid without the places that are found."""
+    return grid if found is None else replace(grid, points=np.where(found.found[:, None], np.nan, grid.points))

@@ -1,0 +1,1 @@
+"""Images that sensors would have taken of a known motion."""

@@ -1,0 +1,65 @@
+"""Grey images of a moving body with a fine texture that sticks to it, as photogrammetry needs it."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit._arguments import checked
+from kinefit.errors import ObservationError
+from kinefit.geometry.camera import Camera
+from kinefit.rendering import scaled
+from kinefit.simulation.rendering.scenes import SimulatedScene
+
+_CELLS = 64  # of the texture's lattice, after which it repeats
+_SAMPLES = 2  # rays along each side of a pixel
+_GREY, _CONTRAST, _GROUND = 120.0, 45.0, 50.0
+
+
+@checked
+def textured_picture(
+    scene: SimulatedScene, frame: int, camera: Camera, *, grain: float = 0.003, noise: float = 2.0, seed: int = 0
+) -> NDArray:
+    """Image (H, W), 8 bit grey, of one frame of a scene; the texture is a smooth function of the place on the body.
+
+    Parameters
+    ----------
+    grain : float [m]
+        Distance of the lattice points between which the texture is interpolated.
+    noise : float
+        Standard deviation of a grey value.
+    seed : int
+        Of the noise, together with the frame and the camera's name.
+    """
+    if not (0 < grain < 1 and 0 <= noise < np.inf):
+        problem = f"a grain of {grain} m, noise of {noise}"
+        raise ObservationError(problem, remedy="Give metres, and noise of zero or more.")
+    view = scene.view(frame, scaled(camera, _SAMPLES))
+    seen, segment = view.raster.seen, view.raster.segment
+    fine = np.full(seen.shape, _GROUND, np.float32)
+    x = view.x_rest[seen] / grain + 17.0 * segment[seen][:, None]  # every segment has its own
+    fine[seen] = _GREY + _CONTRAST * _lattice(x)
+    image = cv2.resize(fine, camera.size, interpolation=cv2.INTER_AREA)
+    random = np.random.default_rng([seed, frame, *camera.name.encode()])
+    return np.clip(np.rint(image + noise * random.standard_normal(image.shape)), 0, 255).astype(np.uint8)
+
+
+@cache
+def _table() -> NDArray:
+    """(n, n, n) values, mean 0 and deviation 1."""
+    return np.random.default_rng(31).standard_normal((_CELLS,) * 3).astype(np.float32)
+
+
+def _lattice(x: NDArray) -> NDArray:
+    """(N,) smooth random function at places (N, 3) in cells: trilinear with smooth steps."""
+    low = np.floor(x).astype(np.int64)
+    t = x - low
+    t = t * t * (3.0 - 2.0 * t)
+    out, table = np.zeros(len(x)), _table()
+    for corner in np.ndindex(2, 2, 2):
+        i, j, k = ((low[:, a] + corner[a]) % _CELLS for a in range(3))
+        out += table[i, j, k] * np.prod(np.where(corner, t, 1.0 - t), axis=1)
+    return out

@@ -1,0 +1,156 @@
+"""A body's shape as parameters, lengths and places of a detector's points, and the equations of pixels in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
+from kinefit.geometry.camera import Rig
+from kinefit.losses import SQUARED, Loss
+from kinefit.solvers.bundle import _kernels_shape
+
+_MIDDLE = 0.002  # [m] spread of a point in the middle to either side
+PROPORTIONS = 0.05
+"""How far one length departs from the person's size, as a share.
+
+In the 1988 anthropometric survey of U.S. Army personnel (C. Gordon et al., 1989; J. Cheverud et al., 1990) segment
+lengths vary by 4 to 6 % and correlate with stature by 0.5 to 0.9, which leaves 2 to 4 %; and a detector's points are
+not quite the body's.
+"""
+_UNKNOWN_SIZE, _KNOWN_SIZE = 0.2, 0.02  # one standard deviation of a person's size, as a share; shoes, posture, a guess
+
+
+@dataclass(frozen=True, eq=False)
+class PixelFrames:
+    """Pixels of N measurements over F frames.
+
+    Parameters
+    ----------
+    points : PointSet of K points on the body (before scaling and shifts).
+    camera : (N,) int, index in the rig.
+    column : (N,) int, which of the K points.
+    uv : (F, N, 2) [px]
+    weight : (F, N) [1/px²], 0 where unseen.
+    share : (N,) in 0..1, optional
+        How much of a measurement counts beyond the loss: below 1 for points whose errors come together.
+    """
+
+    points: PointSet
+    camera: NDArray
+    column: NDArray
+    uv: NDArray
+    weight: NDArray
+    share: NDArray | None = None
+
+    @property
+    def shares(self) -> NDArray:
+        """(N,) the share, 1 by default."""
+        return np.ones(len(self.column)) if self.share is None else self.share
+
+
+@lru_cache(maxsize=32)  # every kind of parameters asks again
+def mirror_points(points: PointSet, segments: tuple[str, ...]) -> tuple[NDArray, NDArray]:
+    """For each point the one whose shift it shares, and ±1 for the sign of z: left and right are alike.
+
+    A point's image is the one on the mirrored segment at the mirrored place; a point in the middle is its own, sign 0.
+    """
+    lead, sign = np.arange(len(points)), np.ones(len(points))
+    names = [segments[s] for s in points.segments]
+    for k in range(len(points)):
+        flipped = points.points[k] * (1.0, 1.0, -1.0)
+        other = names[k][:-2] + "_r" if names[k].endswith("_l") else names[k]
+        same = [
+            j for j in range(len(points)) if names[j] == other and np.allclose(points.points[j], flipped, atol=1e-6)
+        ]
+        if same and abs(points.points[k, 2]) < 1e-9 and names[k] == other and not names[k].endswith("_r"):
+            sign[k] = 0.0
+        elif same and (names[k].endswith("_l") or points.points[k, 2] < -1e-9) and not names[k].endswith("_r"):
+            rank = sum(1 for j in range(k) if names[j] == names[k] and np.allclose(points.points[j], points.points[k]))
+            lead[k], sign[k] = same[min(rank, len(same) - 1)], -1.0
+    lead.flags.writeable = sign.flags.writeable = False
+    return lead, sign
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeParameters:
+    """What a shape consists of: scales (G,), then three shifts for each point that leads its mirror images."""
+
+    body: Body
+    points: PointSet
+    shift: NDArray  # (K,) first shift parameter of each point
+    mirror: NDArray  # (K,) ±1, sign of z
+    prior: NDArray  # (p, p) inverse covariance
+    mean: NDArray  # (p,)
+
+    def geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
+        """What `_geometry` gives; the latest is kept, for it is asked once for every frame."""
+        key = theta.tobytes()
+        if key not in self._latest:
+            self._latest.clear()
+            self._latest[key] = self._geometry(theta)
+        return self._latest[key]
+
+    @cached_property
+    def _latest(self) -> dict[bytes, tuple[KinematicTree, NDArray, NDArray]]:
+        return {}
+
+    def _geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
+        """The tree, the points (K, 3) in the root frame at rest, and their shifts (K, 3)."""
+        tree, groups = self.body.tree, len(self.body.scale_groups)
+        factor = theta[:groups][self.body.segment_scale]
+        scaled = tree.with_offsets(tree.offsets * factor[np.maximum(tree.parents, 0)][:, None])
+        shifts = theta[groups:][self.shift[:, None] + np.arange(3)]
+        shifts[:, 2] *= self.mirror
+        owner = self.points.segments
+        return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
+
+    def equations(
+        self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray, uv: NDArray,
+        weight: NDArray, *, loss: Loss = SQUARED, share: NDArray | None = None, freedom: NDArray | None = None,
+        velocity: NDArray | None = None,
+    ) -> tuple[NDArray, NDArray]:
+        """One frame's pixels as H (n + p, n + p; lower triangle) and g: degrees of freedom, then shape, then cameras.
+
+        camera, column (N,) int, uv (N, 2) [px] and weight (N,) [1/px²] as in `PixelFrames`. With `freedom` (C, 10) the
+        cameras' parameters follow (see `solvers.cameras`); velocity (N, 2) [px/s] of the pixels tells of their times.
+        """
+        tree, body = self.body.tree, self.body
+        moved, rest, _ = self.geometry(theta)
+        placed, screws = moved.forward(state.T_world_root, state.angles)
+        first = tree.n_dofs + len(self.mean)
+        size = first + (0 if freedom is None else freedom.size)
+        H, g = np.zeros((size, size)), np.zeros(size)
+        _kernels_shape.frame_system(
+            tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
+            self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, camera, column, uv,
+            weight, np.ones(len(weight)) if share is None else share, placed, screws,
+            np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
+            np.empty((0, 0)) if freedom is None else freedom, -1 if freedom is None else first,
+            np.zeros(uv.shape) if velocity is None else velocity, H, g,
+        )  # fmt: skip
+        return H, g
+
+
+def shape_parameters(
+    body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float, *, whole: float | None = None
+) -> ShapeParameters:
+    """What a body's shape consists of, and its prior: one scale a group, shifts of points [m].
+
+    All scales follow the person's size: `whole` (known to 2 %), or else the middle of `scales`, loosely; each differs
+    from it by the share `scale_sigma`. So a length that nothing measures goes with those that something does.
+    """
+    lead, sign = mirror_points(points, body.tree.segments)
+    leaders = np.unique(lead)
+    shift = 3 * np.searchsorted(leaders, lead)
+    groups, size = len(scales), float(np.median(scales)) if whole is None else whole
+    common = (_UNKNOWN_SIZE if whole is None else _KNOWN_SIZE) * size
+    prior = np.diag(np.full(groups + 3 * len(leaders), shift_sigma**-2))
+    middle = groups + shift[sign == 0.0] + 2
+    prior[middle, middle] = _MIDDLE**-2
+    prior[:groups, :groups] = np.linalg.inv(np.eye(groups) * (scale_sigma * size) ** 2 + common**2)
+    mean = np.concatenate([np.full(groups, size), np.zeros(3 * len(leaders))])
+    return ShapeParameters(body, points, shift, np.where(sign == 0.0, 1.0, sign), prior, mean)

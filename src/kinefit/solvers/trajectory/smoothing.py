@@ -1,0 +1,273 @@
+"""Whole-take smoothing: all frames in one sparse least-squares problem, with a prior on how motion changes.
+
+With v_s the step from frame s to s + 1 of every degree of freedom (the root's turn as a rotation vector in the world),
+the prior says that r_s = v_s − (κ + λ) v_{s−1} + κ λ v_{s−2} is new and random in every frame: an acceleration that
+forgets itself by λ a frame drives a velocity that forgets itself by κ a frame (Singer 1970; Särkkä & Svensson, Bayesian
+Filtering and Smoothing, 2023). Frames couple to the next three; the system is solved by Levenberg-Marquardt with a
+block band Cholesky factor, and covariances are blocks of its inverse (Takahashi et al. 1973).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.bodies import Body
+from kinefit.errors import ObservationError
+from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
+from kinefit.solvers.equations import dense_pattern
+from kinefit.solvers.trajectory import _kernels_band, _kernels_smoothing
+from kinefit.solvers.trajectory.marginal import Entering, start_of
+from kinefit.solvers.trajectory.motion_prior import MotionPrior
+
+_NEVER = 1e12  # of damping, beyond which no step is small enough
+
+Equations = tuple[NDArray, NDArray, NDArray]
+MakeEquations = Callable[[NDArray, NDArray], Equations]
+
+
+@dataclass(frozen=True, eq=False)
+class _BandEquations:
+    """Normal equations, undamped; see `_kernels_band`."""
+
+    C: NDArray
+    band: NDArray
+    g: NDArray
+    cost: float
+    changes: NDArray
+    entering: Entering | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """All frames of a take, fitted together.
+
+    Parameters
+    ----------
+    roots : (T, 4, 4) [m], T_world_root; angles : (T, D) [rad or m]
+    cost : float
+    iterations : int, steps tried.
+    converged : bool
+    """
+
+    roots: NDArray
+    angles: NDArray
+    cost: float
+    iterations: int
+    converged: bool
+    prior: MotionPrior
+    system: _BandEquations
+    pattern: tuple[NDArray, NDArray]
+
+    @property
+    def changes(self) -> NDArray:
+        """(T - 1, n) r_s [m, rad] a frame²."""
+        return self.system.changes
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Covariances of a smoothed take.
+
+    Parameters
+    ----------
+    frames : (T, n, n) of every frame.
+    following : (T - 1, n, n) of frame t + 1 (lines) with frame t (columns).
+    change_variance : (T - 1, n) of every r_s.
+    log_determinant : float, of the system's matrix.
+    """
+
+    frames: NDArray
+    following: NDArray
+    change_variance: NDArray
+    log_determinant: float
+
+
+def blocks(body: Body) -> tuple[NDArray, NDArray]:
+    """First column (n,) and width (n,) of each line of a block of the prior: the root's turn is one of three."""
+    first, width = np.arange(body.tree.n_dofs), np.ones(body.tree.n_dofs, np.int64)
+    first[3:6], width[3:6] = 3, 3
+    return first, width
+
+
+def smooth(
+    body: Body,
+    roots: NDArray,
+    angles: NDArray,
+    equations: MakeEquations,
+    prior: MotionPrior,
+    *,
+    bounds: tuple[NDArray, NDArray] | None = None,
+    dense: bool = False,
+    entering: Entering | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-5,
+) -> Smoothed:
+    """Minimise every frame's cost and the prior's together.
+
+    Parameters
+    ----------
+    roots, angles : (T, 4, 4), (T, D), where to start; angles without jumps of 2π.
+    equations : (roots, angles) -> (C (T, n, m) packed as the tree has it, g (T, n), cost (T,))
+        Called anew at every state tried; its arrays are changed.
+    bounds : (T, D) lower and upper ends of every angle.
+    dense : bool
+        The equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower triangle
+        is read. So it is, made dense here, where the prior's posture is coupled.
+    entering : Entering
+        What frames before these tell of the first three, of three or more; the first two steps then have their past.
+    tolerance : stop when the predicted fall of the cost is below this share of it.
+
+    Raises
+    ------
+    ObservationError
+        The equations are not finite.
+    """
+    tree, first, width = body.tree, *blocks(body)
+    if prior.coupled and not dense:
+        equations, dense = _made_dense(body, equations), True
+    chain, depth = pattern = dense_pattern(tree.n_dofs) if dense else (tree.chain, tree.depth)
+    lower, upper = (np.array(np.broadcast_to(b, angles.shape), float) for b in bounds or (-np.inf, np.inf))
+    roots, angles = np.array(roots, float, order="C"), np.clip(np.array(angles, float, order="C"), lower, upper)
+    now = _system(body, roots, angles, equations, prior, depth, entering)
+    mean = float(now.C[:, np.arange(tree.n_dofs), depth].mean() + now.band[0, :, :, 0].mean())
+    if not np.isfinite(now.cost) or not np.isfinite(mean):
+        raise ObservationError("a take that cannot be smoothed", remedy="Are all weights and pixels finite?")
+    damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
+    W, below, delta = _workspace(len(roots), tree.n_dofs)
+    start = start_of(entering, tree.n_dofs, W.shape[1])
+    fresh, converged, tried, any_held = True, False, 0, False
+    while tried < max_iterations and not converged:
+        if fresh:
+            held = np.zeros(now.g.shape, bool)
+            held[:, 6:] = ((angles <= lower) & (now.g[:, 6:] < 0)) | ((angles >= upper) & (now.g[:, 6:] > 0))
+            held[:, :6] = not tree.root_free
+            any_held = bool(held.any())
+            if any_held:
+                _kernels_smoothing.hold(held, first, width, chain, depth, now.C, now.band, now.g)
+            if entering is not None:
+                start = start_of(entering, tree.n_dofs, W.shape[1], held[:3])
+        tried, fresh = tried + 1, False
+        delta[:, : tree.n_dofs] = now.g
+        if not _kernels_band.factor_band(now.C, chain, depth, now.band, first, width, damping, start, W, below, delta):
+            damping, growth = 100.0 * damping, 2.0
+            continue
+        _kernels_band.back_substitute(W, below, delta)
+        step = delta[:, : tree.n_dofs]
+        predicted = float(np.vdot(step, now.g) + damping * np.vdot(step, step))
+        converged = predicted <= tolerance * now.cost + nothing or damping > _NEVER * mean
+        new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
+        _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
+        new = _system(body, new_roots, new_angles, equations, prior, depth, entering)
+        damping, growth = adapt(damping, growth, now.cost - new.cost, predicted, LEAST_DAMPING * mean)
+        if new.cost < now.cost:
+            fresh, now, roots, angles = True, new, new_roots, new_angles
+    if any_held and not fresh:
+        now = _system(body, roots, angles, equations, prior, depth, entering)  # with what was held
+    return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
+
+
+def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
+    def dense(roots: NDArray, angles: NDArray) -> Equations:
+        packed, g, cost = equations(roots, angles)
+        C = np.zeros((*g.shape, g.shape[1]))
+        _kernels_smoothing.add_packed(packed, body.tree.chain, body.tree.depth, C)
+        return C, g, cost
+
+    return dense
+
+
+def _workspace(T: int, n: int) -> tuple[NDArray, NDArray, NDArray]:
+    p = 4 * -(-n // 4)
+    return np.empty((T, p, p)), np.empty((T, 3 * p, p)), np.zeros((T, p))
+
+
+def _system(
+    body: Body,
+    roots: NDArray,
+    angles: NDArray,
+    equations: MakeEquations,
+    prior: MotionPrior,
+    depth: NDArray,
+    entering: Entering | None = None,
+) -> _BandEquations:
+    T, n = len(roots), body.tree.n_dofs
+    C, g, cost = equations(roots, angles)
+    precision, away = prior.precision, prior.usual - angles
+    pull = away @ precision
+    _add_posture(C, precision, depth)
+    g[:, 6:] += pull
+    cost = cost + np.sum(pull * away, axis=1)
+    steps, band = np.empty((max(T - 1, 0), n)), np.zeros((4, T, n, 3))
+    _kernels_smoothing.velocities(roots, angles, steps)
+    past, weight = prior.rows(len(steps))
+    if entering is not None:
+        weight[:2] = 0.0  # in what enters already
+        cost[0] += entering.add(roots, angles, g)
+    total = float(cost.sum()) + _kernels_smoothing.add_motion(steps, past, weight, *blocks(body), band, g)
+    changes = steps.copy()
+    changes[1:] -= past[1:, :1] * steps[:-1]
+    changes[2:] -= past[2:, 1:] * steps[:-2]
+    return _BandEquations(C, band, g, total, changes, entering)
+
+
+def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | None = None) -> Posterior:
+    """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
+
+    Limits are left out, as they are of a frame's covariance. Frames before `since` are left out: they stand as NaN.
+    `share` (D, D) is the prior's `posture_share`, where it is known already.
+    """
+    s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
+    T, n = s.g.shape
+    C = s.C.copy()
+    share = prior.posture_share if share is None else share
+    _add_posture(C, share - prior.precision, depth)
+    W, below, nothing = _workspace(T, n)
+    p, tiny = W.shape[1], max(1e-12 * float(s.C[:, np.arange(n), depth].mean()), 1e-12)  # nothing measured: C is 0
+    start = start_of(s.entering, n, p, covariance=True)
+    while not _kernels_band.factor_band(C, chain, depth, s.band, *blocks(body), tiny, start, W, below, nothing):
+        tiny *= 10.0
+    frames, following = np.full((T, n, n), np.nan), np.full((max(T - 1, 0), n, n), np.nan)
+    past, _ = prior.rows(max(T - 1, 0))
+    variance = np.zeros((max(T - 1, 0), n))
+    ahead = np.zeros((4 * p, 4 * p))  # covariance of frames t .. t + 3
+    fall, cross, both, own = np.empty((3 * p, p)), np.empty((3 * p, p)), np.empty((4 * p, p)), np.empty((p, p))
+    for t in range(T - 1, since - 1, -1):
+        ahead[p:, p:] = ahead[: 3 * p, : 3 * p].copy()
+        _kernels_band.product(below[t], np.ascontiguousarray(W[t].T), fall)
+        _kernels_band.product(np.ascontiguousarray(ahead[p:, p:]), fall, cross)
+        cross *= -1.0
+        both[:p], both[p:] = W[t].T, cross
+        _kernels_band.product(np.concatenate([W[t], -fall.T], axis=1), both, own)
+        ahead[:p, :p], ahead[p:, :p], ahead[:p, p:] = 0.5 * (own + own.T), cross, cross.T
+        frames[t] = ahead[:n, :n]
+        if t + 1 < T:
+            following[t] = cross[:n, :n]
+        alone = np.einsum("aibi->abi", ahead.reshape(4, p, 4, p))[:, :, :n]
+        for change in {t + 2} | ({0, 1} if t == 0 else set()):
+            if change < T - 1:
+                variance[change] = _variance_of(past[change], min(change, 2), alone)
+    return Posterior(frames, following, variance, -2.0 * float(np.log(np.einsum("tii->ti", W)[:, :n]).sum()))
+
+
+def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
+    """Add a weight (D, D) of angles to every block of C, as far as the pattern goes: dense where it is coupled."""
+    n = len(depth)
+    if C.shape[2] == n:
+        C[:, 6:, 6:] += weight
+    else:
+        C[:, np.arange(6, n), depth[6:]] += np.diag(weight)
+
+
+def _variance_of(past: NDArray, back: int, alone: NDArray) -> NDArray:
+    """Variance (n,) of r from covariances (4, 4, n) of each degree of freedom; turns of the root taken for small."""
+    newest = 1 + back
+    part = np.zeros(4)
+    part[newest], part[newest - 1] = 1.0, -1.0
+    for i in range(back):
+        part[newest - 1 - i] -= past[i]
+        part[newest - 2 - i] += past[i]
+    return np.maximum(np.einsum("a,abi,b->i", part, alone, part), 0.0)
