@@ -170,7 +170,7 @@ def test_errors_that_last_are_told_from_fresh_ones():
     bias = random.normal(size=200)
     half = [[seen("a", [rows(0.7 * bias + 0.7 * random.normal(size=200))])] for _ in range(25)]
     assert excess(half, 0.0)["a"] == pytest.approx(0.5 * 25, rel=0.2)
-    assert excess(half, 100.0)["a"] == pytest.approx(2.0 * excess(half, 0.0)["a"], rel=0.01)  # half of them followed
+    assert excess(half, 100.0)["a"] == pytest.approx(2.0 * excess(half, 0.0)["a"], rel=0.05)  # half of them followed
     assert excess([[seen("a", [rows(3.0 * random.normal(size=200))])] for _ in range(25)], 0.0)["a"] > 7.0
 
 
@@ -180,7 +180,7 @@ def test_markers_that_come_and_go_are_known_by_their_names():
     for _ in range(20):
         on = np.flatnonzero(random.random(60) < 0.5)
         frames.append([seen("mocap", [rows(bias[on])], channels=names[on].tolist())])
-    assert excess(frames, 0.0)["mocap"] > 4.0  # the largest biases count as outliers
+    assert excess(frames, 0.0)["mocap"] == pytest.approx(10.0, rel=0.4)
     with pytest.raises(ObservationError, match="'mocap' have no names.*RowsOf"):
         excess([[seen("mocap", one[0].rows)] for one in frames], 0.0)
 
