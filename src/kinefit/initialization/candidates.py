@@ -15,14 +15,10 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.initialization.depth_search import Search
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
-from kinefit.losses import SQUARED
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, LiftedFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, PointCloud
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.depth_view import camera_at
-from kinefit.sensors.keypoints import KeypointSensor
-from kinefit.sensors.lifted import LiftedSensor
-from kinefit.sensors.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
@@ -30,17 +26,16 @@ LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is a
 
 
 def starts_from_points(
-    body: Body, frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
+    body: Body, measurements: Sequence[Measurement], scene: Scene
 ) -> list[BodyState]:
     """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
 
     Parameters
     ----------
-    frames, measurements : what was seen, and the measurements made of it where there are any
+    measurements : of all sensors that place named points
     scene : of the body, in any state
-    keypoints : makes one measurement of the keypoints of all cameras
     """
-    points, x = known_points(frames, measurements, scene, keypoints)
+    points, x = known_points(measurements, scene)
     if np.isfinite(x).all(axis=1).sum() < 6:
         return []
     try:
@@ -50,8 +45,8 @@ def starts_from_points(
 
 
 def starts_from_views(
-    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3,
-    *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
+    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], scene: Scene,
+    count: int = 3, *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
 ) -> list[BodyState]:  # fmt: skip
     """States to begin with from one depth image or cloud; those that known points agree with come first.
 
@@ -67,7 +62,7 @@ def starts_from_views(
                 starts = start_from_points(body, *view, background=empty, up=up, count=count, forward=forward)
             except KinefitError:
                 continue
-    points, x = known_points(frames, (), scene, keypoints)
+    points, x = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
     if known.any():
         starts.sort(
@@ -78,20 +73,10 @@ def starts_from_views(
     return [start.state for start in starts]
 
 
-def known_points(
-    frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor
-) -> tuple[PointSet, NDArray]:
+def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[PointSet, NDArray]:
     """Points of the body with their places (K, 3) [m] in the world, as all measurements show them; NaN where not."""
-    told = list(measurements)
-    if not told:
-        pixels = [f for f in frames if isinstance(f, KeypointFrame)]
-        told = [f for f in frames if isinstance(f, Measurement)]
-        told += [keypoints.prepare(pixels, scene)] if pixels else []
-        marked = [f for f in frames if isinstance(f, MarkerFrame)]
-        told += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
-        told += [LiftedSensor(f.sensor, 1.0).prepare(f, scene) for f in frames if isinstance(f, LiftedFrame)]
     sets, places = [], [np.zeros((0, 3))]
-    for m in (m for m in told if m.settled):  # surfaces give views alone
+    for m in (m for m in measurements if m.settled):  # surfaces give views alone
         hints = m.hints(scene)
         if hints.points is not None and hints.x_world is not None:
             names = tuple(f"{m.sensor}/{name}" for name in hints.points.names)
