@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from tests.tracking.movements import BODY, a_motion, a_rig, cloud_frame, keypoint_frame, marker_frame, off, turned
+from tests.tracking.movements import BODY, RATE, a_motion, a_rig, cloud_frame, keypoint_frame, marker_frame, off, turned
 
 from kinefit.errors import CalibrationError
+from kinefit.frame.routing import Sensors
 from kinefit.initialization.candidates import (
     GAIN,
     LEAP,
@@ -19,12 +20,11 @@ from kinefit.initialization.candidates import (
     starts_from_views,
 )
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, PointCloud
 from kinefit.rendering import render_body
 from kinefit.sensors.depth_view import camera_at, view_of
-from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
 
 UP = np.array([0.0, 1.0, 0.0])
 TRUTH = a_motion().state(0)
@@ -34,9 +34,9 @@ FEW = ("neck", "r_wrist", "l_ankle", "r_hip", "l_hip")
 
 def starts(*frames, count=3):
     scene = Scene(BODY, BODY.usual_state(np.eye(4)), a_rig())
-    detectors = KeypointSensor(a_rig(), {}, 4.0, geman_mcclure(), 0.03)
-    found = starts_from_points(BODY, frames, (), scene, detectors)
-    return found or starts_from_views(BODY, a_rig(), frames, UP, scene, detectors, count)
+    known = Sensors(a_rig(), RATE, {}, TrackSettings()).measurements(frames, scene, points=True)
+    found = starts_from_points(BODY, known, scene, np.array([0.0, 1.0, 0.0]))
+    return found or starts_from_views(BODY, a_rig(), frames, UP, known, scene, count)
 
 
 def test_markers_tell_by_themselves():

@@ -105,7 +105,7 @@ def test_a_wrist_that_is_seen_speaks_against_a_body_that_hides_it(confidence, ag
     uv = CAMERA.project(BODY.positions(away, WRISTS))
     frame = KeypointFrame("depth", 0.0, WRISTS.names, uv, np.full(2, confidence))
     here = shown().at(away)
-    measurement = KeypointSensor(here.rig, {}, 4.0, geman_mcclure(), 0.03).prepare(frame, here)
+    measurement = KeypointSensor(here.rig, {}, 4.0, geman_mcclure(), 0.03).prepare([frame], here)
     alone, both = (measurement.match(s, 0.03) for s in (here.at(away, measurements=()), here))
     assert np.allclose(alone.squares(here), 0.0)
     assert np.isinf(both.squares(here)[1]) == against

@@ -14,16 +14,16 @@ from kinefit.bodies.charts import twin
 from kinefit.errors import ObservationError
 from kinefit.smoothing.fixed_lag import FixedLag
 from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import Strength
-from kinefit.smoothing.smoother import pixels_of_track
+from kinefit.smoothing.smoother import as_tracked
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import continued, unwrap
 from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.trajectory.marginal import leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.smoothing import blocks, smooth
 from kinefit.subject.subject import Subject
-from kinefit.tracking.session import KeptFrame, one_layout
+from kinefit.tracking.session import KeptFrame
 
 COLOUR = "left", "right"
 SIGMA = dict.fromkeys(COLOUR, 2.0)
@@ -56,15 +56,12 @@ def error(states):
 
 def whole(tracker, results, noise):
     """The whole take, smoothed with the same noise: states and covariances."""
-    channels, alone = one_layout(BODY, tracker.rig, results, RATE)
-    take = pixels_of_track(BODY, channels, alone, RATE, STILL)
     kept = tuple(KeptFrame.of(r, tracker.scene_of(r.state, r.time)).measurements for r in results)
-    if any(kept):
-        names = {m.sensor for several in kept for m in several}
-        times = np.array([r.time for r in results])
-        count = 2 * np.count_nonzero(channels.weight, axis=1)
-        others = OtherSensors(times, kept, tracker.scene_of, tracker.apart, STILL, dict.fromkeys(names, 1.0), count)
-        take = replace(take, others=others)
+    times = np.array([r.time for r in results])
+    take = as_tracked(
+        BODY, TrackedFrames(results, kept, (), times, RATE, tracker.scene_of, tracker.apart), STILL
+    )  # fmt: skip
+    channels = take.channels
     take = replace(take, angles=unwrap(BODY.tree, take.angles))
     for _ in range(3):
         take = take.renewed()

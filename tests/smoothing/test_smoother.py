@@ -18,11 +18,10 @@ from kinefit.sensors.observability import levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles
-from kinefit.smoothing.smoother import smooth_results, swapped_channels
+from kinefit.smoothing.smoother import smooth_results
 from kinefit.smoothing.unwrap import boxes, unwrap
 from kinefit.subject.subject import Subject
 from kinefit.tracking.run import run
-from kinefit.tracking.session import one_layout
 
 BODY = load_body("humanoid")
 TREE = BODY.tree
@@ -120,22 +119,20 @@ def squats():
 
 
 def followed(truth, rig, keypoints, sigma=8.0):
-    """Channels of keypoints, and the frames as tracked."""
-    tracked = run(Recording.of_keypoints(rig, keypoints, sigma=sigma), truth.body, DEFAULT)
-    return one_layout(truth.body, rig, tracked.results, truth.rate)[0], tracked
+    """The frames of keypoints as tracked."""
+    return run(Recording.of_keypoints(rig, keypoints, sigma=sigma), truth.body, DEFAULT)
 
 
-def smoothed_of(truth, channels, tracked, settings=DEFAULT, count=None, **options):
+def smoothed_of(truth, tracked, settings=DEFAULT, count=None, **options):
     """Smoothed frames, and what is told of them."""
-    results = tracked.results[:count]
-    scene_of = tracked.tracker.scene_of
-    done = smooth_results(truth.body, channels, results, truth.rate, settings, scene_of, **options)
+    frames = replace(tracked, results=tracked.results[:count], measurements=tracked.measurements[:count])
+    done = smooth_results(truth.body, frames, settings, **options)
     return done.results, done.provenance
 
 
 @pytest.fixture(scope="module")
 def tracked(squats):
-    """Channels of it, and the frames as tracked."""
+    """The frames of it as tracked."""
     return followed(*squats)
 
 
@@ -151,9 +148,8 @@ def as_motion(truth, results) -> Motion:
 
 def test_smoothing_is_nearer_to_the_truth_and_tells_what_it_found(squats, tracked):
     truth, _, _ = squats
-    channels, frames = tracked
-    smoothed, told = smoothed_of(truth, channels, frames)
-    before, after = as_motion(truth, frames.results), as_motion(truth, smoothed)
+    smoothed, told = smoothed_of(truth, tracked)
+    before, after = as_motion(truth, tracked.results), as_motion(truth, smoothed)
     assert joint_errors(truth, after).mean() < 0.75 * joint_errors(truth, before).mean()
     seen = np.isfinite(after.dof_std[:, 6:])
     assert np.abs(angle_errors(truth, after))[seen].mean() < 0.75 * np.abs(angle_errors(truth, before))[seen].mean()
@@ -169,7 +165,7 @@ def test_smoothing_is_nearer_to_the_truth_and_tells_what_it_found(squats, tracke
 
 def test_livelier_motion_is_given_more_acceleration(squats, tracked):
     truth, rig, _ = squats
-    _, told = smoothed_of(truth, *tracked)
+    _, told = smoothed_of(truth, tracked)
     assert told["acceleration"]["knee_angle_r"] == told["acceleration"]["knee_angle_l"]
     roots, angles = np.tile(truth.Ts_world_root[0], (60, 1, 1)), np.tile(truth.angles[0], (60, 1))
     still = replace(truth, Ts_world_root=roots, angles=angles)
@@ -183,8 +179,8 @@ def test_livelier_motion_is_given_more_acceleration(squats, tracked):
 def test_windows_agree_with_all_at_once(squats, tracked):
     truth, _, _ = squats
     settings = TrackSettings(smooth_rounds=0)
-    whole, _ = smoothed_of(truth, *tracked, settings)
-    cut, _ = smoothed_of(truth, *tracked, settings, window=40, overlap=20)
+    whole, _ = smoothed_of(truth, tracked, settings)
+    cut, _ = smoothed_of(truth, tracked, settings, window=40, overlap=20)
     moved = joint_errors(as_motion(truth, whole), as_motion(truth, cut))
     assert 0 < moved.max() < 5e-4
     for a, b in zip(whole, cut, strict=True):
@@ -196,7 +192,7 @@ def test_person_hidden_for_a_while_is_bridged(squats):
     truth, rig, keypoints = squats
     gap = (np.arange(len(truth)) >= 25) & (np.arange(len(truth)) < 40)
     hidden = [replace(k, points=np.where(gap[:, None, None, None], np.nan, k.points)) for k in keypoints]
-    smoothed, _ = smoothed_of(truth, *followed(truth, rig, hidden))
+    smoothed, _ = smoothed_of(truth, followed(truth, rig, hidden))
     after = as_motion(truth, smoothed)
     std = after.joint_std[:, TREE.segment("shank_r")].max(axis=1)
     assert std[24] < std[27] < std[32] and std[32] > std[37] > std[40]
@@ -210,9 +206,8 @@ def test_person_hidden_for_a_while_is_bridged(squats):
 def test_exchanged_sides_stay_put_right(squats):
     truth, rig, _ = squats
     keypoints = simulate_keypoints(truth, rig, "BODY_25B", noise_px=3.0, outliers=0.0, swaps=0.15, seed=2)
-    channels, frames = followed(truth, rig, keypoints, 5.0)
-    smoothed, _ = smoothed_of(truth, channels, frames)
-    swaps = swapped_channels(channels, smoothed)
+    smoothed, _ = smoothed_of(truth, followed(truth, rig, keypoints, 5.0))
+    swaps = np.stack([m.swapped for r in smoothed for m in r.matched])
     assert 0.1 < swaps.mean() < 0.2
     assert joint_errors(truth, as_motion(truth, smoothed)).mean() < 0.02
     assert min(r.support for r in smoothed) > 0.6
@@ -257,10 +252,8 @@ def test_soles_that_rest_are_held_still():
 
 def test_one_and_two_frames_are_smoothed_too(squats, tracked):
     truth, _, _ = squats
-    channels, frames = tracked
     for count in (1, 2, 3):
-        few = replace(channels, uv=channels.uv[:count], confidence=channels.confidence[:count])
-        smoothed, told = smoothed_of(truth, few, frames, count=count)
+        smoothed, told = smoothed_of(truth, tracked, count=count)
         assert len(smoothed) == count
         states = (np.stack([getattr(r.state, n) for r in smoothed]) for n in ("T_world_root", "angles"))
         places = TREE.segment_poses(*states)

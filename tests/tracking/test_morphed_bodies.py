@@ -105,7 +105,7 @@ def test_keypoints_and_markers_make_rows_on_moved_joints(body, rig):
     frame = KeypointFrame("c1", 0.0, keypoints.names, uv, np.ones(len(uv)), "COCO_17")
     here = Scene(body, state, rig)
     for measurement in (
-        keypoint_sensor(rig).prepare(frame, here), marker_sensor().prepare(markers(model, state, 0.0), here)
+        keypoint_sensor(rig).prepare([frame], here), marker_sensor().prepare(markers(model, state, 0.0), here)
     ):  # fmt: skip
         match = measurement.match(here, 0.1)
         np.testing.assert_allclose(match.squares(here), 0.0, atol=1e-12)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from kinefit._records import restore_state, save_state
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import (
+    KEYPOINTS,
     ColourFrame,
     DepthFrame,
     Frame,
@@ -29,7 +30,6 @@ from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
 from kinefit.sensors.channel_names import ChannelNames
 from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.image_lines import ImageLineSensor
-from kinefit.sensors.keypoints import NAME as KEYPOINTS
 from kinefit.sensors.keypoints import KeypointSensor
 from kinefit.sensors.lifted import LiftedSensor
 from kinefit.sensors.markers import MarkerSensor
@@ -106,20 +106,22 @@ class Sensors:
         """The sensor of a measurement; None for a measurement that came without one."""
         return self._sensors.get(name)
 
-    def measurements(self, frames: Sequence[Any], scene: Scene) -> list[Measurement]:
-        """What the sensors saw at one time, ready to be matched; keypoints of all cameras are one measurement."""
-        pixels = [f for f in frames if isinstance(f, KeypointFrame) and f.sensor not in self._own]
-        out = []
-        for frame in frames:
+    def measurements(self, frames: Sequence[Any], scene: Scene, *, points: bool = False) -> list[Measurement]:
+        """What the sensors saw at one time, ready to be matched; `points`: of those alone that place named points."""
+        out, several = [], dict[str, list[Any]]()
+        seen = [(None if isinstance(f, Measurement) else self._of_frame(f), f) for f in frames]
+        for sensor, frame in seen:
+            several.setdefault("" if sensor is None else sensor.name, []).append(frame)
+        for sensor, frame in seen:
             with named(frame.sensor):
-                if isinstance(frame, Measurement):
+                if sensor is None:
                     out.append(_checked(frame, frame.sensor))
-                elif frame.sensor in self._own:
-                    out.append(_checked(self._sensors[frame.sensor].prepare(frame, scene), frame.sensor))
-                elif not isinstance(frame, KeypointFrame):
-                    out.append(self._of_frame(frame).prepare(frame, scene))
-                elif frame is pixels[0]:
-                    out.append(self.keypoints.prepare(pixels, scene))
+                elif sensor.places_points or not points:
+                    same = several[sensor.name]
+                    if not sensor.together:
+                        out.append(_checked(sensor.prepare(frame, scene), sensor.name))
+                    elif frame is same[0]:
+                        out.append(_checked(sensor.prepare(same, scene), sensor.name))
         return out
 
     def check_channels(self, matched: Sequence[Matched], scene: Scene) -> None:
@@ -164,12 +166,7 @@ class Sensors:
     @property
     def keypoints(self) -> KeypointSensor:
         """The detectors of all cameras."""
-        if KEYPOINTS not in self._sensors:
-            self._sensors[KEYPOINTS] = self._keypoints(KEYPOINTS)
-            self._made_of[KEYPOINTS] = KeypointFrame.__name__, KEYPOINTS
-        sensor = self._sensors[KEYPOINTS]
-        assert isinstance(sensor, KeypointSensor)
-        return sensor
+        return cast(KeypointSensor, self._made(KEYPOINTS, KeypointFrame, KEYPOINTS))
 
     def background(self, camera: Camera) -> Background | None:
         """What stands still before a depth camera; None where nothing is to be learnt."""
@@ -215,11 +212,15 @@ class Sensors:
                 self._sensors[name] = makers[kind](sensor)
             restore_state(self._sensors[name], learnt)
 
-    def _of_frame(self, frame: Frame) -> Sensor:
-        name = sensor_of(frame)
+    def _of_frame(self, frame: Any) -> Sensor:
+        own = self._sensors[frame.sensor] if frame.sensor in self._own else None
+        return own or self._made(sensor_of(frame), type(frame), frame.sensor)
+
+    def _made(self, name: str, kind: type, of: str) -> Sensor:
+        """The sensor of a name, made when it is first asked for."""
         if name not in self._sensors:
-            self._sensors[name] = self._makers[type(frame)](frame.sensor)
-            self._made_of[name] = type(frame).__name__, frame.sensor
+            self._sensors[name] = self._makers[kind](of)
+            self._made_of[name] = kind.__name__, of
         return self._sensors[name]
 
     def _keypoints(self, name: str) -> KeypointSensor:

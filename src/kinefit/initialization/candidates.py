@@ -16,14 +16,10 @@ from kinefit.initialization.depth_search import PostureSearch
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.initialization.from_rays import starts_from_rays
-from kinefit.losses import SQUARED
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, LiftedFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, PointCloud
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.depth_view import camera_at
-from kinefit.sensors.keypoints import KeypointSensor
-from kinefit.sensors.lifted import LiftedSensor
-from kinefit.sensors.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
@@ -31,21 +27,19 @@ LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is a
 
 
 def starts_from_points(
-    body: Body, frames: Sequence[Any], measurements: Sequence[Measurement], scene: Scene, keypoints: KeypointSensor,
-    up: NDArray,
-) -> list[BodyState]:  # fmt: skip
+    body: Body, measurements: Sequence[Measurement], scene: Scene, up: NDArray
+) -> list[BodyState]:
     """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
 
     Where fewer are known, from the rays of one camera's keypoints, if another sensor measures something beside them.
 
     Parameters
     ----------
-    frames, measurements : what was seen, and the measurements made of it where there are any
+    measurements : of all sensors that place named points
     scene : of the body, in any state
-    keypoints : makes one measurement of the keypoints of all cameras
     up : (3,) unit, upwards in the world
     """
-    given = [m for m in measurements or _measurements(frames, scene, keypoints) if m.settled]
+    given = [m for m in measurements if m.settled]
     points, x, rays = known_points(given, scene)
     if np.isfinite(x).all(axis=1).sum() < 6:
         return starts_from_rays(scene, points, rays, given, up) if len(given) > 1 else []
@@ -56,8 +50,8 @@ def starts_from_points(
 
 
 def starts_from_views(
-    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, scene: Scene, keypoints: KeypointSensor, count: int = 3,
-    *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
+    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], scene: Scene,
+    count: int = 3, *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
 ) -> list[BodyState]:  # fmt: skip
     """States to begin with from one depth image or cloud; those that known points agree with come first.
 
@@ -73,7 +67,7 @@ def starts_from_views(
                 starts = start_from_points(body, *view, background=empty, up=up, count=count, forward=forward)
             except KinefitError:
                 continue
-    points, x, _ = known_points(_measurements(frames, scene, keypoints), scene)
+    points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
     if known.any():
         starts.sort(
@@ -82,16 +76,6 @@ def starts_from_views(
             )
         )
     return [start.state for start in starts]
-
-
-def _measurements(frames: Sequence[Any], scene: Scene, keypoints: KeypointSensor) -> list[Measurement]:
-    """Measurements of the frames that show points."""
-    pixels = [f for f in frames if isinstance(f, KeypointFrame)]
-    out = [f for f in frames if isinstance(f, Measurement)]
-    out += [keypoints.prepare(pixels, scene)] if pixels else []
-    marked = [f for f in frames if isinstance(f, MarkerFrame)]
-    out += [MarkerSensor(f.sensor, 1.0, SQUARED, 1.0).prepare(f, scene) for f in marked]
-    return out + [LiftedSensor(f.sensor, 1.0).prepare(f, scene) for f in frames if isinstance(f, LiftedFrame)]
 
 
 def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[PointSet, NDArray, NDArray]:

@@ -19,7 +19,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, LiftedFrame
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.warm import warm_keypoints
-from kinefit.tracking.recording import Recording
+from kinefit.tracking.recording import Recording, keypoint_records
 from kinefit.tracking.sizing import fitted_to_person
 
 _STEPS, _BETWEEN, _SEEN = 40, 0.2, 0.5  # steps that are kept, [s] between them, quality of a frame that counts
@@ -117,7 +117,7 @@ def fitted_body(
     settings: TrackSettings, height: float | None, up: str,
 ) -> Body:  # fmt: skip
     """The body with the person's lengths, from keypoints of some steps."""
-    records = _records(steps)
+    records = [_with_lifted(k, steps) for k in keypoint_records(steps, 1.0 / _BETWEEN)]
     sigmas = [sigma.get(k.camera, KEYPOINT_SIGMA) for k in records]
     recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
     settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
@@ -128,22 +128,12 @@ def fitted_body(
     return person.subject.body
 
 
-def _records(steps: Sequence[Sequence[Any]]) -> list[Keypoints]:
-    """Of each camera one record, a frame a step, with the points lifted to space where there are any."""
-    out = []
-    seen = {(f.sensor, f.keypoint_set, f.names) for step in steps for f in step if isinstance(f, KeypointFrame)}
-    for camera, keypoint_set, names in sorted(seen):
-        points = np.full((len(steps), 1, len(names), 2), np.nan)
-        confidence, lifted = np.zeros(points.shape[:3]), np.full((*points.shape[:3], 3), np.nan)
-        for i, step in enumerate(steps):
-            for f in step:
-                if (f.sensor, f.keypoint_set, f.names) == (camera, keypoint_set, names):
-                    if isinstance(f, KeypointFrame):
-                        points[i, 0], confidence[i, 0] = f.uv, f.confidence
-                    else:
-                        lifted[i, 0] = f.x
-        known = np.isfinite(lifted).any()
-        out.append(Keypoints(
-            camera, keypoint_set, names, 1.0 / _BETWEEN, points, confidence, lifted=lifted if known else None
-        ))  # fmt: skip
-    return out
+def _with_lifted(record: Keypoints, steps: Sequence[Sequence[Any]]) -> Keypoints:
+    """The same with its points lifted to space, where there are any."""
+    lifted = np.full((*record.points.shape[:3], 3), np.nan)
+    key = record.camera, record.keypoint_set, record.names
+    for i, step in enumerate(steps):
+        for f in step:
+            if isinstance(f, LiftedFrame) and (f.sensor, f.keypoint_set, f.names) == key:
+                lifted[i, 0] = f.x
+    return replace(record, lifted=lifted) if np.isfinite(lifted).any() else record

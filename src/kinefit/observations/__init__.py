@@ -9,6 +9,7 @@ from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.detections import MEDIAPIPE_33, Detections
 from kinefit.observations.features import KeypointVideo, LineVideo
 from kinefit.observations.frames import (
+    KEYPOINTS,
     ColourFrame,
     DepthFrame,
     Frame,
@@ -25,6 +26,7 @@ from kinefit.observations.silhouettes import SilhouetteVideo
 from kinefit.observations.surface_points import SurfacePointFrame, SurfacePointVideo
 
 __all__ = [
+    "KEYPOINTS",
     "KEYPOINT_SIGMA",
     "MEDIAPIPE_33",
     "CloudVideo",

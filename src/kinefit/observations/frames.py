@@ -333,9 +333,15 @@ class LiftedFrame:
 Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame | LiftedFrame
 
 
-_KINDS = {SilhouetteFrame: "silhouette ", LineFrame: "lines ", ColourFrame: "region ", LiftedFrame: "lifted "}
+KEYPOINTS = "keypoints"
+"""Name of the sensor that the keypoint detectors of all cameras are together."""
+
+_NAMES = {
+    KeypointFrame: KEYPOINTS, SilhouetteFrame: "silhouette {}", LineFrame: "lines {}", ColourFrame: "region {}",
+    LiftedFrame: "lifted {}",
+}  # fmt: skip
 
 
 def sensor_of(frame: object) -> str:
-    """Name of the sensor that a frame is of: the camera's for keypoints, else with what is seen there."""
-    return _KINDS.get(type(frame), "") + str(getattr(frame, "sensor", ""))
+    """Name of the sensor that a frame is of: where several see with one camera, with what is seen there."""
+    return _NAMES.get(type(frame), "{}").format(getattr(frame, "sensor", ""))

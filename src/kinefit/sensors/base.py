@@ -227,11 +227,17 @@ class Sensor(ABC):
     ----------
     name : as frames name it in `sensor`
     unknowns : {name: Unknown} of its own that a subject fit estimates
+    together : whether `prepare` takes a list of all its frames of one time, in place of one frame
+    places_points : whether a measurement says in its `hints` where named points of the body are, whatever the pose
+    shows_person : whether it shows a person as a whole, so that a search for one in it takes long
     state_attributes : names of the attributes that change while it tracks; checkpoints keep those of kinefit's sensors
     """
 
     name: str
     unknowns: Mapping[str, Unknown] = {}
+    together: bool = False
+    places_points: bool = False
+    shows_person: bool = False
     state_attributes: Sequence[str] = ()
 
     @abstractmethod

@@ -47,6 +47,8 @@ class DepthImageSensor(Sensor):
     background : Background of this camera, None where it moves, or shows nothing but the body.
     """
 
+    shows_person = True
+
     def __init__(
         self, name: str, camera: Camera, sigma: float, settings: TrackSettings, background: Background | None
     ) -> None:

@@ -14,22 +14,17 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.losses import Loss
-from kinefit.observations import KeypointFrame, Keypoints
+from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
-from kinefit.sensors.layout import Layout, projected
+from kinefit.sensors.layout import Layout, Stream, projected
 from kinefit.sensors.left_right import find_swaps
 from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.triangulation import rays, triangulated_frame
 from kinefit.sensors.view_bias import ViewBias
-
-NAME = "keypoints"
-
-Stream = tuple[str, str, tuple[str, ...]]
-"""Camera, keypoint set and names of the keypoints that one detector gives frame after frame."""
 
 
 class KeypointSensor(Sensor):
@@ -45,7 +40,8 @@ class KeypointSensor(Sensor):
     view_bias : bias of the detectors by direction of view, as a subject fit estimated it; default: none
     """
 
-    name = NAME
+    name = KEYPOINTS
+    together = places_points = True
 
     def __init__(
         self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float,
@@ -53,9 +49,9 @@ class KeypointSensor(Sensor):
     ) -> None:  # fmt: skip
         self.rig, self.sigma, self.usual, self.loss, self.near = rig, sigma, usual, loss, near
         self.view_bias = view_bias or ViewBias()
-        self._layouts: dict[tuple[object, ...], tuple[Layout, list[tuple[int, NDArray]]]] = {}
+        self._layouts: dict[tuple[object, ...], tuple[Layout, NDArray]] = {}
 
-    def prepare(self, frame: KeypointFrame | Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
+    def prepare(self, frame: Sequence[KeypointFrame], scene: Scene) -> KeypointMeasurement:
         """Of the frames of all cameras at one time.
 
         Raises
@@ -63,19 +59,16 @@ class KeypointSensor(Sensor):
         BodyError, CalibrationError
             A keypoint set that the body does not have, a camera that the rig does not have.
         """
-        frames = [frame] if isinstance(frame, KeypointFrame) else list(frame)
-        layout, columns = self.layout(scene.body, [(f.sensor, f.keypoint_set, f.names) for f in frames])
-        parts = [(frames[k], c, c >= 0) for k, c in columns]
-        uv = np.concatenate([np.zeros((0, 2)), *(np.where(has[:, None], f.uv[c], np.nan) for f, c, has in parts)])
-        confidence = np.concatenate([np.zeros(0), *(np.where(has, f.confidence[c], 0.0) for f, c, has in parts)])
-        time = float(np.mean([f.time for f in frames]))
+        layout, place = self.layout(scene.body, [(f.sensor, f.keypoint_set, f.names) for f in frame])
+        uv = np.concatenate([*(f.uv for f in frame), [[np.nan, np.nan]]])[place]
+        confidence = np.concatenate([*(f.confidence for f in frame), [0.0]])[place]
+        time = float(np.mean([f.time for f in frame]))
         return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
 
-    def layout(self, body: Body, streams: Sequence[Stream]) -> tuple[Layout, list[tuple[int, NDArray]]]:
+    def layout(self, body: Body, streams: Sequence[Stream]) -> tuple[Layout, NDArray]:
         """The layout of frames of these streams, made once.
 
-        And of each stream whose points the body knows its number, and the places of the points in its names, -1 for
-        none.
+        And (N,) int where among the names of all streams, one after the other, each channel's point is, -1 for nowhere.
         """
         key = (id(body), *streams)
         if key not in self._layouts:
@@ -90,14 +83,13 @@ class KeypointSensor(Sensor):
             if records:
                 sigma = keypoint_sigma(records, self.sigma, self.usual)
                 channels = self.view_bias.known_to(make_channels(body, self.rig, records, sigma))
-            columns = []
-            for q, k in enumerate(used):
-                has = streams[k][2]
-                points = [channels.points.names[c] for c in channels.column[channels.source == q]]
-                columns.append((k, np.array([has.index(n) if n in has else -1 for n in points], np.int64)))
+            given = [(k, name) for k, (*_, names) in enumerate(streams) for name in names]
+            found = {point: i for i, point in reversed(list(enumerate(given)))}  # a name counts where it is first
+            wanted = [(used[q], channels.points.names[c]) for q, c in zip(channels.source, channels.column)]
+            place = np.array([found.get(point, -1) for point in wanted], np.int64)
             if len(self._layouts) > 16:
                 self._layouts.clear()
-            self._layouts[key] = Layout(channels, body), columns
+            self._layouts[key] = Layout(channels, body, tuple(streams[k] for k in used)), place
         return self._layouts[key]
 
 
@@ -114,7 +106,7 @@ class KeypointMeasurement(Measurement):
     """
 
     def __init__(self, sensor: KeypointSensor, layout: Layout, uv: NDArray, confidence: NDArray, time: float) -> None:
-        self.sensor, self.time, self.of, self.layout = NAME, time, sensor, layout
+        self.sensor, self.time, self.of, self.layout = KEYPOINTS, time, sensor, layout
         seen = np.isfinite(uv).all(axis=1) & (confidence > 0)
         self.confidence = np.where(seen, confidence, 0.0)
         self.weight = self.confidence / np.square(layout.channels.sigma)
@@ -168,7 +160,7 @@ class KeypointMatched(Matched):
     hidden: tuple[Hidden, ...] = ()
     beside: NDArray | None = None
 
-    sensor = NAME
+    sensor = KEYPOINTS
 
     @property
     def pixels(self) -> KeypointMatched:

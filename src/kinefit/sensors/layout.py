@@ -15,6 +15,9 @@ from kinefit.sensors.left_right import limb_groups
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.view_bias import beside, trunks
 
+Stream = tuple[str, str, tuple[str, ...]]
+"""Camera, keypoint set and names of the keypoints that one detector gives frame after frame."""
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
@@ -24,10 +27,12 @@ class Layout:
     ----------
     channels : Channels, of which the measurements are not used
     body : Body
+    streams : of every source what a detector gives, frame after frame, where it was made of that
     """
 
     channels: Channels
     body: Body
+    streams: tuple[Stream, ...] = ()
 
     @cached_property
     def points(self) -> PointSet:
@@ -82,6 +87,11 @@ class Layout:
         c = self.channels
         known = [(name, point) for name, span in c.sets.items() for point in c.points.names[span]]
         return tuple(known[k] for k in c.column)
+
+    @property
+    def of_streams(self) -> list[tuple[str, str, str]]:
+        """(N,) camera, keypoint set and point of every channel."""
+        return [(*self.streams[q][:2], name) for q, name in zip(self.channels.source, self.points.names)]
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -36,6 +36,8 @@ class LiftedSensor(Sensor):
     sigma : float [m] standard deviation of a landmark's depth against that of the hips
     """
 
+    places_points = True
+
     def __init__(self, camera: str, sigma: float) -> None:
         self.name, self.camera, self.sigma = f"lifted {camera}", camera, sigma
 

@@ -31,6 +31,8 @@ class MarkerSensor(Sensor):
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
     """
 
+    places_points = True
+
     def __init__(self, name: str, sigma: float | NDArray, loss: Loss, near: float) -> None:
         self.name, self.sigma, self.loss, self.near = name, sigma, loss, near
 

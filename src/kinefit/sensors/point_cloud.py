@@ -34,6 +34,8 @@ class PointCloudSensor(Sensor):
     camera : Camera, where the scanner is one of the rig's: its points go with it.
     """
 
+    shows_person = True
+
     def __init__(self, name: str, sigma: float, settings: TrackSettings, camera: Camera | None = None) -> None:
         self.name, self.sigma, self.settings, self.camera = name, sigma, settings, camera
 

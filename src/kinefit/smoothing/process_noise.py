@@ -61,6 +61,7 @@ class Strength:
 class SmoothTake:
     """Measurements of all frames as used (left and right put right), and states to start from.
 
+    `swapped` (T, N) bool: channels that changed sides for it;
     `told` (T, D) bool: coordinates that some frame not far away observes on its own; `live` (T, n): its process noise
     over time, as a factor; `others`: what all sensors but the keypoints measured, `linear` the same about
     the states; `speed_std` (n,) [m/s, rad/s] of the rates of change, which nine tenths of the frames fall below;
@@ -72,6 +73,7 @@ class SmoothTake:
     points: PointSet
     uv: NDArray
     confidence: NDArray
+    swapped: NDArray
     roots: NDArray
     angles: NDArray
     told: NDArray
@@ -94,7 +96,8 @@ class SmoothTake:
 
     def part(self, frames: slice) -> SmoothTake:
         """A stretch of it."""
-        cut = {name: getattr(self, name)[frames] for name in ("uv", "confidence", "roots", "angles", "told", "live")}
+        names = ("uv", "confidence", "swapped", "roots", "angles", "told", "live")
+        cut = {name: getattr(self, name)[frames] for name in names}
         return replace(
             self, **cut, contacts=self.contacts and self.contacts.part(frames),
             others=self.others and self.others.part(frames), linear=self.linear and self.linear.part(frames),

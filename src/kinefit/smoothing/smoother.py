@@ -21,11 +21,12 @@ from kinefit.sensors.observability import SHORTEST, levers, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
-from kinefit.smoothing.linearised import OtherSensors, SceneOf
+from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.pixels import exchanged, without_bias
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_surely
 from kinefit.solvers.closed import Constraint, on_null_space, onto
@@ -60,8 +61,7 @@ class SmoothedTake:
 
 
 def smooth_results(
-    body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings,
-    scene_of: SceneOf, *, others: OtherSensors | None = None, contacts: bool = False, up: str = "z",
+    body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
     eye: NDArray | None = None, window: int = 600, overlap: int = 60,
 ) -> SmoothedTake:  # fmt: skip
     """Tracked frames of any sensors, smoothed together.
@@ -71,29 +71,24 @@ def smooth_results(
 
     Parameters
     ----------
-    channels : keypoints of the F frames, of no points where there are none
-    results : F frames from a `Tracker`
-    rate : float [Hz]
-    scene_of : (state, time) -> scene
-    others : what all sensors but the keypoints measured
     contacts : bool
         Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
     eye : (3,) [m] of the camera that is the only sensor, for the contacts, see `find_contacts`; its pixels then stay
         no surer than they are stated, since no other view shows what they are off by
     window, overlap : frames of a part that is solved at once, and how many it shares with the next.
     """
-    swapped = swapped_channels(channels, results)
-    take = replace(_take(body, channels, results, swapped, rate, settings, others), one_view=eye is not None)
+    take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
+    channels, swapped, others = take.channels, take.swapped, take.others
     strength, take, rounds = _estimate(take, settings, window, overlap)
     take, covariances, others_matched = solved_surely(take, strength, window, overlap)
     again = _swaps(take)
     if not np.array_equal(again, swapped):
         uv, confidence = exchanged(channels, again)
         uv = without_bias(body, channels, uv, take.roots, take.angles)
-        take, swapped = replace(take, uv=uv, confidence=confidence), again
+        take, swapped = replace(take, uv=uv, confidence=confidence, swapped=again), again
         take, covariances, others_matched = solved_surely(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
-        found = find_contacts(body, take.roots, take.angles, rate, up, eye)
+        found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye)
         take, others_matched = solved(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
@@ -106,9 +101,9 @@ def smooth_results(
     surfaces = False
     smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
     covariance = np.empty((body.tree.n_dofs,) * 2)
-    for f, result in enumerate(results):
+    for f, result in enumerate(frames.results):
         state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
-        scene = scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
+        scene = frames.scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         pixels = tuple(
             replace(
                 m, uv=np.where(weight[:, None] > 0, take.uv[f], np.nan), weight=weight, swapped=swapped[f],
@@ -124,7 +119,7 @@ def smooth_results(
         surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
     if surfaces:
-        smoothed = _without_adrift(body, smoothed, round(_ADRIFT * rate))
+        smoothed = _without_adrift(body, smoothed, round(_ADRIFT * frames.rate))
     shared = SharedErrors.of(channels, strength.shared, strength.sigma)
     return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds), shared)
 
@@ -151,37 +146,30 @@ def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> Sp
     )  # fmt: skip
 
 
-def swapped_channels(channels: Channels, results: Sequence[FrameResult]) -> NDArray:
-    """(F, N) bool: channels that the track exchanged with their partner."""
-    out = np.zeros((len(results), len(channels.column)), bool)
-    for f, result in enumerate(results):
-        for m in pixels_of(result.matched):
-            out[f] = m.swapped
-    return out
-
-
-def pixels_of_track(
-    body: Body, channels: Channels, results: Sequence[FrameResult], rate: float, settings: TrackSettings
-) -> SmoothTake:
-    """The pixels of a track as they were used, with its states, not smoothed."""
+def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> SmoothTake:
+    """What all sensors measured in tracked frames as it was used, with the tracker's states, not smoothed."""
+    (channels, swapped), results = frames.pixels(), frames.results
     roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
     everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
-    uv, confidence = exchanged(channels, swapped_channels(channels, results))
+    uv, confidence = exchanged(channels, swapped)
+    sensors, others = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0), None
+    if sensors or body.closures:
+        rows = 2 * np.count_nonzero(channels.weight, axis=1)
+        others = OtherSensors(
+            frames.times, frames.measurements, frames.scene_of, frames.apart, settings, sensors, rows
+        )  # fmt: skip
     return SmoothTake(
-        body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, roots, angles, everything,
-        np.ones((len(roots), body.tree.n_dofs)), 1.0 / rate, settings.loss,
-        (settings.acceleration_memory, settings.smooth_memory),
+        body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,
+        everything, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
+        (settings.acceleration_memory, settings.smooth_memory), others=others,
     )  # fmt: skip
 
 
-def _take(
-    body: Body, channels: Channels, results: Sequence[FrameResult], swapped: NDArray, rate: float,
-    settings: TrackSettings, others: OtherSensors | None,
-) -> SmoothTake:  # fmt: skip
+def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     """What was tracked, in angles without jumps."""
-    take = pixels_of_track(body, channels, results, rate, settings)
+    body, channels, others, rate = take.body, take.channels, take.others, 1.0 / take.dt
     inliers = take.agreeing(channels.sigma) > INLIER
     alone, rows = _observed(take, channels, others)
     far = levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST
@@ -189,7 +177,7 @@ def _take(
     lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
     roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)
     told = near(told, round(settings.smooth_memory * rate))
-    return replace(take, roots=roots, angles=angles, told=told, others=others)
+    return replace(take, roots=roots, angles=angles, told=told)
 
 
 def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:

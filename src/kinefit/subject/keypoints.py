@@ -12,8 +12,9 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError
 from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.losses import geman_mcclure
+from kinefit.observations import KEYPOINTS
 from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.sensors.keypoints import NAME, KeypointMeasurement, KeypointSensor
+from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.layout import Layout
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
@@ -194,7 +195,7 @@ def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -
     worlds, prior = Worlds(found.prior_world, found.parameters), found.prior.information
     frames = MatchedFrames(worlds, steps, None, None, found.mean, found.states, joint.REACH[0])
     known = len(found.mean) - float(np.sum(prior * inverse(prior + found.information)))
-    return excess(frames.seen(found.mean, found.states), found.body.tree.n_dofs + known).get(NAME, 1.0)
+    return excess(frames.seen(found.mean, found.states), found.body.tree.n_dofs + known).get(KEYPOINTS, 1.0)
 
 
 def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:

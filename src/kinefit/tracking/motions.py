@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,18 +15,17 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
-from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at, pixels_of
-from kinefit.sensors.channels import Channels
+from kinefit.sensors.base import Leftover, Matched, leftovers_at, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.fixed_lag import FixedLag
 from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.smoothing.lag_frame import TrackerView
-from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
-from kinefit.smoothing.smoother import pixels_of_track, smooth_results
+from kinefit.smoothing.smoother import as_tracked, smooth_results
 from kinefit.smoothing.spool import STRETCH, Spool
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.uncertainty import TIED, pixel_information, with_lasting_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
@@ -34,31 +33,6 @@ from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
 from kinefit.tracking.cameras import CAMERAS, as_told
 from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
-
-
-@dataclass(frozen=True, eq=False)
-class TrackedFrames:
-    """F consecutive frames as a tracker left them.
-
-    Parameters
-    ----------
-    channels : keypoints of the F frames, of no points where there are none
-    results : F frames, with the matches of keypoints alone
-    measurements : of each of them what all sensors but the keypoints measured, without whole images
-    leftovers : of each of them what the fit leaves over of every sensor
-    times : (F,) [s]
-    rate : float [Hz]
-    scene_of, apart : those of the tracker
-    """
-
-    channels: Channels
-    results: Sequence[FrameResult]
-    measurements: Sequence[tuple[Measurement, ...]]
-    leftovers: Sequence[tuple[Leftover, ...]]
-    times: NDArray
-    rate: float
-    scene_of: SceneOf
-    apart: ApartRows
 
 
 def motion_of(
@@ -82,33 +56,25 @@ def motion_of(
     told : what else there is to tell, for `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
-    body, rate, channels = subject.body, frames.rate, frames.channels
-    results: Sequence[FrameResult] = frames.results
+    body, rate, results = subject.body, frames.rate, frames.results
     provenance: dict[str, Any] = dict(told or {})
-    others = shared = None
-    names = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0)
-    if names or body.closures:
-        points = 2 * np.count_nonzero(channels.weight, axis=1)
-        others = OtherSensors(
-            frames.times, frames.measurements, frames.scene_of, frames.apart, settings, names, points
-        )  # fmt: skip
+    shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
-        done = smooth_results(
-            body, channels, results, rate, settings, frames.scene_of, others=others,
-            contacts=contacts or eye is not None, up=up, eye=eye,
-        )
+        done = smooth_results(body, frames, settings, contacts=contacts or eye is not None, up=up, eye=eye)
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
-        others, matched = take.others, done.matched
+        matched = done.matched
     else:
         if lag is not None:
             results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, noise)
-        take = pixels_of_track(body, channels, results, rate, settings)
-        factor = take.factors(channels.sigma, take.fitted(take.roots, take.angles))
-        weight = take.confidence / np.square(channels.sigma) * factor
-        if others is not None and lag is None:
-            matched = Spool(others.matched(others.scene(f, take.roots, take.angles)) for f in range(len(results)))
+        take = as_tracked(body, replace(frames, results=results), settings)
+        sigma = take.channels.sigma
+        weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))
+        if take.others is not None and lag is None:
+            of = take.others
+            matched = Spool(of.matched(of.scene(f, take.roots, take.angles)) for f in range(len(results)))
+    others, channels = take.others, take.channels
 
     def seen(f: int) -> tuple[Scene, list[Matched]]:
         """A frame's scene, with the body where it is when each sensor measured, and all that was matched in it."""

@@ -210,7 +210,7 @@ class Recording:
             if name not in there:
                 remedy = "Leave its standard deviation out, or correct its name."
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
-        records = _records(steps, times, rate)
+        records = keypoint_records(steps, rate, start=float(times[0]))
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
         worn = _marker_records(steps, rate)
         known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
@@ -269,8 +269,13 @@ def _sigmas(sigma: float | Sequence[float], count: int) -> tuple[float, ...]:
     return tuple(float(v) for v in np.broadcast_to(values, count))
 
 
-def _records(steps: Sequence[Sequence[Any]], times: NDArray, rate: float) -> tuple[Keypoints, ...]:
-    """Keypoints of single frames as records of all of them, one for each camera and keypoint set."""
+def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: float = 0.0) -> tuple[Keypoints, ...]:
+    """Keypoints of single frames as records of all of them, one for each camera and keypoint set.
+
+    Parameters
+    ----------
+    rate : float [Hz] of the steps, of which the first is at `start` [s]
+    """
     seen: dict[tuple[str, str, tuple[str, ...]], dict[int, KeypointFrame]] = {}
     for i, frames in enumerate(steps):
         for f in frames:
@@ -282,7 +287,7 @@ def _records(steps: Sequence[Sequence[Any]], times: NDArray, rate: float) -> tup
         confidence = np.zeros(points.shape[:3])
         for i, f in frames_of.items():
             points[i, 0], confidence[i, 0] = f.uv, f.confidence
-        out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=float(times[0])))
+        out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=start))
     return tuple(out)
 
 

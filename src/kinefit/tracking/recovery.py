@@ -108,7 +108,8 @@ class Recovery:
     ) -> FrameResult | None:  # fmt: skip
         """A start from points that are known in space, which costs little."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
-        for state in starts_from_points(self.body, frames, measurements, scene, tracker.sensors.keypoints, self.up):
+        known = measurements or tracker.sensors.measurements(frames, scene, points=True)
+        for state in starts_from_points(self.body, known, scene, self.up):
             found = tracker.fitted(time, frames, state).result
             if result is None or found.support > result.support + _GAIN:
                 result, self._lost_since = found, time
@@ -126,8 +127,8 @@ class Recovery:
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         for state in starts_from_views(
-            self.body, self.rig, tracker.alone(frames), self.up, scene, own.keypoints, backgrounds=own.stated,
-            forward=None if known is None else known[:3, 0],
+            self.body, self.rig, tracker.alone(frames), self.up, own.measurements(frames, scene, points=True), scene,
+            backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
             if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
                 continue  # somebody else

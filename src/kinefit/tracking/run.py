@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -11,11 +11,10 @@ from typing import Any
 from kinefit._mapped import release
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
-from kinefit.frame.results import FrameResult
-from kinefit.sensors.base import Leftover, Measurement
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.view_bias import ViewBias
 from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.frame_file import KINDS
@@ -31,23 +30,17 @@ _EVERY = 300  # steps after which a checkpoint is written: ten seconds of video,
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedSteps:
-    """A recording, tracked frame by frame.
+class TrackedSteps(TrackedFrames):
+    """A recording, tracked frame by frame; what its frames hold is read on demand.
 
     Parameters
     ----------
-    results : one for each step of `steps`, with the matches of keypoints alone; read on demand
     steps : numbers of the steps that were done, in order
-    measurements : of each of them what all sensors but the keypoints measured, without whole images; read on demand
-    leftovers : of each of them what the fit leaves over of every sensor; read on demand
     tracker : that did it
     complete : whether all steps were done
     """
 
-    results: Sequence[FrameResult]
     steps: list[int]
-    measurements: Sequence[tuple[Measurement, ...]]
-    leftovers: Sequence[tuple[Leftover, ...]]
     tracker: Tracker
     complete: bool
 
@@ -91,13 +84,14 @@ class _Frames:
         checkpoint.frames.name(body=tracker.body, layout=layout)
         checkpoint.frames.name_sensors(tracker.sensors)
 
-    def tracked(self, tracker: Tracker, steps: int, *, stopped: bool) -> TrackedSteps:
-        """In the order of time; `steps` of the whole recording."""
+    def tracked(self, tracker: Tracker, recording: Recording, *, stopped: bool) -> TrackedSteps:
+        """In the order of time."""
         done = sorted(self.place)
         order = [self.place[i] for i in done]
         return TrackedSteps(
-            self.results.chosen(order), done, self.measurements.chosen(order), self.leftovers.chosen(order), tracker,
-            not stopped and len(done) == steps,
+            self.results.chosen(order), self.measurements.chosen(order), self.leftovers.chosen(order),
+            recording.times[done], recording.rate, tracker.scene_of, tracker.apart, done, tracker,
+            not stopped and len(done) == len(recording),
         )  # fmt: skip
 
 
@@ -182,4 +176,4 @@ def run(
         if not frames.place:
             raise
         stopped = True
-    return frames.tracked(tracker, len(times), stopped=stopped)
+    return frames.tracked(tracker, recording, stopped=stopped)

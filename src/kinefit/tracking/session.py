@@ -8,24 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._mapped import release, room
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
-from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
-from kinefit.observations import Keypoints
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.base import Leftover, Measurement, leftovers_at, pixels_of
-from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement
 from kinefit.sensors.layout import Layout
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
-from kinefit.smoothing.spool import STRETCH, Spool
-from kinefit.tracking.motions import TrackedFrames
-
-_Key = tuple[str, str, int]  # camera, keypoint set, and which of a layout's records of these
+from kinefit.smoothing.spool import Spool
+from kinefit.smoothing.tracked_frames import TrackedFrames
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +104,11 @@ class Session:
                 self._append(KeptFrame(unseen(last, last.time + gap * k / ahead), (), ()))
             self._append(new)
 
-    def frames(self, body: Body, rig: Rig, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
-        """All of them, with the keypoints of whatever cameras as one list of channels."""
-        channels, results = one_layout(body, rig, self._results, self.rate)
+    def frames(self, body: Body, scene_of: SceneOf, apart: ApartRows) -> TrackedFrames:
+        """All of them, with the keypoints of whatever cameras in one layout."""
+        results = in_one_layout(body, self._results)
         return TrackedFrames(
-            channels, results, self._measurements[:], self._leftovers[:], np.array([r.time for r in results]),
+            results, self._measurements[:], self._leftovers[:], np.array([r.time for r in results]),
             self.rate, scene_of, apart,
         )  # fmt: skip
 
@@ -128,104 +122,43 @@ def unseen(last: FrameResult, time: float) -> FrameResult:
     )  # fmt: skip
 
 
-def one_layout(
-    body: Body, rig: Rig, results: Sequence[FrameResult], rate: float
-) -> tuple[Channels, Sequence[FrameResult]]:
-    """Keypoints of F results, of whatever cameras took part in each, as channels of all of them.
-
-    Parameters
-    ----------
-    results : F frames, with the matches of keypoints alone
-    rate : float [Hz]
-
-    Returns
-    -------
-    channels of the F frames, and the results with their keypoints matched in these channels
-    """
-    F, uv, confidence = len(results), np.zeros((0, 0, 2)), np.zeros((0, 0))
-    layout: Layout | None = None
-    for f, r in enumerate(results):
-        if f % STRETCH == 0:
-            release(uv, confidence)
-        pixels = pixels_of(r.matched)
-        if layout is None and pixels:
-            layout = pixels[0].measurement.layout
-            uv, confidence = room((F, len(layout.points), 2)), room((F, len(layout.points)))
-            uv[:] = np.nan
-        if len(pixels) > 1 or any(m.measurement.layout is not layout for m in pixels):
-            return _of_several(body, rig, results, rate)
-        for m in pixels:
-            uv[f], confidence[f] = m.measurement.uv, m.measurement.confidence
-    if layout is None:
-        return Channels.none(rig, F), results
-    return replace(layout.channels, uv=uv, confidence=confidence), results
-
-
-def _of_several(
-    body: Body, rig: Rig, results: Sequence[FrameResult], rate: float
-) -> tuple[Channels, list[FrameResult]]:
-    """Of results in several layouts: of a session in which cameras come and go."""
+def in_one_layout(body: Body, results: Sequence[FrameResult]) -> Sequence[FrameResult]:
+    """Results (F,) with their keypoints in one layout of all cameras, whatever cameras took part in each."""
     matches = [pixels_of(r.matched) for r in results]
-    names: dict[_Key, dict[str, int]] = {}
-    sigma: dict[_Key, float] = {}
-    keys: dict[int, list[tuple[_Key, str]]] = {}
-    for m in (m for several in matches for m in several):
-        layout = m.measurement.layout
-        if id(layout) not in keys:
-            keys[id(layout)] = _keys(layout.channels)
-            for (key, name), s in zip(keys[id(layout)], layout.channels.sigma):
-                names.setdefault(key, {}).setdefault(name, len(names[key]))
-                sigma.setdefault(key, float(s))
-    values = {k: np.full((len(results), 1, len(n), 2), np.nan) for k, n in names.items()}
-    trust = {k: np.zeros((len(results), 1, len(n))) for k, n in names.items()}
-    for f, several in enumerate(matches):
-        for m in several:
-            of = m.measurement
-            for (key, name), uv, confidence in zip(keys[id(of.layout)], of.uv, of.confidence):
-                if confidence > 0.0:
-                    values[key][f, 0, names[key][name]], trust[key][f, 0, names[key][name]] = uv, confidence
-    records = [Keypoints(k[0], k[1], tuple(n), rate, values[k], trust[k]) for k, n in names.items()]
-    channels = make_channels(body, rig, records, list(sigma.values()))
-    layout, order = Layout(channels, body), list(names)
-    place = {(order[q], channels.points.names[c]): k for k, (q, c) in enumerate(zip(channels.source, channels.column))}
-    columns = {one: np.array([place[k] for k in own], np.int64) for one, own in keys.items()}
-    return channels, [
-        replace(r, matched=(_together(several, columns, layout, f, r.time),) if several else ())
-        for f, (r, several) in enumerate(zip(results, matches))
+    layouts = {id(m.measurement.layout): m.measurement.layout for several in matches for m in several}
+    if len(layouts) < 2 and max(map(len, matches)) < 2:
+        return results
+    streams: dict[tuple[str, str], dict[str, None]] = {}
+    for one in layouts.values():
+        for camera, keypoint_set, names in one.streams:
+            streams.setdefault((camera, keypoint_set), {}).update(dict.fromkeys(names))
+    sensor = next(several[-1] for several in reversed(matches) if several).measurement.of
+    layout, _ = sensor.layout(body, [(*key, tuple(names)) for key, names in streams.items()])
+    place = {point: k for k, point in enumerate(layout.of_streams)}
+    columns = {key: np.array([place[point] for point in one.of_streams], np.int64) for key, one in layouts.items()}
+    return [
+        replace(r, matched=(_together(several, columns, layout, r.time),) if several else ())
+        for r, several in zip(results, matches)
     ]
 
 
 def _together(
-    several: Sequence[KeypointMatched], columns: dict[int, NDArray], layout: Layout, f: int, time: float
+    several: Sequence[KeypointMatched], columns: dict[int, NDArray], layout: Layout, time: float
 ) -> KeypointMatched:
     """Matches of one time in another layout."""
-    channels = layout.channels
-    measurement = KeypointMeasurement(several[0].measurement.of, layout, channels.uv[f], channels.confidence[f], time)
-    swapped, hidden = np.zeros(len(channels.column), bool), []
+    N = len(layout.points)
+    uv, confidence, swapped, hidden = np.full((N, 2), np.nan), np.zeros(N), np.zeros(N, bool), []
     for m in several:
-        column = columns[id(m.measurement.layout)]
-        swapped[column] = m.swapped
+        column, of = columns[id(m.measurement.layout)], m.measurement
+        seen = of.confidence > 0.0
+        uv[column[seen]], confidence[column[seen]], swapped[column] = of.uv[seen], of.confidence[seen], m.swapped
         hidden += [replace(h, index=column[h.index], far=column[h.far]) for h in m.hidden]
-    order = np.where(swapped, channels.partner, np.arange(len(swapped)))
+    measurement = KeypointMeasurement(several[0].measurement.of, layout, uv, confidence, time)
+    order = np.where(swapped, layout.channels.partner, np.arange(N))
     return KeypointMatched(
         measurement, np.ascontiguousarray(measurement.uv[order]), np.ascontiguousarray(measurement.weight[order]),
         swapped, several[0].loss, tuple(hidden),
     )  # fmt: skip
-
-
-def _keys(channels: Channels) -> list[tuple[_Key, str]]:
-    """Of each channel its camera, its keypoint set and its record among them, and its point's name."""
-    count: dict[tuple[str, str], int] = {}
-    of: dict[int, _Key] = {}
-    out = []
-    for q, camera, c in zip(channels.source, channels.camera, channels.column):
-        if q not in of:
-            name = next(n for n, span in channels.sets.items() if span.start <= c < span.stop)
-            pair = channels.rig.cameras[camera].name, name
-            of[q] = (*pair, count.get(pair, 0))
-            count[pair] = count.get(pair, 0) + 1
-        out.append((of[q], channels.points.names[c]))
-    return out
 
 
 def axis_of(up: NDArray) -> str:

@@ -26,9 +26,7 @@ from kinefit.observations.arrays import is_number
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.checks import of_kind
-from kinefit.sensors.depth_image import DepthImageSensor
 from kinefit.sensors.parting import without_others
-from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.mobility import check_closed
@@ -118,7 +116,7 @@ class Tracker:
     @property
     def sees_surfaces(self) -> bool:
         """Whether some sensor so far shows a person as a whole: searches in it take long."""
-        return any(isinstance(s, DepthImageSensor | PointCloudSensor) for s in self.sensors)
+        return any(sensor.shows_person for sensor in self.sensors)
 
     @property
     def sigma(self) -> Mapping[str, float]:
@@ -198,7 +196,7 @@ class Tracker:
             raise ObservationError("a session in which the body was not found", remedy=remedy)
         if contacts and not smooth:
             raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
-        frames = self._session.frames(self.body, self.rig, self.scene_of, self.apart)
+        frames = self._session.frames(self.body, self.scene_of, self.apart)
         subject = Subject(self.body, np.ones(len(self.body.scale_groups)))
         told = {"frames": {"dropped": self.dropped, "late": self.late}}
         return motion_of(

@@ -13,10 +13,9 @@ from kinefit.smoothing.known_noise import KnownNoise
 from kinefit.subject.subject import Progress, Subject
 from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.interrupted import TrackingInterrupted
-from kinefit.tracking.motions import TrackedFrames, motion_of
+from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
-from kinefit.tracking.session import one_layout
 from kinefit.tracking.sizing import fitted_to_person
 
 
@@ -98,18 +97,13 @@ def track(
         person.recording, person.subject.body, settings, start=person.start, values=person.values,
         view_bias=person.subject.view_bias, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
-    steps, tracker = tracked.steps, tracked.tracker
-    channels, results = one_layout(tracker.body, tracker.rig, tracked.results, recording.rate)
-    frames = TrackedFrames(
-        channels, results, tracked.measurements, tracked.leftovers, recording.times[steps], recording.rate,
-        tracker.scene_of, tracker.apart,
-    )  # fmt: skip
+    tracker = tracked.tracker
     others = {} if recording.followed is None else recording.followed.as_told()
     told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     motion = motion_of(
-        frames, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
+        tracked, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
         eye=None if recording.alone is None else recording.alone.centre_world,
         lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
         found=person.joint,
