@@ -10,7 +10,7 @@ from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.detector_noise import DetectorNoise
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.keypoints import Layout
+from kinefit.sensors.points.keypoints import Layout
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting

@@ -20,7 +20,7 @@ from kinefit.frame.trust import forgotten, holding, leapt, left_out, levered, mo
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import closed_step, on_null_space

@@ -26,12 +26,12 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, PairRows, ParameterRows
 from kinefit.sensors.checks import check_rows, named
-from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.surfaces.depth_view import DepthView
 
 if TYPE_CHECKING:
-    from kinefit.sensors.occlusion import DepthSeen
+    from kinefit.sensors.visibility.occlusion import DepthSeen
 
 
 @dataclass(frozen=True)

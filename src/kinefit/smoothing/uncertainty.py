@@ -25,7 +25,7 @@ from kinefit.frame.results import ANYWHERE, FrameResult
 from kinefit.multiview.detector_noise import DetectorNoise, estimate_noise
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import Layout
+from kinefit.sensors.points.keypoints import Layout
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors

@@ -13,11 +13,11 @@ from kinefit.errors import TrackingError
 from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.sensors.keypoints import NAME, KeypointMeasurement, KeypointSensor, Layout
-from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.keypoints import NAME, KeypointMeasurement, KeypointSensor, Layout
+from kinefit.sensors.points.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.triangulation import triangulated
+from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.triangulation import triangulated
-from kinefit.sensors.view_bias import ViewBias
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear

@@ -17,13 +17,13 @@ from kinefit.losses import SQUARED
 from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.keypoints import KeypointMatched
+from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.fixed_lag import FixedLag
-from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.smoothing.lag_frame import TrackerView
 from kinefit.smoothing.linearised import ApartRows, OtherSensors, SceneOf
+from kinefit.smoothing.online.fixed_lag import FixedLag
+from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import TrackerView
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import pixels_of_track, smooth_results

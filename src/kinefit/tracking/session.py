@@ -17,7 +17,7 @@ from kinefit.observations import Keypoints
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.base import Leftover, Measurement, leftovers_at
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement, Layout
+from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import Spool

@@ -29,7 +29,7 @@ from kinefit.readers.take.load import Observations
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.displaced import AXES, Displaced, displacement
-from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor, Layout
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.fit import fit_subject
@@ -39,7 +39,7 @@ from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
-from kinefit.tracking.take_recording import marker_sensor, recording_of
+from kinefit.tracking.takes.take_recording import marker_sensor, recording_of
 from kinefit.tracking.video import track
 
 FRAMES = 12

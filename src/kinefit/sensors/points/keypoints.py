@@ -21,11 +21,11 @@ from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
-from kinefit.sensors.left_right import find_swaps, limb_groups
-from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
+from kinefit.sensors.points.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.triangulation import triangulated_frame
+from kinefit.sensors.points.view_bias import beside, trunks
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.triangulation import triangulated_frame
-from kinefit.sensors.view_bias import beside, trunks
+from kinefit.sensors.visibility.occlusion import SEEN, Hidden, hidden_points
 
 NAME = "keypoints"
 
