@@ -83,7 +83,7 @@ def _accuracy(plain: Scene, occluded: Scene) -> dict[str, float]:
 
 def unhidden(scene: Scene, r: Run) -> NDArray:
     """(F, 10) share of each part's true outline that neither another part nor an obstacle hides."""
-    from kinefit.sensors.visibility import Layers
+    from kinefit.sensors.visibility.visibility import Layers
 
     layers = Layers(scene.body, scene.rig["depth"], mesh=scene.mesh)
     out = np.empty(r.add.shape)

@@ -148,7 +148,7 @@ def _size(body: Any) -> None:
     from dataclasses import replace
 
     from kinefit.bodies.surfaces import TaperedCylinder
-    from kinefit.sensors.depth_view import view_of
+    from kinefit.sensors.surfaces.depth_view import view_of
     from kinefit.simulation.rendering.sensors import KINECT
     from kinefit.subject.depth import fit_surfaces
 

@@ -12,7 +12,6 @@ from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.layout import Layout, projected
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.view_bias import ViewBias
 
 _SURE = 0.3  # confidence of keypoints that are held against the fit
 _SIGMA = 8.0  # [px] at which sides count as exchanged, as for a take that states nothing

@@ -31,9 +31,9 @@ from kinefit.exporters import write_glb
 from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud
 from kinefit.recipes.metaball_bodies import metaball_bodies
-from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 from kinefit.simulation import squat_and_wave
 from kinefit.solvers.equations import normal_equations
 from kinefit.subject.fit import fit_subject

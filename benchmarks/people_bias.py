@@ -32,7 +32,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.preparing import detecting
 from kinefit.preparing.take import prepared
 from kinefit.readers.keypoints import read_caliscope_csv
-from kinefit.sensors.view_bias import ViewBias
+from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.tracking.sizing import channels_of

@@ -18,9 +18,9 @@ from kinefit.preparing.take import prepared
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.video import Video
-from kinefit.tracking.in_view import people_in_view
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.take import track_take
+from kinefit.tracking.takes.in_view import people_in_view
+from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.video import track
 
 _GOALS = {

@@ -21,7 +21,7 @@ from kinefit.bodies.surfaces.obj import read_obj
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame
-from kinefit.tracking.take import track_take
+from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.tracker import Tracker
 
 RATE = 30.0  # [Hz] that the images are taken to have; the recording does not state it

@@ -13,9 +13,9 @@ from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import SilhouetteFrame
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.parameters import Parameters
 from kinefit.subject.subject import SubjectFit

@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -48,6 +49,7 @@ SEEN_ONLY_BY = {
     "viewers": {"recipes", "batch", "cli"},
     "assets": {"cli", "preparing"},
 }
+MOST_FILES = 15  # of a folder, without its __init__.py
 LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds
 
 
@@ -185,6 +187,13 @@ def test_a_class_name_means_one_thing():
                 homes.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
     wrong = [f"class {name} is in {', '.join(places)}" for name, places in homes.items() if len(places) > 1]
     assert not wrong, "\n".join([*wrong, "Name each by what it is, or make them one."])
+
+
+def test_rooms_are_small():
+    sizes = Counter(path.parent for path in SOURCES if path.name != "__init__.py")
+    wrong = [f"{room.relative_to(ROOT)}: {size} files" for room, size in sizes.items() if size > MOST_FILES]
+    remedy = f"{MOST_FILES} are allowed: split by what is imported together, or join files."
+    assert not wrong, "\n".join([*wrong, remedy])
 
 
 def test_files_are_short():

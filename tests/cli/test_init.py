@@ -21,7 +21,7 @@ from kinefit.errors import TakeError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take_recording import recording_of
 
 
 def run(*args):

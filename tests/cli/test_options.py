@@ -23,11 +23,11 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut, write_synthetic_take
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
-from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.take import track_take
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.video import track
 

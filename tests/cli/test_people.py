@@ -42,8 +42,8 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
     from kinefit.multiview import followed
-    from kinefit.tracking import in_view
-    from kinefit.tracking import take as module
+    from kinefit.tracking.takes import in_view
+    from kinefit.tracking.takes import take as module
 
     calls = []
     for of, name in ((module, "load_observations"), (in_view, "load_observations"), (followed, "people_of")):
@@ -80,7 +80,7 @@ def test_a_number_too_many_is_told(take, tmp_path):
 
 def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monkeypatch):
     from kinefit.errors import TrackingError
-    from kinefit.tracking import take as module
+    from kinefit.tracking.takes import take as module
 
     original = module.track_take
 

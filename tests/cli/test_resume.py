@@ -10,7 +10,7 @@ from kinefit.batch import one
 from kinefit.cli import main
 from kinefit.readers.take.file import read_take
 from kinefit.tracking import run as running
-from kinefit.tracking.checkpoint import key_of
+from kinefit.tracking.checkpoints.checkpoint import key_of
 from kinefit.tracking.tracker import Tracker
 
 

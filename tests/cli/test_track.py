@@ -20,7 +20,7 @@ from kinefit.cli._summary import bone_lengths, frame_ranges
 from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.tracking.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 

@@ -13,7 +13,7 @@ from kinefit.frame.fit import FrameFit
 from kinefit.frame.trust import forgotten, holding, left_out, moving, observed
 from kinefit.observations import KeypointFrame
 from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
-from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave, studio_rig

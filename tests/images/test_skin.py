@@ -7,7 +7,7 @@ import pytest
 from kinefit.errors import ObservationError
 from kinefit.images.detectors.skin import WRISTS, SkinTracker
 from kinefit.readers.video import Video
-from kinefit.sensors.occlusion import SEEN
+from kinefit.sensors.visibility.occlusion import SEEN
 
 SKIN, WOOD, WALL, SHIRT = (205, 150, 125), (190, 140, 110), (130, 150, 140), (40, 60, 120)
 FACE = (285.0, 80.0, 70.0, 100.0)

@@ -4,7 +4,7 @@ import numpy as np
 from tests.tracking.depth_oracle import BODY, UP, camera, depth_of, facing
 
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.sensors.depth_view import view_of
+from kinefit.sensors.surfaces.depth_view import view_of
 
 
 def test_one_who_faced_away_a_moment_ago_rather_still_does():

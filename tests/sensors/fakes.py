@@ -15,7 +15,7 @@ from kinefit.correspondences import point_rows
 from kinefit.observations import DepthFrame
 from kinefit.rows import PairRows
 from kinefit.sensors.base import Measurement, RowsOf, Sensor, Unknown
-from kinefit.sensors.occlusion import depth_behind
+from kinefit.sensors.visibility.occlusion import depth_behind
 
 HELD = (
     "neck", "hip_centre", "nose_tip", "r_hip", "l_hip", "r_shoulder", "l_shoulder", "r_elbow", "l_elbow", "r_knee",

@@ -12,7 +12,7 @@ from kinefit.bodies.surfaces import MeshSurface, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.initialization.depth_score import OVERLAP, POSTURE, TOLERANCE, Score, spreads
 from kinefit.rendering import Canvas, rasterise
-from kinefit.sensors.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
+from kinefit.sensors.surfaces.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
 
 CAMERA = camera()
 

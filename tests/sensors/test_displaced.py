@@ -11,7 +11,7 @@ from kinefit.losses import SQUARED
 from kinefit.observations import MarkerFrame
 from kinefit.sensors.base import matched_by, rows_at
 from kinefit.sensors.displaced import CLOCK, Displaced, displacement
-from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.points.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.sensor_parameters import SensorFrames

@@ -11,7 +11,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.losses import SQUARED, geman_mcclure
 from kinefit.observations import LineFrame
 from kinefit.rows import DofRows
-from kinefit.sensors.image_lines import ImageLineSensor, image_lines
+from kinefit.sensors.points.image_lines import ImageLineSensor, image_lines
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton

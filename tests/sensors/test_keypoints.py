@@ -10,8 +10,8 @@ from tests.tracking.movements import BODY, SET, a_motion, a_rig, keypoint_frame,
 from kinefit.errors import BodyError, CalibrationError
 from kinefit.losses import geman_mcclure
 from kinefit.observations import KeypointFrame
-from kinefit.sensors.keypoints import KeypointSensor
-from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.points.keypoints import KeypointSensor
+from kinefit.sensors.points.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton, levenberg_marquardt

@@ -10,7 +10,7 @@ from kinefit.errors import BodyError, CalibrationError, ObservationError
 from kinefit.observations import LiftedFrame
 from kinefit.rows import PairRows
 from kinefit.sensors.channels import known_points
-from kinefit.sensors.lifted import HIPS, LiftedSensor
+from kinefit.sensors.points.lifted import HIPS, LiftedSensor
 from kinefit.sensors.scene import Scene
 
 BODY, SET = load_body("humanoid"), "MEDIAPIPE_33"

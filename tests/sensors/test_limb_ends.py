@@ -9,7 +9,7 @@ from kinefit.bodies import load_body
 from kinefit.bodies.fingers import of_fingers
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, render_body
-from kinefit.sensors.visibility import Layers, judge_segments
+from kinefit.sensors.visibility.visibility import Layers, judge_segments
 
 BODY = load_body("humanoid")
 LENS = np.array([[275.0, 0, 159.5], [0, 275.0, 119.5], [0, 0, 1]])

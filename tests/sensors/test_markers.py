@@ -11,7 +11,7 @@ from kinefit.errors import BodyError
 from kinefit.losses import geman_mcclure
 from kinefit.observations import MarkerFrame
 from kinefit.sensors.evidence import SHOWN
-from kinefit.sensors.markers import MarkerSensor, of_points
+from kinefit.sensors.points.markers import MarkerSensor, of_points
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.least_squares import gauss_newton
 

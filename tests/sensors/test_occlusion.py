@@ -9,11 +9,11 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.depth_image import DepthImageSensor
-from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
-from kinefit.sensors.occlusion import THICK, DepthSeen, beside, depth_behind, hidden_points
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.visibility.occlusion import THICK, DepthSeen, beside, depth_behind, hidden_points
 from kinefit.solvers.equations import normal_equations
 
 TRUTH = a_motion().state(0)

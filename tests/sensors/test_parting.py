@@ -9,11 +9,11 @@ from tests.tracking.depth_oracle import BODY, camera, facing
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, SilhouetteFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.depth_image import DepthImageSensor
-from kinefit.sensors.parting import without_others
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
+from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.visibility.parting import without_others
 
 SETTINGS = TrackSettings()
 

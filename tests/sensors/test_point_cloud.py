@@ -17,8 +17,8 @@ from kinefit.correspondences import surface_rows
 from kinefit.errors import BodyError
 from kinefit.observations import PointCloud
 from kinefit.rows import DofRows
-from kinefit.sensors.point_cloud import PointCloudSensor
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 
 WRONG = turned(TRUTH, arm_add_l=-12)
 

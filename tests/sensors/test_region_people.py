@@ -8,8 +8,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.images.regions import RegionSettings
 from kinefit.observations import ColourFrame
 from kinefit.rendering import render_body
-from kinefit.sensors.region_parts import AROUND, Parts
-from kinefit.sensors.regions import RegionSensor
+from kinefit.sensors.regions.region_parts import AROUND, Parts
+from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker

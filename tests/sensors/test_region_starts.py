@@ -10,10 +10,10 @@ from kinefit.frame.trust import leapt
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_flips import Flips
-from kinefit.sensors.region_limbs import Limbs
-from kinefit.sensors.region_seams import Seams
-from kinefit.sensors.regions import RegionSensor
+from kinefit.sensors.regions.region_flips import Flips
+from kinefit.sensors.regions.region_limbs import Limbs
+from kinefit.sensors.regions.region_seams import Seams
+from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker

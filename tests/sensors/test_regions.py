@@ -13,8 +13,8 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.regions import RegionSettings
 from kinefit.observations import ColourFrame
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_parts import spread_anchors
-from kinefit.sensors.regions import RegionSensor
+from kinefit.sensors.regions.region_parts import spread_anchors
+from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker

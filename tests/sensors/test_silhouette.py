@@ -16,7 +16,7 @@ from kinefit.motion import Motion
 from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.take import track_take
+from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.tracker import Tracker
 
 

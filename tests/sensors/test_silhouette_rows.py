@@ -16,9 +16,9 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import Canvas, render_body
 from kinefit.rows import DofRows
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
 from kinefit.solvers.least_squares import gauss_newton
 
 SETTINGS, RIG = TrackSettings(), ring()

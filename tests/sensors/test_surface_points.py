@@ -11,7 +11,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SurfacePointFrame
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.surface_points import SurfacePointSensor
+from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.tracking.tracker import Tracker
 
 BODY = load_body("humanoid")

@@ -9,7 +9,6 @@ from kinefit.sensors.channels import make_channels
 from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.layout import Layout, projected
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias, beside, directions, trunks
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track

@@ -7,8 +7,8 @@ from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import render_body
-from kinefit.sensors import _kernels_visibility as kernels
-from kinefit.sensors.visibility import Layers, judge_segments
+from kinefit.sensors.visibility import _kernels_visibility as kernels
+from kinefit.sensors.visibility.visibility import Layers, judge_segments
 
 CAMERA = Camera("depth", (320, 240), np.array([[275.0, 0, 159.5], [0, 275.0, 119.5], [0, 0, 1]]))
 WALL = 6.0  # [m]

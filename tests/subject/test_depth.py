@@ -8,7 +8,7 @@ from tests.tracking.depth_oracle import ARMS, BODY, camera, depth_of, facing
 
 from kinefit.bodies.surfaces import TaperedCylinder, nearest
 from kinefit.errors import BodyError, ObservationError
-from kinefit.sensors.depth_view import view_of
+from kinefit.sensors.surfaces.depth_view import view_of
 from kinefit.subject.depth import fit_surfaces
 from kinefit.subject.surfaces import GIRTH
 

@@ -14,7 +14,7 @@ from kinefit.geometry import se3
 from kinefit.losses import geman_mcclure
 from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import RowsOf, Unknown
-from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
+from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.bundle.border_frames import differences
 from kinefit.subject.lasting import Seen, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds

@@ -7,7 +7,7 @@ from tests.oracle import posture, rig_around
 from kinefit.bodies import load_body
 from kinefit.losses import SQUARED
 from kinefit.observations import KeypointFrame
-from kinefit.sensors.keypoints import KeypointSensor
+from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.bundle.border_frames import differences
 from kinefit.subject.matched_frames import MatchedFrames, Worlds

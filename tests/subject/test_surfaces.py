@@ -11,9 +11,9 @@ from kinefit.bodies.surfaces import TaperedCylinder, body_mesh
 from kinefit.errors import BodyError
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.parameters import SegmentScales, World
 from kinefit.subject.surfaces import GIRTH, CylinderShape, Girths

@@ -8,7 +8,6 @@ from kinefit.bodies import load_body
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.layout import Layout
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias

@@ -18,9 +18,9 @@ from kinefit.cli import main
 from kinefit.errors import AssetError, BodyError
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import Canvas, render_body
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
 from kinefit.subject.surfaces import AnnyShape, CylinderShape, shape_of
 
 FRAMES = 9

@@ -14,7 +14,7 @@ from tests.tracking.test_long_takes import FIELDS, SUBJECT, recording
 from kinefit import Recording, track
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.tracking import run as running
-from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 
 COUNT, EVERY = 14, 4
 

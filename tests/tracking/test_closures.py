@@ -20,7 +20,7 @@ from kinefit.sensors.base import RowsOf
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.closed import onto
-from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.video import track

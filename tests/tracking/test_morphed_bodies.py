@@ -13,8 +13,8 @@ from kinefit.losses import geman_mcclure
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import Canvas
 from kinefit.rows import DofRows
-from kinefit.sensors.keypoints import KeypointSensor
-from kinefit.sensors.markers import MarkerSensor
+from kinefit.sensors.points.keypoints import KeypointSensor
+from kinefit.sensors.points.markers import MarkerSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker

@@ -13,8 +13,8 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.one_camera import USUAL
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.in_view import people_in_view
-from kinefit.tracking.take import track_take
+from kinefit.tracking.takes.in_view import people_in_view
+from kinefit.tracking.takes.take import track_take
 
 SIZE, RATE = (720, 1280), 30.0
 HEAD = f"[take]\nrate = {RATE}\n"

@@ -20,8 +20,8 @@ from kinefit.geometry import se3
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.take.file import read_take
 from kinefit.rendering import render_body
-from kinefit.tracking.take import track_take
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 
 FRAMES, TURN = 8, np.radians(5.0)
 BODY = """

@@ -13,8 +13,8 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave, write_synthetic_take
 from kinefit.simulation.movements import movement, people
-from kinefit.tracking.take import track_take
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 
 MARKERS = ("l_wrist", "r_wrist", "l_knee")
 

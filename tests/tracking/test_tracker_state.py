@@ -15,14 +15,14 @@ from tests.tracking.test_contract import MIXES, SEEN, SIGMA
 from kinefit import Recording, track
 from kinefit.frame.prediction import Prediction
 from kinefit.geometry.camera import Rig
-from kinefit.sensors.background import Background
 from kinefit.sensors.base import Matched, Measurement, Sensor
-from kinefit.sensors.regions import RegionSensor
+from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_points import SurfacePointSensor
+from kinefit.sensors.surfaces.background import Background
+from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.smoothing.record_classes import CODEC
 from kinefit.tracking import run as running
-from kinefit.tracking.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.recovery import Recovery
 from kinefit.tracking.tracker import Tracker
 

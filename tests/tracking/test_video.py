@@ -14,7 +14,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.agreement import sentences
-from kinefit.tracking.take import track_take
+from kinefit.tracking.takes.take import track_take
 
 
 @pytest.fixture(scope="module")

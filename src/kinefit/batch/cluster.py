@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from kinefit.batch.processes import Failure
 from kinefit.errors import ExportError
-from kinefit.tracking.checkpoint import code_digest
+from kinefit.tracking.checkpoints.checkpoint import code_digest
 
 T = TypeVar("T")
 R = TypeVar("R")

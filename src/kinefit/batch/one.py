@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.preparing.detecting import Tell
     from kinefit.readers.take.file import Take
-    from kinefit.tracking.in_view import InView
+    from kinefit.tracking.takes.in_view import InView
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
     Keypoints are detected and bodies fetched first, where the take needs them.
     """
     from kinefit.preparing.take import prepared
-    from kinefit.tracking.in_view import people_in_view
+    from kinefit.tracking.takes.in_view import people_in_view
 
     take = prepared(take, step, tell)
     view = people_in_view(take) if take.person is None else None
@@ -132,8 +132,8 @@ def track_person(
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
-    from kinefit.tracking.checkpoint import Checkpoint, key_of
-    from kinefit.tracking.take import settings_of, track_take
+    from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
+    from kinefit.tracking.takes.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     notes: list[str] = []

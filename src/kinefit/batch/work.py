@@ -54,7 +54,7 @@ def work(job: TakeJob) -> tuple[Row, ...]:
 
     What is wrong with the take stands in its rows. Other errors are raised, as they may not come again.
     """
-    from kinefit.tracking.checkpoint import key_of
+    from kinefit.tracking.checkpoints.checkpoint import key_of
 
     start, said = Row(take=job.label), list[str]()
     try:

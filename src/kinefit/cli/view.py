@@ -148,7 +148,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     from kinefit.multiview.followed import follow
     from kinefit.readers.take.pictures import TakePictures
     from kinefit.sensors.channels import make_channels
-    from kinefit.sensors.triangulation import triangulated
+    from kinefit.sensors.points.triangulation import triangulated
 
     if seen.rig is None or not seen.keypoints:
         return None

@@ -59,7 +59,7 @@ def _surfaces() -> None:
     from kinefit.photogrammetry.spline_image import SplineImage
     from kinefit.photogrammetry.states import measure_states, surface_strain
     from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-    from kinefit.sensors.surface_points import SurfacePointSensor
+    from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
     from kinefit.tracking.tracker import Tracker
 
     random, places = np.random.default_rng(0), (0.0, -0.12, 0.12)

@@ -25,7 +25,6 @@ from kinefit.observations import (
     sensor_of,
 )
 from kinefit.observations.arrays import is_number
-from kinefit.sensors.background import Background
 from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
 from kinefit.sensors.channel_names import ChannelNames
 from kinefit.sensors.depth_image import DepthImageSensor

@@ -14,8 +14,8 @@ from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import AGREES, Evidence
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers, near
+from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances
 

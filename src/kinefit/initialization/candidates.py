@@ -21,6 +21,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.depth_view import camera_at
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.surfaces.depth_view import camera_at
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
 LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is about this much of a person

@@ -16,8 +16,8 @@ from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs
 from kinefit.rendering import Canvas, rasterise
-from kinefit.sensors import _kernels_depth_view as kernels
-from kinefit.sensors.depth_view import DepthView
+from kinefit.sensors.surfaces import _kernels_depth_view as kernels
+from kinefit.sensors.surfaces.depth_view import DepthView
 
 TOLERANCE = 0.10  # [m] a drawn surface this far from the measured one explains nothing: the radius of a thigh
 OVERLAP = 0.5  # [1/m] share of the score that a metre of parts within parts costs: 2 cm, the softness of flesh, 1 %

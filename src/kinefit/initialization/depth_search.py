@@ -16,7 +16,7 @@ from kinefit.correspondences import point_rows, prior_rows, surface_rows
 from kinefit.initialization.depth_score import Score, spreads
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
-from kinefit.sensors.depth_view import DepthView, geodesic_ends
+from kinefit.sensors.surfaces.depth_view import DepthView, geodesic_ends
 from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_marquardt
 
 POINTS = 700  # measured points that take part in a fit: more do not distinguish postures better

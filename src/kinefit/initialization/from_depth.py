@@ -20,7 +20,7 @@ from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, noise_of, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.sensors.depth_view import DepthView, splat, view_of
+from kinefit.sensors.surfaces.depth_view import DepthView, splat, view_of
 from kinefit.subject.depth import fit_surfaces
 from kinefit.subject.subject import SubjectFit
 

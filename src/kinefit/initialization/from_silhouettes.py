@@ -15,9 +15,9 @@ from kinefit.frame.results import FrameResult
 from kinefit.frame.routing import Sensors
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SilhouetteFrame
+from kinefit.sensors.regions.silhouette import SilhouetteMeasurement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteMeasurement
 
 
 class Level(NamedTuple):

@@ -23,7 +23,7 @@ from kinefit.readers.take.file import CameraEntry, DepthEntry, Take
 from kinefit.readers.take.load import image_frame, read_rig
 from kinefit.readers.take.one_camera import assumed_camera, is_alone
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.take_recording import posed_start
+from kinefit.tracking.takes.take_recording import posed_start
 
 _RATE = 30.0  # [Hz] of streams that nothing states a rate of
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing

@@ -25,8 +25,8 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.one_camera import is_alone
 from kinefit.readers.take.streams import streams_of
 from kinefit.tracking.run import tracker_of
-from kinefit.tracking.take import settings_of, trial_of
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take import settings_of, trial_of
+from kinefit.tracking.takes.take_recording import recording_of
 
 
 def live_session(

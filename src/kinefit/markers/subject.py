@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.markers.poses import LOSS, columns, sequence_both_ways
 from kinefit.observations import Markers
 from kinefit.sensors.base import Measurement
-from kinefit.sensors.markers import MarkerMeasurement, MarkerSensor
+from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.subject import fit as joint
 from kinefit.subject.parameters import PointOffsets, SegmentScales
 from kinefit.subject.subject import SubjectFit

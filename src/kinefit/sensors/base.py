@@ -26,9 +26,9 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, PairRows, ParameterRows
 from kinefit.sensors.checks import check_rows, named
-from kinefit.sensors.depth_view import DepthView
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.surfaces.depth_view import DepthView
 
 if TYPE_CHECKING:
     from kinefit.sensors.keypoints import KeypointMatched

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.view_bias import beside, trunks
+from kinefit.sensors.points.view_bias import beside, trunks
 from kinefit.smoothing.spool import stretches
 
 

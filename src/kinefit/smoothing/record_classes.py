@@ -10,22 +10,22 @@ from kinefit.frame.results import FrameResult
 from kinefit.images.regions import Ratios, RegionColours
 from kinefit.losses import Loss
 from kinefit.sensors.base import Leftover, RowsOf
-from kinefit.sensors.depth_image import DepthImageMatched, DepthImageMeasurement
 from kinefit.sensors.displaced import Displaced, DisplacedMatched
-from kinefit.sensors.image_lines import ImageLineMatched, ImageLineMeasurement
-from kinefit.sensors.keypoints import KeypointMatched, KeypointMeasurement
-from kinefit.sensors.lifted import LiftedMatched, LiftedMeasurement
-from kinefit.sensors.markers import MarkerMatched, MarkerMeasurement
-from kinefit.sensors.occlusion import Hidden
-from kinefit.sensors.point_cloud import PointCloudMatched, PointCloudMeasurement
-from kinefit.sensors.region_image import Coloured, Kept
-from kinefit.sensors.region_matched import RegionMatched
-from kinefit.sensors.region_parts import Lines
-from kinefit.sensors.region_seams import Seams
-from kinefit.sensors.regions import RegionMeasurement
-from kinefit.sensors.silhouette import SilhouetteMatched, SilhouetteMeasurement
-from kinefit.sensors.surface_match import FreePairs, SurfacePairs
-from kinefit.sensors.surface_points import SurfacePointMatched, SurfacePointMeasurement
+from kinefit.sensors.points.image_lines import ImageLineMatched, ImageLineMeasurement
+from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
+from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
+from kinefit.sensors.points.markers import MarkerMatched, MarkerMeasurement
+from kinefit.sensors.regions.region_image import Coloured, Kept
+from kinefit.sensors.regions.region_matched import RegionMatched
+from kinefit.sensors.regions.region_parts import Lines
+from kinefit.sensors.regions.region_seams import Seams
+from kinefit.sensors.regions.regions import RegionMeasurement
+from kinefit.sensors.regions.silhouette import SilhouetteMatched, SilhouetteMeasurement
+from kinefit.sensors.surfaces.depth_image import DepthImageMatched, DepthImageMeasurement
+from kinefit.sensors.surfaces.point_cloud import PointCloudMatched, PointCloudMeasurement
+from kinefit.sensors.surfaces.surface_match import FreePairs, SurfacePairs
+from kinefit.sensors.surfaces.surface_points import SurfacePointMatched, SurfacePointMeasurement
+from kinefit.sensors.visibility.occlusion import Hidden
 
 CODEC = Codec([
     BodyState, PointSet, SurfaceAnchors, Rim, FrameResult, Ratios, RegionColours, Loss, Leftover, RowsOf,

@@ -18,8 +18,6 @@ from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.layout import Layout
 from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.triangulation import triangulated
-from kinefit.sensors.view_bias import ViewBias
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.sensors.channels import Channels, mirror_name
-from kinefit.sensors.view_bias import MIRRORED, TERMS, ViewBias, directions, trunks
+from kinefit.sensors.points.view_bias import MIRRORED, TERMS, ViewBias, directions, trunks
 
 _PRIOR = 0.01  # [m] standard deviation of a coefficient: of 1, 1.4 and 2 cm the best on three recordings of the
 # built-in network (`benchmarks.people_bias`); 2 cm gains more on two of them, and loses 7 % on the third

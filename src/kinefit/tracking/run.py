@@ -16,12 +16,12 @@ from kinefit.sensors.view_bias import ViewBias
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.subject.subject import Progress
-from kinefit.tracking.checkpoint import Checkpoint
-from kinefit.tracking.frame_file import KINDS
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.frame_file import KINDS
+from kinefit.tracking.checkpoints.so_far import append_rows
 from kinefit.tracking.others import OtherPeople
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.session import KeptFrame
-from kinefit.tracking.so_far import append_rows
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.tracker_state import restore_tracker, save_tracker
 

@@ -29,6 +29,9 @@ from kinefit.sensors.checks import of_kind
 from kinefit.sensors.parting import without_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
+from kinefit.sensors.visibility.parting import without_others
 from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject
 from kinefit.tracking.motions import motion_of

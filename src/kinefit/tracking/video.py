@@ -8,8 +8,8 @@ from kinefit.errors import ObservationError
 from kinefit.motion import Motion
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.fixed_lag import lag_frames
-from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.online.fixed_lag import lag_frames
+from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Progress, Subject
 from kinefit.tracking.checkpoint import Checkpoint
 from kinefit.tracking.interrupted import TrackingInterrupted

@@ -10,8 +10,8 @@ from kinefit.errors import TakeError
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.take import track_take
-from kinefit.tracking.take_recording import recording_of
+from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 
 
 def written(folder, *, region='[[region]]\ncamera = "cam"\n', start=True, scale=1, count=4):

@@ -16,11 +16,11 @@ from kinefit.losses import Loss
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, by_segments
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_seams import Seams
+from kinefit.sensors.regions.region_seams import Seams
 from kinefit.sensors.scene import Scene
 
 if TYPE_CHECKING:
-    from kinefit.sensors.regions import RegionMeasurement
+    from kinefit.sensors.regions.regions import RegionMeasurement
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import KinematicTree
 from kinefit.geometry.camera import Rig
-from kinefit.sensors import _kernels_view_bias as _kernels
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.points import _kernels_view_bias as _kernels
 
 TERMS = 5
 MIRRORED = np.outer((1.0, 1.0, -1.0, 1.0, -1.0), (1.0, 1.0, -1.0))

@@ -17,17 +17,17 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.depth_noise import without_speckles
 from kinefit.observations import DepthFrame
 from kinefit.rows import AnyRows
-from kinefit.sensors import _kernels_depth_image as kernels
-from kinefit.sensors.background import Background
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.depth_gate import gathered, person_view, window_of
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.occlusion import DepthSeen
-from kinefit.sensors.parting import drawn_together, of_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_match import FreePairs, SurfacePairs, along
-from kinefit.sensors.visibility import judge_segments
+from kinefit.sensors.surfaces import _kernels_depth_image as kernels
+from kinefit.sensors.surfaces.background import Background
+from kinefit.sensors.surfaces.depth_gate import gathered, person_view, window_of
+from kinefit.sensors.surfaces.surface_match import FreePairs, SurfacePairs, along
+from kinefit.sensors.visibility.occlusion import DepthSeen
+from kinefit.sensors.visibility.parting import drawn_together, of_others
+from kinefit.sensors.visibility.visibility import judge_segments
 
 AGREES = 3.0  # standard deviations of a measurement that agrees
 _SHAPE = 0.03  # [m] by which a surface of simple shapes is off

@@ -22,14 +22,14 @@ from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
 from kinefit.tracking.cameras import as_found
-from kinefit.tracking.checkpoint import Checkpoint
-from kinefit.tracking.in_view import InView, people_in_view
-from kinefit.tracking.interrupted import TrackingInterrupted
-from kinefit.tracking.take_recording import from_afar, recording_of
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.takes.in_view import InView, people_in_view
+from kinefit.tracking.takes.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
 _USUAL = "humanoid"  # body of a take that names none

@@ -22,7 +22,7 @@ from kinefit.observations import SurfacePointFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.surface_match import SurfacePairs
+from kinefit.sensors.surfaces.surface_match import SurfacePairs
 
 _SETTLED = 0.05  # of the slide, by which places on a limb may wander from step to step: 0.5 mm, a degree of a thin arm
 _PATIENCE = 10  # steps after which a limb counts as settled: a cloud does not tell a round one's turn at all

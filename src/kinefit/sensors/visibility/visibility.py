@@ -18,9 +18,9 @@ from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
-from kinefit.sensors import _kernels_visibility as kernels
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.limb_ends import END, LimbEnds
+from kinefit.sensors.visibility import _kernels_visibility as kernels
+from kinefit.sensors.visibility.limb_ends import END, LimbEnds
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
 FEWEST = 16  # pixels of a whole outline: fewer say too little of a segment

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios
-from kinefit.sensors.region_parts import Drawn, Lines
+from kinefit.sensors.regions.region_parts import Drawn, Lines
 
 _LEVELS = 127  # of a log ratio that is kept, to either side of 0
 # A map that is kept is drawn as an image whose colours are numbers of levels, so that one kernel looks at both.

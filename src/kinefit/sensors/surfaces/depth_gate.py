@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Camera
-from kinefit.sensors import _kernels_depth_image as kernels
-from kinefit.sensors.depth_view import DepthView, view_of
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces import _kernels_depth_image as kernels
+from kinefit.sensors.surfaces.depth_view import DepthView, view_of
 
 
 def window_of(camera: Camera, low: NDArray, high: NDArray) -> tuple[tuple[int, int], tuple[int, int], float]:

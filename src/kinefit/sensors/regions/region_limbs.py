@@ -19,7 +19,7 @@ from kinefit.correspondences.contours.rims import Window
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.rendering import Canvas
-from kinefit.sensors.region_image import Coloured
+from kinefit.sensors.regions.region_image import Coloured
 
 _CELLS = 40  # along a body's longest side, in which vertices of a segment are merged: limbs are two wide
 _SIDE = 112  # [px] of the drawing, longer side: a forearm at 3 m is four wide

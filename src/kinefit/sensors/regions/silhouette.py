@@ -23,9 +23,9 @@ from kinefit.rendering import scaled
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.parting import drawn_together, outside_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.visibility.parting import drawn_together, outside_others
 
 _AGREES = 3.0  # standard deviations within which a contour agrees
 _STALE = 0.5  # [px] by which a body may have moved in the virtual image: half of how far beside its contour one looks

@@ -13,12 +13,12 @@ from kinefit.geometry.camera import Camera
 from kinefit.observations import PointCloud
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.depth_image import AGREES
-from kinefit.sensors.depth_view import camera_at, splat, view_of
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_match import SurfacePairs, along
+from kinefit.sensors.surfaces.depth_image import AGREES
+from kinefit.sensors.surfaces.depth_view import camera_at, splat, view_of
+from kinefit.sensors.surfaces.surface_match import SurfacePairs, along
 
 _PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
 

@@ -13,10 +13,10 @@ from kinefit.bodies.surfaces import segment_middles
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_flips import Flips
-from kinefit.sensors.region_image import Coloured
-from kinefit.sensors.region_limbs import Limbs
-from kinefit.sensors.region_search import Seeker, region_starts
+from kinefit.sensors.regions.region_flips import Flips
+from kinefit.sensors.regions.region_image import Coloured
+from kinefit.sensors.regions.region_limbs import Limbs
+from kinefit.sensors.regions.region_search import Seeker, region_starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 

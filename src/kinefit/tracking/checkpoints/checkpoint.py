@@ -20,8 +20,8 @@ import numpy as np
 
 from kinefit.errors import ExportError, KinefitError
 from kinefit.readers.take.file import Take, read_take
-from kinefit.tracking.frame_file import FrameFile
-from kinefit.tracking.so_far import BEGIN
+from kinefit.tracking.checkpoints.frame_file import FrameFile
+from kinefit.tracking.checkpoints.so_far import BEGIN
 
 try:
     import fcntl
@@ -183,7 +183,7 @@ def key_of(take: Take, **options: Any) -> str:
 def code_digest() -> bytes:
     """Of kinefit's own code, as it was when this process first asked."""
     digest = hashlib.sha256()
-    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
+    for source in sorted(Path(__file__).parents[2].rglob("*.py")):
         digest.update(source.read_bytes())
     return digest.digest()
 

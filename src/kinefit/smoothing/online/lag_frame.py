@@ -17,10 +17,11 @@ from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
 from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers
+from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.known_noise import KnownNoise, known_sigma
 from kinefit.smoothing.linearised import ApartRows, SceneOf
+from kinefit.smoothing.online.known_noise import KnownNoise, known_sigma
 from kinefit.smoothing.process_noise import INLIER
 from kinefit.solvers.equations import inverse, normal_equations
 

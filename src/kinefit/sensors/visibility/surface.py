@@ -16,7 +16,7 @@ from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
-from kinefit.sensors.visibility import Layers
+from kinefit.sensors.visibility.visibility import Layers
 
 _COLUMNS = 160  # of the image in which the body's own hidden parts are found: a forearm at 3 m is four pixels wide
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Camera
-from kinefit.sensors import _kernels_background as kernels
+from kinefit.sensors.surfaces import _kernels_background as kernels
 
 _COLUMNS = 320  # of the cells: finer ones cost more, and a wrist at 3 m is four wide
 _DEVIATIONS = 3.0  # beyond which a depth is something new

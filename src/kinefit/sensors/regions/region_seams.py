@@ -19,8 +19,8 @@ from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry.camera import Camera
 from kinefit.losses import Loss
 from kinefit.rows import DofRows
-from kinefit.sensors import _kernels_region_seams as kernels
-from kinefit.sensors.region_parts import Drawn, Lines
+from kinefit.sensors.regions import _kernels_region_seams as kernels
+from kinefit.sensors.regions.region_parts import Drawn, Lines
 from kinefit.sensors.scene import Scene
 
 _GAP = 0.02  # [m] between depths of neighbouring pixels of two parts that cut each other

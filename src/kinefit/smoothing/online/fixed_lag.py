@@ -21,8 +21,8 @@ from kinefit.frame.results import FrameResult, judged
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.checks import of_kind
-from kinefit.smoothing.known_noise import KnownNoise
-from kinefit.smoothing.lag_frame import Follows, FrameCosts, LagFrame
+from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import Follows, FrameCosts, LagFrame
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal

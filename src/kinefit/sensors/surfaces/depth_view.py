@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Camera
-from kinefit.sensors import _kernels_depth_view as kernels
+from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 
 _LENS = 300.0  # [px] of the camera that a cloud is looked at with
 _JUMP = 0.10  # [m] between neighbouring pixels that belong together: less than from an arm to the trunk behind it

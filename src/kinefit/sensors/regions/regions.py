@@ -25,11 +25,11 @@ from kinefit.losses import geman_mcclure
 from kinefit.observations import ColourFrame
 from kinefit.sensors.base import Measurement, Sensor
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.region_image import Coloured, kept
-from kinefit.sensors.region_matched import RegionMatched
-from kinefit.sensors.region_parts import OTHER, Drawn, Lines, Parts
-from kinefit.sensors.region_seams import SPACING, Seams
-from kinefit.sensors.region_starts import Starts
+from kinefit.sensors.regions.region_image import Coloured, kept
+from kinefit.sensors.regions.region_matched import RegionMatched
+from kinefit.sensors.regions.region_parts import OTHER, Drawn, Lines, Parts
+from kinefit.sensors.regions.region_seams import SPACING, Seams
+from kinefit.sensors.regions.region_starts import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 

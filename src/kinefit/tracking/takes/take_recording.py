@@ -24,7 +24,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surface_points import SurfacePointSensor
+from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.tracking.recording import Recording, spread
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing

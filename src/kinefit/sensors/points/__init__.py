@@ -1,0 +1,1 @@
+"""Sensors of points in images and in space: keypoints, markers, lines."""

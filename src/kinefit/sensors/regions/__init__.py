@@ -1,0 +1,1 @@
+"""Sensors of regions of an image: colours of segments, silhouettes."""

@@ -1,0 +1,1 @@
+"""Sensors of surfaces: depth images, point clouds, tracked surface points."""

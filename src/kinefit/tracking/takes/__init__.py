@@ -1,0 +1,1 @@
+"""Tracking of a take file: its recording, the people in view."""
