@@ -25,11 +25,11 @@ from kinefit.motion import Motion as Motion
 from kinefit.readers.take.file import read_take as read_take
 from kinefit.readers.take.load import load_observations as load_observations
 from kinefit.sensors.settings import TrackSettings as TrackSettings
-from kinefit.smoothing.fixed_lag import FixedLag as FixedLag
-from kinefit.smoothing.known_noise import KnownNoise as KnownNoise
+from kinefit.smoothing.online.fixed_lag import FixedLag as FixedLag
+from kinefit.smoothing.online.known_noise import KnownNoise as KnownNoise
 from kinefit.subject.fit import fit_subject as fit_subject
 from kinefit.tracking.recording import Recording as Recording
-from kinefit.tracking.take import track_take as track_take
+from kinefit.tracking.takes.take import track_take as track_take
 from kinefit.tracking.tracker import Tracker as Tracker
 from kinefit.tracking.video import track as track
 

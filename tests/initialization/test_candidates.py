@@ -22,9 +22,9 @@ from kinefit.initialization.candidates import (
 from kinefit.initialization.depth_search import PostureSearch
 from kinefit.observations import DepthFrame, PointCloud
 from kinefit.rendering import render_body
-from kinefit.sensors.depth_view import camera_at, view_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.depth_view import camera_at, view_of
 
 UP = np.array([0.0, 1.0, 0.0])
 TRUTH = a_motion().state(0)

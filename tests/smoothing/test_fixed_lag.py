@@ -12,8 +12,8 @@ from tests.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, a_track
 from kinefit import BodyState, Recording, load_body, track
 from kinefit.bodies.charts import twin
 from kinefit.errors import ObservationError
-from kinefit.smoothing.fixed_lag import FixedLag
-from kinefit.smoothing.known_noise import KnownNoise
+from kinefit.smoothing.online.fixed_lag import FixedLag
+from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.smoothing.process_noise import Strength
 from kinefit.smoothing.smoother import as_tracked
 from kinefit.smoothing.tracked_frames import TrackedFrames

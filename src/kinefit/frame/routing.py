@@ -27,17 +27,18 @@ from kinefit.observations import (
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
 from kinefit.sensors.channel_names import ChannelNames
-from kinefit.sensors.depth_image import DepthImageSensor
-from kinefit.sensors.image_lines import ImageLineSensor
-from kinefit.sensors.keypoints import KeypointSensor
-from kinefit.sensors.lifted import LiftedSensor
-from kinefit.sensors.markers import MarkerSensor
-from kinefit.sensors.point_cloud import PointCloudSensor
-from kinefit.sensors.regions import RegionSensor
+from kinefit.sensors.points.image_lines import ImageLineSensor
+from kinefit.sensors.points.keypoints import KeypointSensor
+from kinefit.sensors.points.lifted import LiftedSensor
+from kinefit.sensors.points.markers import MarkerSensor
+from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.regions.regions import RegionSensor
+from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.silhouette import SilhouetteSensor
-from kinefit.sensors.view_bias import ViewBias
+from kinefit.sensors.surfaces.background import Background
+from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 
 MIN_SIGMA, MAX_SIGMA = 1e-5, 1e4
 """[m] or [px] of a sensor: finer than any marker system, and wider than any image. A weight is 1 / sigma²."""

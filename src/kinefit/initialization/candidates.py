@@ -19,7 +19,6 @@ from kinefit.initialization.from_rays import starts_from_rays
 from kinefit.observations import DepthFrame, Frame, PointCloud
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
-from kinefit.sensors.depth_view import camera_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import camera_at
 

@@ -31,8 +31,8 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import DepthView
 
 if TYPE_CHECKING:
-    from kinefit.sensors.keypoints import KeypointMatched
-    from kinefit.sensors.occlusion import DepthSeen
+    from kinefit.sensors.points.keypoints import KeypointMatched
+    from kinefit.sensors.visibility.occlusion import DepthSeen
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.left_right import limb_groups
+from kinefit.sensors.points.left_right import limb_groups
+from kinefit.sensors.points.view_bias import beside, trunks
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.view_bias import beside, trunks
 
 Stream = tuple[str, str, tuple[str, ...]]
 """Camera, keypoint set and names of the keypoints that one detector gives frame after frame."""

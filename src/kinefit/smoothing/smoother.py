@@ -16,9 +16,7 @@ from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.frame.trust import adrift
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.left_right import find_swaps, limb_groups
 from kinefit.sensors.observability import SHORTEST, levers, near
-from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.points.left_right import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts

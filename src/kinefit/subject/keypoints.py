@@ -14,9 +14,11 @@ from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.losses import geman_mcclure
 from kinefit.observations import KEYPOINTS
 from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.sensors.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.layout import Layout
-from kinefit.sensors.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
+from kinefit.sensors.points.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.triangulation import triangulated
+from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint

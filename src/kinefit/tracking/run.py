@@ -11,8 +11,8 @@ from typing import Any
 from kinefit._mapped import release
 from kinefit.bodies import Body
 from kinefit.errors import TrackingError
+from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.view_bias import ViewBias
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.subject.subject import Progress

@@ -18,7 +18,7 @@ from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
-from kinefit.sensors.keypoints import keypoint_sigma
+from kinefit.sensors.points.keypoints import keypoint_sigma
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear

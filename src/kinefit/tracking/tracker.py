@@ -26,11 +26,8 @@ from kinefit.observations.arrays import is_number
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.checks import of_kind
-from kinefit.sensors.parting import without_others
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.depth_image import DepthImageSensor
-from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 from kinefit.sensors.visibility.parting import without_others
 from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject

@@ -11,8 +11,8 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.fixed_lag import lag_frames
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Progress, Subject
-from kinefit.tracking.checkpoint import Checkpoint
-from kinefit.tracking.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
 from kinefit.tracking.motions import motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run

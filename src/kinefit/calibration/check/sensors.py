@@ -38,7 +38,7 @@ from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.take_recording import marker_sensor, recording_of
+from kinefit.tracking.takes.take_recording import marker_sensor, recording_of
 from kinefit.tracking.video import track
 
 FRAMES = 12

@@ -20,11 +20,11 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.layout import Layout, Stream, projected
-from kinefit.sensors.left_right import find_swaps
-from kinefit.sensors.occlusion import SEEN, Hidden, hidden_points
+from kinefit.sensors.points.left_right import find_swaps
+from kinefit.sensors.points.triangulation import rays, triangulated_frame
+from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.triangulation import rays, triangulated_frame
-from kinefit.sensors.view_bias import ViewBias
+from kinefit.sensors.visibility.occlusion import SEEN, Hidden, hidden_points
 
 
 class KeypointSensor(Sensor):

@@ -15,7 +15,6 @@ from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
-from kinefit.sensors.keypoints import KeypointMatched
 from kinefit.sensors.observability import SHORTEST, levers
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
