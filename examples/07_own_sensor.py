@@ -1,7 +1,6 @@
 """A sensor of one's own: a rope from a hand to a post, which pulls and never pushes, and whose length is not known.
 
-Two cameras and the rope find its length. Then one camera, which cannot see how far away a hand is, and the rope track.
-
+Two cameras and the rope find its length. One camera, which cannot see how far away a hand is, and the rope then track.
     python examples/07_own_sensor.py
 """
 
@@ -41,7 +40,7 @@ class Pull(kinefit.Measurement):  # what the rope measures at one time: a load c
 
 
 def simulated(arm, rig, frames, noise_px, random):
-    """Yield the state and the frames of all sensors: an arm swings until the rope stops it."""
+    """Yield state and frames of all sensors: an arm swings until the rope stops it."""
     points = arm.keypoints("MEDIAPIPE_33")
     for k in range(frames):
         mean = np.array([1.0, -0.5, 0.0, 0.8, 0.3, 0.0, 0.0]) + 0.6 * np.sin(2 * np.pi * k / frames + np.arange(7))
@@ -54,26 +53,27 @@ def simulated(arm, rig, frames, noise_px, random):
         state = kinefit.levenberg_marquardt(arm, scene.state, rows).state
         taut = bool(Pull(0, True).rows(scene.at(state)).residual[0] > -1e-3)
         uv = [c.project(arm.positions(state, points)) + noise_px * random.normal(size=(len(points), 2)) for c in rig]
-        seen = [kinefit.KeypointFrame(c.name, k / RATE, points.names, p, np.ones(len(p)), "MEDIAPIPE_33")
-                for c, p in zip(rig, uv)]  # fmt: skip
-        yield state, [*seen, Pull(k / RATE, taut)]
+        frame = lambda c, p: kinefit.KeypointFrame(c.name, k / RATE, points.names, p, np.ones(len(p)), "MEDIAPIPE_33")  # noqa: B023
+        yield state, [*map(frame, rig, uv), Pull(k / RATE, taut)]
 
 
 def main(frames=60, noise_px=1.0, seed=0):
-    arm, rig = kinefit.load_body("arm"), kinefit.simulation.studio_rig(cameras=2)
-    states, steps = zip(*simulated(arm, rig, frames, noise_px, np.random.default_rng(seed)))
-    options = {"rate": RATE, "sigma": dict.fromkeys(rig.names, noise_px), "sensors": [Rope()], "up": "y"}
-    motion = kinefit.track(kinefit.Recording.of_frames(steps, rig, **options), arm, size=False, settings=SETTINGS)
-    length, std = motion.provenance["shape"]["rope length"]
-    print(f"the rope is {length:.4f} ± {std:.4f} m long; {LENGTH} m is the truth")
+    arm, rig, random = kinefit.load_body("arm"), kinefit.simulation.studio_rig(cameras=2), np.random.default_rng(seed)
+    states, steps = zip(*simulated(arm, rig, frames, noise_px, random))
+    options = {"rate": RATE, "sigma": dict.fromkeys(rig.names, noise_px), "settings": SETTINGS, "up": "y"}
+    near = [kinefit.BodyState(s.T_world_root, s.angles + 0.05 * random.normal(size=7)) for s in states[::3]]
+    sensors = kinefit.Tracker(arm, rig, sensors=[Rope()], **options).sensors
+    seen = [sensors.measurements(f, kinefit.Scene(arm, s, rig)) for f, s in zip(steps[::3], near)]
+    subject = kinefit.fit_subject(arm, rig, seen, near, [kinefit.OwnUnknowns.of([Rope()])])
+    print("the rope is {:.4f} ± {:.4f} m long;".format(*subject.value("rope length")), LENGTH, "m is the truth")
     errors, hand = {}, lambda s: kinefit.Scene(arm, s, rig).position("r_dactylion")
     for name, used in (("one camera", slice(0, 1)), ("one camera and the rope", slice(0, 3, 2))):
-        tracker = kinefit.Tracker(arm, rig, settings=SETTINGS, values={"rope": {"length": length}}, **options)
+        tracker = kinefit.Tracker(arm, rig, values=subject.values, sensors=[Rope()], **options)
         tracker.start_at(states[0])
-        errors[name] = np.array([np.linalg.norm(hand(tracker.update(f[used]).state) - hand(s))
-                                 for f, s in zip(steps, states)])  # fmt: skip
+        gaps = [hand(tracker.update(f[used]).state) - hand(s) for f, s in zip(steps, states)]
+        errors[name] = np.linalg.norm(gaps, axis=1)
         print(f"{name}: the hand is off by {1000 * np.median(errors[name]):.0f} mm")
-    return (length, std), errors, np.array([f[-1].taut for f in steps])
+    return subject, errors, np.array([f[-1].taut for f in steps])
 
 
 if __name__ == "__main__":

@@ -117,7 +117,8 @@ def test_a_morph_of_ones_own(tmp_path):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_sensor_of_ones_own(seed, capsys):
-    (length, std), errors, taut = example("07_own_sensor").main(seed=seed)
+    subject, errors, taut = example("07_own_sensor").main(seed=seed)
+    length, std = subject.value("rope length")
     assert abs(length - 0.8) < 0.005
     assert abs(length - 0.8) < 3 * std < 0.015
     assert 20 < taut.sum() < 50

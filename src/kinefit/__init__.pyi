@@ -28,6 +28,7 @@ from kinefit.sensors.settings import TrackSettings as TrackSettings
 from kinefit.smoothing.online.fixed_lag import FixedLag as FixedLag
 from kinefit.smoothing.online.known_noise import KnownNoise as KnownNoise
 from kinefit.subject.fit import fit_subject as fit_subject
+from kinefit.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
 from kinefit.tracking.recording import Recording as Recording
 from kinefit.tracking.takes.take import track_take as track_take
 from kinefit.tracking.tracker import Tracker as Tracker

@@ -14,7 +14,7 @@ from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.variance_components import VarianceComponents
+from kinefit.solvers.trajectory.variance_components import VarianceComponents
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics

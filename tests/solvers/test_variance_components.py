@@ -6,7 +6,7 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.sensors.channels import make_channels
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.solvers.variance_components import variance_components
+from kinefit.solvers.trajectory.variance_components import variance_components
 
 RATE, FRAMES = 60.0, 360
 TIMES = np.arange(FRAMES) / RATE
@@ -112,9 +112,9 @@ def pixels(**wrong):
     """Channels of a detector, and measured minus true pixels (F, N, 2)."""
     seen = simulate_keypoints(MOTION, RIG, **{"outliers": 0.0, "missing": 0.1, **wrong})
     body = load_body("humanoid")
-    channels = make_channels(body, RIG, seen, [np.zeros(len(MOTION), int)] * 4, [3.0] * 4)
+    channels = make_channels(body, RIG, seen, [3.0] * 4)
     true = simulate_keypoints(MOTION, RIG, noise_px=0.0, outliers=0.0, missing=0.0)
-    return channels, channels.uv - make_channels(body, RIG, true, [np.zeros(len(MOTION), int)] * 4, [3.0] * 4).uv
+    return channels, channels.uv - make_channels(body, RIG, true, [3.0] * 4).uv
 
 
 def of_detector(channels, values):

@@ -121,10 +121,7 @@ class Matched(ABC):
 
     @property
     def pixels(self) -> KeypointMatched | None:
-        """The same points of the body in images as one packed block, which the compiled fits take without rows.
-
-        None, the default, for everything else. Smoothing takes such a block exactly, at every step of its solver.
-        """
+        """Its points in images as one packed block, or None: compiled fits and the smoother take such a block whole."""
         return None
 
     @property

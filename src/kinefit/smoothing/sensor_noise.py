@@ -21,7 +21,7 @@ from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.spool import Spool
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
-from kinefit.solvers.variance_components import VarianceComponents, variance_components
+from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
 _RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0

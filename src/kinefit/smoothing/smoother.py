@@ -22,11 +22,10 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors
-from kinefit.smoothing.pixels import exchanged, without_bias
 from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
-from kinefit.smoothing.tracked_frames import TrackedFrames
+from kinefit.smoothing.tracked_frames import TrackedFrames, exchanged, without_bias
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_surely
 from kinefit.solvers.closed import Constraint, on_null_space, onto

@@ -1,4 +1,4 @@
-"""Frames of a take as a tracker left them: what smoothing begins with."""
+"""Frames of a take as a tracker left them, and their pixels as they are fitted: what smoothing begins with."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._mapped import release, room
+from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement, pixels_of
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.points.view_bias import beside, trunks
 from kinefit.smoothing.linearised import ApartRows, SceneOf
-from kinefit.smoothing.spool import STRETCH
+from kinefit.smoothing.spool import STRETCH, stretches
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,3 +56,33 @@ class TrackedFrames:
         if layout is None:
             return Channels.none(self.scene_of(self.results[0].state, 0.0).rig, F), swapped
         return replace(layout.channels, uv=uv, confidence=confidence), swapped
+
+
+def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
+    """Pixels (F, N, 2) and confidences (F, N) with sides put right, 0 where unseen."""
+    if len(swapped) == len(channels.uv) and not swapped.any():
+        unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
+        return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
+    uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
+    for some in stretches(len(swapped)):
+        order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))
+        uv[some] = np.take_along_axis(channels.uv[some], order[:, :, None], axis=1)
+        sure = np.take_along_axis(channels.confidence[some], order, axis=1)
+        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
+    release(uv, confidence)
+    return uv, confidence
+
+
+def without_bias(body: Body, channels: Channels, uv: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
+    """Pixels (T, N, 2) without the bias by view that keypoints have at states; the same where none is known."""
+    if channels.view_bias is None:
+        return uv
+    points = channels.points
+    trunk, out = trunks(body.tree)[points.segments][channels.column], room(uv.shape)
+    for some in stretches(len(out)):
+        for f in range(*some.indices(len(out))):
+            x = body.positions(BodyState(roots[f], angles[f]), points)[channels.column]
+            frames, _ = body.tree.forward(roots[f], angles[f])
+            out[f] = uv[f] - beside(channels.view_bias, trunk, x, frames, channels.rig, channels.camera)
+        release(uv, out)
+    return out

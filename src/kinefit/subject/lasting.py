@@ -16,7 +16,7 @@ from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channel_residuals import ChannelResiduals
 from kinefit.solvers.bundle.whitened import residuals
-from kinefit.solvers.variance_components import variance_components
+from kinefit.solvers.trajectory.variance_components import variance_components
 
 _MIN_RESIDUALS = 10  # of a sensor, below which nothing is said of their errors
 _MAX_FOLLOWED = 0.75  # share of all lasting errors that a fit may be thought to follow

@@ -13,6 +13,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown
+from kinefit.sensors.checks import of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.solvers import _kernels_border
 from kinefit.subject.parameters import World
@@ -173,11 +174,17 @@ class OwnUnknowns:
     Parameters
     ----------
     unknowns : {sensor: {name: Unknown}}
+
+    Raises
+    ------
+    ObservationError
+        No mapping, a mean that is not finite, a standard deviation that is not positive.
     """
 
     unknowns: Mapping[str, Mapping[str, Unknown]]
 
     def __post_init__(self) -> None:
+        of_kind(self.unknowns, Mapping, "unknowns of sensors", "Give {sensor: {name: Unknown}}, as `of` does.")
         for sensor, own in self.unknowns.items():
             for name, unknown in own.items():
                 if not (np.isfinite(unknown.mean) and 0.0 < unknown.std < np.inf):
