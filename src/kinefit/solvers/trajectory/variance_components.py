@@ -12,7 +12,6 @@ sum of all components.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -223,7 +222,10 @@ def _means(r: NDArray) -> NDArray:
 
 
 def _medians(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
-    """Medians along axes without NaN, NaN where nothing is seen."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=axis))
+    """Medians along the first axis, or the first and the last, without NaN; NaN where nothing is seen."""
+    columns = values if axis == 0 else np.moveaxis(values, -1, 1).reshape(-1, *values.shape[1:-1])
+    if not len(columns):
+        return np.full(columns.shape[1:], np.nan)
+    ordered, count = np.sort(columns, axis=0), np.isfinite(columns).sum(axis=0)  # NaN comes last
+    middle = [np.take_along_axis(ordered, np.maximum(k, 0)[None], axis=0)[0] for k in ((count - 1) // 2, count // 2)]
+    return np.asarray(np.where(count > 0, 0.5 * (middle[0] + middle[1]), np.nan))
