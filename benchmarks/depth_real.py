@@ -86,7 +86,7 @@ def fitted(images: list[NDArray], camera: Any) -> Any:
 
 def explained(body: Any, state: Any, camera: Any, depth: NDArray) -> tuple[NDArray, float]:
     """Distances (N,) [m] of accepted points from the visible surface, and the share of all that are close to it."""
-    from kinefit.bodies.surfaces.closest import nearest
+    from kinefit.bodies.surfaces import nearest
     from kinefit.images.depth import to_points
 
     points = to_points(depth, camera, step=3)

@@ -152,3 +152,10 @@ def test_points_that_are_hardly_seen_are_as_noisy_as_the_others():
     values[:, channels.column == 0] = np.nan
     found = of_detector(channels, values)
     assert np.isfinite(found.jitter).all() and found.jitter[channels.column == 0].min() > 2.0
+
+
+def test_nothing_seen_is_no_error():
+    none = variance_components(np.zeros((5, 0, 2)), TIMES[:5])
+    assert none.bias.shape == (0,) and none.outlier.shape == (5, 0)
+    unseen = variance_components(np.full((5, 3, 2), np.nan), TIMES[:5])
+    assert np.all(unseen.bias == 0.0) and np.all(unseen.jitter == 0.0) and not unseen.outlier.any()

@@ -223,7 +223,9 @@ def _means(r: NDArray) -> NDArray:
 
 def _medians(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
     """Medians along the first axis, or the first and the last, without NaN; NaN where nothing is seen."""
-    columns = values if axis == 0 else np.moveaxis(values, -1, 1).reshape(-1, *values.shape[1:-1])
+    columns = values
+    if axis != 0:
+        columns = np.moveaxis(values, -1, 1).reshape(len(values) * values.shape[-1], *values.shape[1:-1])
     if not len(columns):
         return np.full(columns.shape[1:], np.nan)
     ordered, count = np.sort(columns, axis=0), np.isfinite(columns).sum(axis=0)  # NaN comes last
