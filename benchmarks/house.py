@@ -38,7 +38,7 @@ def code_lines(text: str) -> int:
 
 def type_questions(tree: ast.AST) -> set[int]:
     """Lines that ask with `isinstance` whether something is some sensor, frame, measurement or match."""
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and ast.unparse(node.func) == "isinstance"]
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "isinstance"]
     return {
         call.lineno for call in calls
         for name in ast.walk(call.args[1])
