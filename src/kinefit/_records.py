@@ -148,7 +148,7 @@ class RecordFile:
 
     Parameters
     ----------
-    file : open to be read and written, by nobody else
+    file : open to be read and written, exclusively
     key : up to 64 bytes, on which every checksum depends
     start : byte at which the first record begins
     name : path for messages

@@ -145,11 +145,11 @@ def _stranger(name: str, text: str) -> Finding:
 
 def _another_session(views: KeypointViews, misses: NDArray) -> Finding:
     least = float(np.nanmin(misses))
-    told = (
+    agreement = (
         f"even two of them alone miss by {least:.0f} px or more" if np.isfinite(least) else "no two of them meet at all"
     )
     return Finding(
-        "fault", "session", f"The cameras do not agree on where the person is: {told}.", (),
+        "fault", "session", f"The cameras do not agree on where the person is: {agreement}.", (),
         "Sure that something is wrong; exchanged cameras, inverted poses, wrong signs, mirrored images and other focal "
         "lengths were tried.",
         "The calibration is of another session or of other cameras, or the keypoints are of different people: name the "
@@ -158,42 +158,43 @@ def _another_session(views: KeypointViews, misses: NDArray) -> Finding:
 
 
 def frame_findings(
-    views: KeypointViews, images: Mapping[str, ImageFrame], told: Mapping[str, str]
+    views: KeypointViews, images: Mapping[str, ImageFrame], stated: Mapping[str, str]
 ) -> tuple[list[Finding], KeypointViews]:
     """A fault where the cameras agree far better with the keypoints in the other picture; and the views so.
 
     Parameters
     ----------
-    views : KeypointViews with the keypoints read as told.
+    views : KeypointViews with the keypoints read as the take states.
     images : {camera: ImageFrame} of the videos.
-    told : {camera: "video" or "calibration"}
+    stated : {camera: "video" or "calibration"}
         Only of cameras whose keypoints' picture the take tells.
     """
-    names = [n for n in told if n in views.rig and not np.allclose(images[n].T_image_calibration, np.eye(3), atol=1e-9)]
+    moved = lambda name: not np.allclose(images[name].T_image_calibration, np.eye(3), atol=1e-9)
+    names = [n for n in stated if n in views.rig and moved(n)]
     fits: tuple[str, ...] = ()
     best, before = views, disagreement_share(views.rig, sample(views))
     least = _MAX_SHARE_OTHER_FRAME * before
     for which in dict.fromkeys((tuple(names), *((name,) for name in names))):
-        other = _otherwise(views, images, told, which)
+        other = _otherwise(views, images, stated, which)
         share = disagreement_share(other.rig, sample(other)) if which else 1.0
         if share < least:
             best, least, fits = other, share, which
     if not fits:
         return [], views
-    right = "calibration" if told[fits[0]] == "video" else "video"
-    text = f"The keypoints of {listed(fits)} are not in the {told[fits[0]]}'s image, but in the {right}'s."
+    right = "calibration" if stated[fits[0]] == "video" else "video"
+    text = f"The keypoints of {listed(fits)} are not in the {stated[fits[0]]}'s image, but in the {right}'s."
     sure = f"Sure: the cameras' mean error falls to {100 * least / before:.0f} %."
     remedy = f'Write frame = "{right}" into [[keypoints]] of {listed(fits)}.'
     return [Finding("fault", "frame", text, tuple(fits), sure, remedy)], best
 
 
 def _otherwise(
-    views: KeypointViews, images: Mapping[str, ImageFrame], told: Mapping[str, str], which: tuple[str, ...]
+    views: KeypointViews, images: Mapping[str, ImageFrame], stated: Mapping[str, str], which: tuple[str, ...]
 ) -> KeypointViews:
-    """The views with the keypoints of some cameras in the other picture than told."""
+    """The views with the keypoints of some cameras in the other image than the take states."""
     uv = views.uv.copy()
     for name in which:
         c = views.rig.index(name)
-        change = images[name].from_calibration if told[name] == "video" else images[name].to_calibration
+        change = images[name].from_calibration if stated[name] == "video" else images[name].to_calibration
         uv[:, :, c] = change(uv[:, :, c])
     return replace(views, uv=uv)

@@ -14,7 +14,7 @@ from kinefit.readers.take.file import CameraEntry
 from kinefit.readers.video import Video
 
 _EITHER = Told(90, "guess", "clockwise or counter-clockwise: try 90, then 270")
-_MAX_RIM = 0.02  # of the image: narrower bars may be a camera's own dark rim
+_MAX_DARK_BORDER = 0.02  # of the image: narrower bars may be a camera's own dark border
 _MIN_BAR_ERROR_PX = 2.0  # video codecs smear edges
 _MIN_BAR_ERROR = 0.2  # of a bar's width, the same
 
@@ -57,7 +57,7 @@ def fit_image(
     where = "at the sides" if expected[0] > expected[1] else "above and below"
     with_bars = f"{sizes}, with bars of {max(expected):.1f} px {where}"
     if size == turned:
-        if bars > _MAX_RIM * max(size):
+        if bars > _MAX_DARK_BORDER * max(size):
             remedy = "Nothing, if it was calibrated with the bars; else calibrate on the same images."
             add("doubt", "picture", f"has black bars of {bars} px, though its video has the calibration's size", remedy)
     elif entry.image == "letterboxed" and boxed:

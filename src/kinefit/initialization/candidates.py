@@ -27,7 +27,7 @@ LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is a
 
 
 def starts_from_points(
-    body: Body, measurements: Sequence[Measurement], scene: Scene, up: NDArray
+    body: Body, measurements: Sequence[Measurement], scene: Scene, up: NDArray, *, rays: bool = True
 ) -> list[BodyState]:
     """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
 
@@ -38,11 +38,12 @@ def starts_from_points(
     measurements : of all sensors that place named points
     scene : of the body, in any state
     up : (3,) unit, upwards in the world
+    rays : whether rays are used, which takes several fits
     """
     given = [m for m in measurements if m.settled]
-    points, x, rays = known_points(given, scene)
+    points, x, directions = known_points(given, scene)
     if np.isfinite(x).all(axis=1).sum() < 6:
-        return starts_from_rays(scene, points, rays, given, up) if len(given) > 1 else []
+        return starts_from_rays(scene, points, directions, given, up) if rays and len(given) > 1 else []
     try:
         return [pose_from_points(body, points, x)[0]]
     except TrackingError:

@@ -192,7 +192,8 @@ def estimate(
         count += 1
         squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
         takes = [take.renewed(keep=True) for take in takes]
-        for i, (fit, post) in enumerate(side_by_side(partial(_roughly, strength), list(takes))):
+        for fitted in side_by_side(partial(_roughly, strength), list(takes)):
+            i, (fit, post) = len(told), fitted
             take = takes[i]
             of_r, of_gamma = _changes(take, fit, post)
             squares, informed = squares + (of_r / np.square(take.live)).sum(axis=0), informed + of_gamma.sum(axis=0)
@@ -200,6 +201,7 @@ def estimate(
             level += (of_gamma * np.log(live)).sum(axis=0)
             takes[i] = replace(take, roots=fit.roots, angles=fit.angles, live=live)
             told.append(_pixels(takes[i], strength, post))
+            del fitted, fit, post  # of 600 frames some 100 MB, while two more parts are fitted
         level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # the accelerations have it
         takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration

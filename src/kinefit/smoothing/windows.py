@@ -59,13 +59,15 @@ def solved_surely(
     covariances, speeds = Spool[NDArray](), []
     matched = None if take.others is None else Spool[tuple[Matched, ...]]()
     fits = side_by_side(lambda part: part.fit(strength), _linear_parts(take, windows, matched, judge=True))
-    for (whole, kept), (fit, post) in zip(windows, fits, strict=True):
+    for whole, kept in windows:
+        fit, post = next(fits)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept] = fit.roots[inside], fit.angles[inside]
         release(take.uv, take.confidence)
         speeds.append(_speed_std(post, take.dt)[max(inside.start - 1, 0) : inside.stop - 1])
         for covariance in post.frames[inside]:
             covariances.append(covariance[packed])
+        del fit, post  # large, while the next parts are fitted
     moving = np.concatenate(speeds)
     speed_std = np.percentile(moving, 90.0, axis=0) if len(moving) else None
     return replace(take, roots=roots, angles=angles, speed_std=speed_std), covariances, matched

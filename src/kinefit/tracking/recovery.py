@@ -106,10 +106,11 @@ class Recovery:
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
         result: FrameResult | None,
     ) -> FrameResult | None:  # fmt: skip
-        """A start from points that are known in space, which costs little."""
+        """A start from points that are known in space, which costs little; from rays as often as a search runs."""
         scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
         known = measurements or tracker.sensors.measurements(frames, scene, points=True)
-        for state in starts_from_points(self.body, known, scene, self.up):
+        rays = result is None or abs(time - self._sought) >= self.settings.search_every - 0.25 / self.rate
+        for state in starts_from_points(self.body, known, scene, self.up, rays=rays):
             found = tracker.fitted(time, frames, state).result
             if result is None or found.support > result.support + _GAIN:
                 result, self._lost_since = found, time

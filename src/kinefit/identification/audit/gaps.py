@@ -78,8 +78,8 @@ def _spans(positions: NDArray, least: float) -> list[tuple[int, int, int]]:
             for length in range(1, min(_MAX_END, end - first) + 1):
                 out |= {(a, first, first + length - 1), (a, end - length, end - 1)}
     for length in range(1, _MAX_END + 1):
-        here, usual = passing(positions, length)
-        leaps = np.linalg.norm(here - usual, axis=-1).min(axis=1) > least
+        here, between = passing(positions, length)
+        leaps = np.linalg.norm(here - between, axis=-1).min(axis=1) > least
         out |= {(a, f + 1, f + length) for f, a in np.argwhere(leaps).tolist()}
     return sorted(out, key=lambda span: (span[1] - span[2], span))
 
@@ -118,7 +118,7 @@ class _ExpectedPlaces:
         weight = self.deviation[label, peers] ** -2.0
         R, t = rigid_frames(self.positions[frame, peers], self.positions[near][:, peers], weight=weight)
         carried = np.split(np.einsum("fji,fj->fi", R, self.positions[near, label] - t), [len(sides[0])])
-        told = [(np.median(x, axis=0), 1.0 / abs(np.median(n) - frame)) for x, n in zip(carried, sides) if len(n)]
-        if not told:
+        estimates = [(np.median(x, axis=0), 1.0 / abs(np.median(n) - frame)) for x, n in zip(carried, sides) if len(n)]
+        if not estimates:
             return np.full(3, np.nan)
-        return np.asarray(np.average([x for x, _ in told], axis=0, weights=[share for _, share in told]))
+        return np.asarray(np.average([x for x, _ in estimates], axis=0, weights=[share for _, share in estimates]))

@@ -34,7 +34,7 @@ class KeypointSensor(Sensor):
     ----------
     rig : Rig
     sigma : {camera: standard deviation [px] of a keypoint with confidence 1}; "CAMERA SET" for one of several detectors
-    usual : float [px] default, of a camera that none is given for
+    default_sigma : float [px] of a camera that none is given for
     loss : Loss of a keypoint, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
     view_bias : bias of the detectors by direction of view, as a subject fit estimated it; default: none
@@ -44,10 +44,10 @@ class KeypointSensor(Sensor):
     together = places_points = True
 
     def __init__(
-        self, rig: Rig, sigma: Mapping[str, float], usual: float, loss: Loss, near: float,
+        self, rig: Rig, sigma: Mapping[str, float], default_sigma: float, loss: Loss, near: float,
         view_bias: ViewBias | None = None,
     ) -> None:  # fmt: skip
-        self.rig, self.sigma, self.usual, self.loss, self.near = rig, sigma, usual, loss, near
+        self.rig, self.sigma, self.default_sigma, self.loss, self.near = rig, sigma, default_sigma, loss, near
         self.view_bias = view_bias or ViewBias()
         self._layouts: dict[tuple[object, ...], tuple[Layout, NDArray]] = {}
 
@@ -81,7 +81,7 @@ class KeypointSensor(Sensor):
                     records.append(Keypoints(camera, keypoint_set, names, 1.0, np.zeros((*empty.shape, 2)), empty))
             channels = Channels.none(self.rig, 1)
             if records:
-                sigma = keypoint_sigma(records, self.sigma, self.usual)
+                sigma = keypoint_sigma(records, self.sigma, self.default_sigma)
                 channels = self.view_bias.known_to(make_channels(body, self.rig, records, sigma))
             given = [(k, name) for k, (*_, names) in enumerate(streams) for name in names]
             found = {point: i for i, point in reversed(list(enumerate(given)))}  # a name counts where it is first
@@ -251,6 +251,6 @@ class KeypointMatched(Matched):
         return out if out.any() else None
 
 
-def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], usual: float) -> list[float]:
+def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], default: float) -> list[float]:
     """[px] of each record, where {camera: standard deviation} or {"CAMERA SET": standard deviation} are given."""
-    return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, usual)) for k in keypoints]
+    return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, default)) for k in keypoints]
