@@ -190,23 +190,24 @@ def estimate(
     takes = list(takes)
     while count < rounds:
         count += 1
-        squares, informed, level, told = np.zeros(n), np.zeros(n), np.zeros(n), []
+        squares, informed, level = np.zeros((3, n))
+        errors: list[tuple[NDArray, NDArray, NDArray]] = []
         takes = [take.renewed(keep=True) for take in takes]
         for fitted in side_by_side(partial(_roughly, strength), list(takes)):
-            i, (fit, post) = len(told), fitted
+            i, (fit, post) = len(errors), fitted
             take = takes[i]
             of_r, of_gamma = _changes(take, fit, post)
             squares, informed = squares + (of_r / np.square(take.live)).sum(axis=0), informed + of_gamma.sum(axis=0)
             live = _liveliness(body, take.dt, of_r, of_gamma)
             level += (of_gamma * np.log(live)).sum(axis=0)
             takes[i] = replace(take, roots=fit.roots, angles=fit.angles, live=live)
-            told.append(_pixels(takes[i], strength, post))
+            errors.append(_pixels(takes[i], strength, post))
             del fitted, fit, post  # of 600 frames some 100 MB, while two more parts are fitted
         level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # the accelerations have it
         takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
         looks = min(takes[0].dt / _LOOK, 1.0)
-        left, r2, variance = (np.concatenate(p) for p in zip(*told, strict=True))
+        left, r2, variance = (np.concatenate(p) for p in zip(*errors, strict=True))
         sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, left, variance, looks)
         if takes[0].one_view:  # a pose follows what its only view is off by: residuals show the jitter alone
             sigma, shared = np.maximum(sigma, channels.sigma), np.zeros(len(sigma))
