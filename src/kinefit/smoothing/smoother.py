@@ -31,7 +31,7 @@ from kinefit.smoothing.windows import parts, solved, solved_surely
 from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import inverse
 
-_PARTS = 3  # of a long take, from which its process noise is estimated
+_PARTS = 6  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
 _ADRIFT = 0.13  # [s] about a contradicted segment: of 0, 0.13 and 0.27, the first misses the ends of a gap
@@ -61,7 +61,7 @@ class SmoothedTake:
 
 def smooth_results(
     body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
-    eye: NDArray | None = None, window: int = 600, overlap: int = 60,
+    eye: NDArray | None = None, window: int = 300, overlap: int = 60,
 ) -> SmoothedTake:  # fmt: skip
     """Tracked frames of any sensors, smoothed together.
 
