@@ -27,7 +27,7 @@ from kinefit.tracking.checkpoints.frame_file import FORMAT, KINDS
 from kinefit.tracking.takes.take import track_take
 
 LONG, KILLS = 20_000, 20
-_FRAMES, _BYTES = 700, 10_000  # of the take that is killed, with states after 300, 600 and all; of a frame, about
+_FRAMES, _BYTES = amount(700, 320), 10_000  # of the take that is killed, with states after 300, 600 and all; of a frame, about
 _OPTIONS = "--no-report", "--no-overlays", "--formats", "motion,csv"
 _UNPICKLING = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
 MACHINE_CODE = {"_jit.py"}
@@ -145,7 +145,7 @@ def run() -> None:
         figure("faults_folder_crafted_wrong", wrong, f"of {len(WAYS)}", "== 0")
         take, whole, began = write_long_take(work / "take", _FRAMES), work / "whole", time.monotonic()
         tracked(take, whole, *_OPTIONS)
-        seconds, kills = time.monotonic() - began, amount(KILLS, 3)
+        seconds, kills = time.monotonic() - began, amount(KILLS, 1)
         equal = sum(_survives(take, whole, work / f"kill-{k}", seconds, rng) for k in range(kills))
         figure("faults_folder_kills", equal, f"of {kills}", f"== {kills}")
         memory = None if quick() else tracked(write_long_take(work / "long", LONG), work / "long-out")[1]

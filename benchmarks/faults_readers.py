@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.bags import Bag
 from benchmarks.figures import amount, figure
-from benchmarks.fuzz import FAULTS, fuzz
+from benchmarks.fuzz import FAULTS, WHOLE, fuzz
 from benchmarks.fuzz_seeds_folders import FOLDERS, packed_glb
 from kinefit.bodies import load_body
 from kinefit.bodies.serial import body_to_arrays
@@ -38,7 +38,7 @@ print(*answer(Seed((path,), lambda: {code}), path.parent))
 
 
 def run() -> None:
-    """Print the largest of each figure over all files, then what a short fuzzing of the newest seeds finds."""
+    """Print the largest of each figure over all files, then what the fuzzing of the newest seeds finds."""
     answers = []
     for name, (code, make) in FILES.items():
         with tempfile.TemporaryDirectory() as folder:
@@ -50,7 +50,7 @@ def run() -> None:
     figure("faults_readers_bombs_seconds", max(seconds), "s", "<= 2")
     figure("faults_readers_bombs_memory", max(megabytes), "MB", "<= 500")
     figure("faults_readers_bombs_untyped", sum(untyped), "files", "== 0")
-    found = [fuzz(name, amount(100, 10)) for name in FOLDERS]
+    found = [fuzz(name, amount(WHOLE, 10)) for name in FOLDERS]
     figure("faults_readers_fuzz", sum(one[kind] for one in found for kind in FAULTS), "files", "== 0")
 
 

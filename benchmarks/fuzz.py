@@ -28,7 +28,7 @@ _TOLD = 8  # faults of a reader that are printed
 
 def run() -> None:
     """Print the counts over all readers."""
-    count = int(os.environ.get("KINEFIT_FUZZ") or amount(WHOLE, 40))
+    count = int(os.environ.get("KINEFIT_FUZZ") or amount(WHOLE, 8))
     chosen = os.environ.get("KINEFIT_FUZZ_READERS")
     totals: Counter[str] = Counter()
     names = [name.strip() for name in chosen.split(",")] if chosen else list(READERS)

@@ -110,7 +110,7 @@ def run() -> None:
     rng = np.random.default_rng(5)
     alarms = hits = tried = false = takes = 0
     seconds = []
-    for name in CLEAN[: amount(None, 3)]:
+    for name in CLEAN[: amount(None, 1)]:
         markers = clean(name)
         if markers is None:
             continue
@@ -155,7 +155,7 @@ def one_frame() -> None:
     """Two labels exchanged for one frame, near each other, with both seen or one hidden: four of each in every take."""
     rng = np.random.default_rng(3)
     tried = hits = 0
-    for name in CLEAN[: amount(None, 2)]:
+    for name in CLEAN[: amount(None, 1)]:
         markers = clean(name)
         if markers is None:
             continue
@@ -189,7 +189,7 @@ def in_gaps() -> None:
         ("one leaps there, the other is hidden", False, True, False, True),
     )
     rng, tried, hits = np.random.default_rng(11), 0, np.zeros(len(ways), int)
-    for name in CLEAN[: amount(None, 2)]:
+    for name in CLEAN[: amount(None, 1)]:
         markers = clean(name)
         if markers is None:
             continue

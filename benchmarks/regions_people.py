@@ -31,7 +31,7 @@ from kinefit.recipes.regions import pose_from_regions
 from kinefit.rendering import render_body, scaled
 from kinefit.smoothing.foot_contacts import find_contacts
 
-FRAMES = amount(100, 6)
+FRAMES = amount(100, 3)
 GOOD = 0.8  # overlap of a frame from which it counts as tracked, as of silhouettes
 SMALL = 0.35  # at which the paper's recipe sees the images
 GOALS = {
