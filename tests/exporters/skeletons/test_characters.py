@@ -225,6 +225,11 @@ def test_vrm_files_tell_their_joints(motion, tmp_path):
     found = write_character(motion, tmp_path / "c.gltf", tmp_path / "o.vrm")
     assert {found.segments[number[name]] for name in ("LeftArm", "Spine2")} == {"upperarm_l", "thorax"}
     assert chunks(tmp_path / "o.vrm")[1].startswith(binary)
+    for wrong in (len(number), -1):
+        told["extensions"]["VRMC_vrm"]["humanoid"]["humanBones"]["head"]["node"] = wrong
+        (tmp_path / "c.gltf").write_text(json.dumps(told))
+        with pytest.raises(FileError, match="names a node for head that the file does not have"):
+            read_character(tmp_path / "c.gltf")
 
 
 def test_soles_are_those_of_the_mesh(tmp_path):

@@ -206,7 +206,10 @@ def _told(file: Mapping[str, Any]) -> dict[str, int]:
     old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
     joints = next(family for family in FAMILIES if family.name == "VRM, Unity").joints
-    return {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
+    out = {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
+    if wrong := [name for name, node in out.items() if not 0 <= node < len(file["nodes"])]:
+        raise ValueError(f"humanBones names a node for {wrong[0]} that the file does not have")
+    return out
 
 
 def _from_bvh(path: Path) -> Character:
