@@ -27,7 +27,7 @@ from kinefit.tracking.checkpoints.frame_file import FORMAT, KINDS
 from kinefit.tracking.takes.take import track_take
 
 LONG, KILLS = 20_000, 20
-_FRAMES, _BYTES = amount(700, 320), 10_000  # of the take that is killed, with states after 300, 600 and all; of a frame, about
+_FRAMES, _BYTES = amount(700, 320), 10_000  # frames of the take that is killed; of a frame, about
 _OPTIONS = "--no-report", "--no-overlays", "--formats", "motion,csv"
 _UNPICKLING = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
 MACHINE_CODE = {"_jit.py"}

@@ -50,7 +50,7 @@ def run() -> None:
     figure("faults_readers_bombs_seconds", max(seconds), "s", "<= 2")
     figure("faults_readers_bombs_memory", max(megabytes), "MB", "<= 500")
     figure("faults_readers_bombs_untyped", sum(untyped), "files", "== 0")
-    found = [fuzz(name, amount(WHOLE, 10)) for name in FOLDERS]
+    found = [fuzz(name, amount(WHOLE, 10)) for name in list(FOLDERS)[: amount(None, 1)]]
     figure("faults_readers_fuzz", sum(one[kind] for one in found for kind in FAULTS), "files", "== 0")
 
 

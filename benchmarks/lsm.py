@@ -101,7 +101,7 @@ def _precision() -> None:
     figure("lsm_points_a_second", count / spent, "points/s", ">= 10000")
     figure("lsm_intervals_low", inside, "% in 95 % intervals", ">= 93")
     figure("lsm_intervals_high", inside, "% in 95 % intervals", "<= 97")
-    first, second, at, goal, _ = drawn(amount(20, 6), SEED + 5, stretch=0.0)
+    first, second, at, goal, _ = drawn(amount(20, 3), SEED + 5, stretch=0.0)
     for window in (9, 13, 21):
         told = match(SplineImage.of(first), SplineImage.of(second), at, window=window)
         error = (told.uv - goal)[told.found]
@@ -115,7 +115,7 @@ def _bias() -> None:
     for grain in (0.7, 1.0, 1.2, 1.5):
         told, shifts = [], (0.0, 0.125, 0.25, 0.375, 0.5)
         for shift in shifts:
-            first, second, at, goal, _ = drawn(amount(12, 4), 77, shift=shift, stretch=0.0, noise=0.0, grain=grain)
+            first, second, at, goal, _ = drawn(amount(12, 2), 77, shift=shift, stretch=0.0, noise=0.0, grain=grain)
             found = match(SplineImage.of(first), SplineImage.of(second), at)
             told.append(float(np.nanmean(found.uv - goal)))
         worst[grain] = np.abs(told).max()

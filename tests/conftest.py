@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, as the command line has it
+
 from kinefit._jit import kernel_folder
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -60,6 +60,7 @@ def test_the_real_recording_is_tracked_with_its_credit_on_screen(tmp_path, monke
     assert "doubtful moments: " in told.stdout
 
 
+@pytest.mark.slow
 def test_warmup_says_how_long_it_took_and_where_the_kernels_are():
     told = run("warmup")
     assert told.exit_code == 0, told.output

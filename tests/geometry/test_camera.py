@@ -127,6 +127,7 @@ def test_scaled_camera_sees_the_scaled_image(fx, fy):
         ({"T_camera_world": np.diag([1.0, 1, -1, 1])}, "right-handed"),
         ({"T_camera_world": np.diag([1.1, 1, 1, 1])}, "orthonormal"),
         ({"distortion": np.zeros(7)}, "7 distortion"),
+        ({"distortion": [0.0, 1e200, 0.0, 0.0]}, r"coefficient of 1e\+200"),
         ({"model": "orthographic"}, "radtan, fisheye"),
         ({"size": (0, 720)}, "size"),
     ],

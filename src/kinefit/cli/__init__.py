@@ -5,6 +5,7 @@ Heavy imports stand inside the commands, so that help comes at once.
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
@@ -16,6 +17,8 @@ from kinefit import __version__
 from kinefit.cli import _screen
 from kinefit.cli._group import CommandGroup
 from kinefit.errors import KinefitError
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads only wait for each other here
 
 COMMANDS = {
     "demo": "tracking.demo", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",

@@ -21,6 +21,7 @@ from kinefit.geometry.se3 import inverse
 
 MODELS = ("radtan", "fisheye")
 _COEFFICIENTS = {"radtan": (0, 4, 5, 8), "fisheye": (0, 4)}
+_MOST = 1e9  # that a distortion coefficient may be; no lens comes near
 
 
 def _read_only(array: ArrayLike) -> NDArray:
@@ -99,6 +100,8 @@ class Camera:
                 f"{k.size} distortion coefficients for the model {self.model}",
                 f"Give {', '.join(map(str, _COEFFICIENTS[self.model]))} (no thin prism, no tilt).",
             )
+        if np.abs(k).max(initial=0.0) > _MOST:
+            raise self._error(f"a distortion coefficient of {np.abs(k).max():.3g}", "Calibrate it again.")
         R = T[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0 or np.any(T[3] != (0, 0, 0, 1)):
             raise self._error("rotation is not orthonormal and right-handed", "Give the rotation world to camera.")
@@ -109,13 +112,7 @@ class Camera:
         out = np.zeros(kernels.PACKED)
         K, T = self.matrix, self.T_camera_world
         out[kernels.MODEL] = MODELS.index(self.model)
-        out[[kernels.FX, kernels.FY, kernels.CX, kernels.CY, kernels.SKEW]] = (
-            K[0, 0],
-            K[1, 1],
-            K[0, 2],
-            K[1, 2],
-            K[0, 1],
-        )
+        out[[kernels.FX, kernels.FY, kernels.CX, kernels.CY, kernels.SKEW]] = K[[0, 1, 0, 1, 0], [0, 1, 2, 2, 1]]
         out[kernels.DIST : kernels.DIST + self.distortion.size] = self.distortion
         out[kernels.ROT : kernels.ROT + 9] = T[:3, :3].ravel()
         out[kernels.TRANS : kernels.TRANS + 3] = T[:3, 3]
