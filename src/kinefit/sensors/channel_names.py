@@ -14,7 +14,7 @@ from kinefit.sensors.base import Matched
 _MIN_FRAMES = 10  # named measurements of a sensor; in fewer it may be that no channel was seen twice
 
 Channel = tuple[str | int, ...]
-"""Which part of a match (of numbered channels), its name or measurement id, how many rows it has, and which of them."""
+"""Part of the match (of numbered channels only), name or measurement id, number of rows; of a surface: the segment."""
 
 
 class ChannelNames:
@@ -25,8 +25,8 @@ class ChannelNames:
         self._numbered: dict[tuple[str, int], bytes] = {}
         self._names: dict[str, tuple[set[str], int, int]] = {}
 
-    def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[list[Channel]]:
-        """Of every part of a match the channel of each row.
+    def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[tuple[list[Channel], NDArray]]:
+        """Of every part of a match its channels, and (2, N) which of these each row is of, and along which axis.
 
         Parameters
         ----------
@@ -40,11 +40,14 @@ class ChannelNames:
             its channels at some times only, or anew at every time; numbered channels that change.
         """
         sensor, names = matched.sensor, matched.channels
+        out, used = list[tuple[list[Channel], NDArray]](), set[str]()
         if not matched.of_points:
-            of = (getattr(r, "segment", None) for r in parts)
-            return [[(int(k),) for k in (np.zeros(len(r)) if s is None else s)] for r, s in zip(parts, of)]
+            for rows in parts:
+                segment = getattr(rows, "segment", None)
+                ids, index = np.unique(np.zeros(len(rows)) if segment is None else segment, return_inverse=True)
+                out.append(([(int(k),) for k in ids], np.stack([index, np.zeros_like(index)])))
+            return out
         self.check_names(matched)
-        out, used = [], set[str]()
         for k, rows in enumerate(parts):
             ids, index, count = np.unique(_ids(rows), return_inverse=True, return_counts=True)
             if names is None:
@@ -56,12 +59,11 @@ class ChannelNames:
             elif len(ids) and ids[-1] >= len(names):
                 problem = f"sensor '{sensor}' names {len(names)} channels and has rows of measurement id {ids[-1]}"
                 raise ObservationError(problem, remedy="Give one name for each measurement id, `Rows.group`.")
-            keys: list[tuple[str | int, ...]] = [(k, int(i)) if names is None else (names[i],) for i in ids]
+            keys: list[Channel] = [(k, i) if names is None else (names[i],) for i in ids.tolist()]
             used.update(() if names is None else (names[i] for i in ids))
-            first = np.cumsum(count) - count
-            rank = np.empty(len(index), np.int64)
-            rank[np.argsort(index, kind="stable")] = np.arange(len(index)) - np.repeat(first, count)
-            out.append([(*keys[i], int(count[i]), int(r)) for i, r in zip(index, rank)])
+            axis = np.empty(len(index), np.int64)
+            axis[np.argsort(index, kind="stable")] = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
+            out.append(([(*key, rows) for key, rows in zip(keys, count.tolist())], np.stack([index, axis])))
         if used:
             self._check_return(sensor, used)
         return out
