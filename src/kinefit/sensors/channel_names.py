@@ -39,7 +39,7 @@ class ChannelNames:
             Names that are no text, or not each a different one; a measurement id without a name; a sensor that names
             its channels at some times only, or anew at every time; numbered channels that change.
         """
-        sensor, names = matched.sensor, matched.channels
+        sensor = matched.sensor
         out, used = list[tuple[list[Channel], NDArray]](), set[str]()
         if not matched.of_points:
             for rows in parts:
@@ -47,7 +47,7 @@ class ChannelNames:
                 ids, index = np.unique(np.zeros(len(rows)) if segment is None else segment, return_inverse=True)
                 out.append(([(int(k),) for k in ids], np.stack([index, np.zeros_like(index)])))
             return out
-        self.check_names(matched)
+        names = self.check_names(matched)
         for k, rows in enumerate(parts):
             ids, index, count = np.unique(_ids(rows), return_inverse=True, return_counts=True)
             if names is None:
@@ -68,8 +68,8 @@ class ChannelNames:
             self._check_return(sensor, used)
         return out
 
-    def check_names(self, matched: Matched) -> None:
-        """An error where a match's names are no names, or where its sensor has names at some times only."""
+    def check_names(self, matched: Matched) -> Sequence[str] | None:
+        """The names of a match's channels; an error where they are none, or its sensor has some at some times only."""
         names, sensor = matched.channels, matched.sensor
         if self._named.setdefault(sensor, names is not None) != (names is not None):
             raise ObservationError(
@@ -81,17 +81,18 @@ class ChannelNames:
         if names is not None and len(set(names)) < len(names):
             twice = next(n for n in names if list(names).count(n) > 1)
             raise ObservationError(f"sensor '{sensor}' has two channels '{twice}'", remedy="Name each differently.")
+        return names
 
     def check_step(self, matched: Sequence[Matched]) -> None:
         """An error where two measurements of one time and sensor have a channel in common: two sensors use one name."""
         seen = set[tuple[str, float, str]]()
         for m in matched:
             if m.of_points:
-                self.check_names(m)
-                keys = {(m.sensor, m.time, name) for name in (("",) if m.channels is None else m.channels)}
+                names = self.check_names(m)
+                keys = {(m.sensor, m.time, name) for name in (("",) if names is None else names)}
                 if both := seen & keys:
                     problem = f"two measurements of sensor '{m.sensor}' at {m.time:g} s"
-                    problem += f" have a channel '{min(both)[2]}'" if m.channels is not None else ""
+                    problem += f" have a channel '{min(both)[2]}'" if names is not None else ""
                     raise ObservationError(problem, remedy="If two sensors use this name, give each its own.")
                 seen |= keys
 

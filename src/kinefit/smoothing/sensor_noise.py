@@ -144,11 +144,13 @@ def other_noise(
         one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
         stated_here = _means(stated[sensor], values.shape[1:])
         found[sensor], variance[sensor] = one, np.maximum(one.lasting[:, None] ** 2, stated_here)
+    held = dict[int, dict[str, NDArray]]()
     for k, span in enumerate(spans):
         lasting[span] = _window_means([skins], [slice(0, T)], span, half)
         near = range(max(k - 1, 0), min(k + 2, len(spans)))
+        held = {j: held[j] if j in held else pushes[j] for j in near}
         for sensor, of in variance.items():
-            pushed = [_padded(pushes[j].get(sensor), (spans[j].stop - spans[j].start, *of.shape, n)) for j in near]
+            pushed = [_padded(held[j].get(sensor), (spans[j].stop - spans[j].start, *of.shape, n)) for j in near]
             mean = _window_means(pushed, [spans[j] for j in near], span, half)
             shared = found[sensor].shared[0][:, None] * mean.sum(axis=1)
             own = (np.sqrt(of)[..., None] * mean).reshape(len(mean), -1, n)
@@ -163,11 +165,8 @@ def _summed(parts: Sequence[_Felt], information: NDArray) -> tuple[NDArray, NDAr
     whitened = np.sqrt(w)[:, None] * J
     _kernels_border.packed_grams(whitened, np.searchsorted(at[0], np.arange(len(information) + 1)), information)
     shape = len(information), *(at[1:].max(axis=1) + 1)
-    index = np.ravel_multi_index(tuple(at), shape)
-    order = np.argsort(index, kind="stable")
-    used, first = np.unique(index[order], return_index=True)
-    push = np.zeros((int(np.prod(shape)), J.shape[1]))
-    push[used] = np.add.reduceat((w[:, None] * J)[order], first)
+    index, push = np.ravel_multi_index(tuple(at), shape), np.zeros((int(np.prod(shape)), J.shape[1]))
+    _kernels_border.add_weighted(J, w, index, push)
     return push.reshape(*shape, -1), np.bincount(index, w, len(push)).reshape(shape)
 
 
