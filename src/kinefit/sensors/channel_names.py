@@ -14,7 +14,7 @@ from kinefit.sensors.base import Matched
 _MIN_FRAMES = 10  # named measurements of a sensor; in fewer it may be that no channel was seen twice
 
 Channel = tuple[str | int, ...]
-"""Which part of a match (of numbered channels), its name or measurement id, how many rows it has, and which of them."""
+"""Part of the match (of numbered channels only), name or measurement id, number of rows; of a surface: the segment."""
 
 
 class ChannelNames:
@@ -25,8 +25,8 @@ class ChannelNames:
         self._numbered: dict[tuple[str, int], bytes] = {}
         self._names: dict[str, tuple[set[str], int, int]] = {}
 
-    def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[list[Channel]]:
-        """Of every part of a match the channel of each row.
+    def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[tuple[list[Channel], NDArray]]:
+        """Of every part of a match its channels, and (2, N) which of these each row is of, and along which axis.
 
         Parameters
         ----------
@@ -39,12 +39,15 @@ class ChannelNames:
             Names that are no text, or not each a different one; a measurement id without a name; a sensor that names
             its channels at some times only, or anew at every time; numbered channels that change.
         """
-        sensor, names = matched.sensor, matched.channels
+        sensor = matched.sensor
+        out, used = list[tuple[list[Channel], NDArray]](), set[str]()
         if not matched.of_points:
-            of = (getattr(r, "segment", None) for r in parts)
-            return [[(int(k),) for k in (np.zeros(len(r)) if s is None else s)] for r, s in zip(parts, of)]
-        self.check_names(matched)
-        out, used = [], set[str]()
+            for rows in parts:
+                segment = getattr(rows, "segment", None)
+                ids, index = np.unique(np.zeros(len(rows)) if segment is None else segment, return_inverse=True)
+                out.append(([(int(k),) for k in ids], np.stack([index, np.zeros_like(index)])))
+            return out
+        names = self.check_names(matched)
         for k, rows in enumerate(parts):
             ids, index, count = np.unique(_ids(rows), return_inverse=True, return_counts=True)
             if names is None:
@@ -56,18 +59,17 @@ class ChannelNames:
             elif len(ids) and ids[-1] >= len(names):
                 problem = f"sensor '{sensor}' names {len(names)} channels and has rows of measurement id {ids[-1]}"
                 raise ObservationError(problem, remedy="Give one name for each measurement id, `Rows.group`.")
-            keys: list[tuple[str | int, ...]] = [(k, int(i)) if names is None else (names[i],) for i in ids]
+            keys: list[Channel] = [(k, i) if names is None else (names[i],) for i in ids.tolist()]
             used.update(() if names is None else (names[i] for i in ids))
-            first = np.cumsum(count) - count
-            rank = np.empty(len(index), np.int64)
-            rank[np.argsort(index, kind="stable")] = np.arange(len(index)) - np.repeat(first, count)
-            out.append([(*keys[i], int(count[i]), int(r)) for i, r in zip(index, rank)])
+            axis = np.empty(len(index), np.int64)
+            axis[np.argsort(index, kind="stable")] = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
+            out.append(([(*key, rows) for key, rows in zip(keys, count.tolist())], np.stack([index, axis])))
         if used:
             self._check_return(sensor, used)
         return out
 
-    def check_names(self, matched: Matched) -> None:
-        """An error where a match's names are no names, or where its sensor has names at some times only."""
+    def check_names(self, matched: Matched) -> Sequence[str] | None:
+        """The names of a match's channels; an error where they are none, or its sensor has some at some times only."""
         names, sensor = matched.channels, matched.sensor
         if self._named.setdefault(sensor, names is not None) != (names is not None):
             raise ObservationError(
@@ -79,17 +81,18 @@ class ChannelNames:
         if names is not None and len(set(names)) < len(names):
             twice = next(n for n in names if list(names).count(n) > 1)
             raise ObservationError(f"sensor '{sensor}' has two channels '{twice}'", remedy="Name each differently.")
+        return names
 
     def check_step(self, matched: Sequence[Matched]) -> None:
         """An error where two measurements of one time and sensor have a channel in common: two sensors use one name."""
         seen = set[tuple[str, float, str]]()
         for m in matched:
             if m.of_points:
-                self.check_names(m)
-                keys = {(m.sensor, m.time, name) for name in (("",) if m.channels is None else m.channels)}
+                names = self.check_names(m)
+                keys = {(m.sensor, m.time, name) for name in (("",) if names is None else names)}
                 if both := seen & keys:
                     problem = f"two measurements of sensor '{m.sensor}' at {m.time:g} s"
-                    problem += f" have a channel '{min(both)[2]}'" if m.channels is not None else ""
+                    problem += f" have a channel '{min(both)[2]}'" if names is not None else ""
                     raise ObservationError(problem, remedy="If two sensors use this name, give each its own.")
                 seen |= keys
 

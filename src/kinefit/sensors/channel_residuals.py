@@ -44,10 +44,9 @@ class ChannelResiduals:
             Channels whose identity is not certain, see `ChannelNames.channels`.
         """
         columns, out = self._columns.setdefault(matched.sensor, {}), []
-        for own, value, weight in zip(self._names.channels(matched, parts), values, weights):
-            keys = [(key[:-1], key[-1]) if matched.of_points else (key, 0) for key in own]
-            at = np.array([(columns.setdefault(k, len(columns)), int(axis)) for k, axis in keys], np.int64)
-            out.append(at.reshape(-1, 2).T)
+        for (own, at), value, weight in zip(self._names.channels(matched, parts), values, weights):
+            number = np.array([columns.setdefault(channel, len(columns)) for channel in own], np.int64)
+            out.append(np.stack([number[at[0]], at[1]]))
             entries = np.vstack([np.full(len(value), frame), out[-1], value, weight])
             self._entries.setdefault(matched.sensor, []).append(entries[:, weight > 0.0])
         return out
