@@ -67,9 +67,9 @@ class DepthImageSensor(Sensor):
         """
         return DepthImageMeasurement(self, frame, scene)
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: DepthImageMeasurement, scene: Scene, sure: bool) -> None:
         """Let the background learn from a whole image, with the body where it was found."""
-        if self.background is None or not isinstance(measurement, DepthImageMeasurement) or measurement.is_compact:
+        if self.background is None or measurement.is_compact:
             return
         shown = measurement.drawn_alone(scene)
         self.background.learn(np.abs(measurement.depth), shown, measurement.box, sure)
