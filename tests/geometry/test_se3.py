@@ -178,3 +178,11 @@ def test_any_leading_shape():
     np.testing.assert_array_equal(T[1, 3], se3.exp(xi[1, 3]))
     np.testing.assert_array_equal(se3.log(T)[1, 3], se3.log(T[1, 3]))
     assert se3.apply(T[0], np.zeros((5, 3))).shape == (5, 3)
+
+
+def test_the_nearest_rotation_is_no_reflection():
+    random = np.random.default_rng(7)
+    R = se3.exp_so3(random.normal(size=(20, 3)))
+    np.testing.assert_allclose(se3.nearest_rotation(R * 2.5), R, atol=1e-13)
+    mirrored = R @ np.diag([3.0, 2.0, -1.0])  # the axis of least weight gives way
+    np.testing.assert_allclose(se3.nearest_rotation(mirrored), R, atol=1e-13)

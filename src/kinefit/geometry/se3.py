@@ -98,12 +98,18 @@ def transform(rotation: NDArray, translation: NDArray) -> NDArray:
     return out
 
 
+def nearest_rotation(M: NDArray) -> NDArray:
+    """Rotations nearest to matrices (..., 3, 3) by least squares (W. Kabsch, 1978)."""
+    u, _, vt = np.linalg.svd(M)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
 def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
     """T_y_x (4, 4) that lays points x (K, 3) onto y (K, 3) best, by least squares with weights (K,) (Kabsch)."""
     w = np.full(len(x), 1.0 / len(x)) if weight is None else weight / weight.sum()
     middle, aim = w @ x, w @ y
-    u, _, vt = np.linalg.svd((w[:, None] * (y - aim)).T @ (x - middle))
-    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    R = nearest_rotation((w[:, None] * (y - aim)).T @ (x - middle))
     return transform(R, aim - R @ middle)
 
 
